@@ -1,0 +1,47 @@
+# make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
+# make test   lint and the whole test suite
+# make torture N=300   kill everything at random moments; every run must end with the same bits
+PYTHON ?= python3
+N      ?= 300
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+
+.PHONY: run test lint format bench bench-resume torture env clean
+
+run: $(READY)
+	$(BIN)/muster run job_specs/cartpole.yaml
+
+test: lint
+	$(BIN)/pytest -q -n 2 --dist loadfile --durations=10
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY)
+	$(BIN)/python -m benchmarks.spine
+
+bench-resume: $(READY)
+	$(BIN)/python -m benchmarks.resume
+
+torture: $(READY)
+	$(BIN)/python -m tests.faults.torture --kills $(N)
+
+env: $(READY)
+
+# torch first and alone: an environment that has it installs nothing more for the packages that want it
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Muster needs Python 3.11 or newer; set PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[worker,aws,dev]'
+	touch $(READY)
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,5 @@
+"""The control plane: what runs, where, when. Imports no torch, no warp, no newton, and nothing of ``worker``."""
+
+from __future__ import annotations
+
+from shared_store import __version__ as __version__

@@ -1,0 +1,1 @@
+"""The HTTP interface: AWS Batch's operations under ``/v1/``, our own under ``/api/``."""

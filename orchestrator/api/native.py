@@ -1,0 +1,243 @@
+"""The native API: capacity, jobs with all their attempts, logs as a stream, runs, checkpoints, metrics, resume."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
+
+from orchestrator.api import runs
+from orchestrator.api.batch import QUEUES
+from orchestrator.api.errors import ClientError
+from orchestrator.bus import BusError
+from orchestrator.controller import Controller
+from orchestrator.database import Job, find_job
+from orchestrator.definition import gang_needs
+from orchestrator.jobs import Status
+from shared_store.checkpoints import list_checkpoints
+from shared_store.logs import LogFollower
+from shared_store.metrics import read_metrics
+
+router = APIRouter(prefix="/api")
+
+_POLL = 0.05
+"""Seconds between two looks at a log that is followed."""
+_HEARTBEAT = 5.0
+"""Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
+
+
+class ResumeRequest(BaseModel):
+    """What to change when a run goes on."""
+
+    checkpoint: int | None = Field(default=None, description="iteration; the newest where absent")
+    nodes: int | None = Field(default=None, ge=1, description="another number of nodes; the worlds are dealt out anew")
+    set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
+    directory: str = Field(default="", description="working directory of the job")
+
+
+def _controller(request: Request) -> Controller:
+    controller: Controller = request.app.state.controller
+    return controller
+
+
+def _job(session: Session, reference: str) -> Job:
+    job = find_job(session, reference)
+    if job is None:
+        raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
+    return job
+
+
+@router.get("/capacity")
+def capacity(request: Request) -> dict[str, Any]:
+    """The engine, its hosts with all that they have, and the store."""
+    controller = _controller(request)
+    hosts = [asdict(host) for host in controller.engine.capacity()]
+    return {
+        "engine": controller.engine.name,
+        "hosts": hosts,
+        "store": str(controller.store.path),
+        "queues": list(QUEUES),
+    }
+
+
+@router.get("/jobs/{reference}")
+def job_detail(request: Request, reference: str) -> dict[str, Any]:
+    """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
+    controller = _controller(request)
+    with controller.database.session() as session:
+        job = _job(session, reference)
+        run = controller.store.run(job.run)
+        attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
+        described = runs.describe_run(controller, session, run) if run.description() else None
+        needs = gang_needs(job.node_properties)
+        return {
+            "id": job.id,
+            "name": job.name,
+            "run": job.run,
+            "kind": next(
+                (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
+            ),
+            "status": job.status,
+            "statusReason": job.status_reason,
+            "createdAt": job.created_at,
+            "startedAt": job.started_at,
+            "stoppedAt": job.stopped_at,
+            "nodes": len(needs.nodes),
+            "attempts": attempts,
+            "attemptsAllowed": job.attempts_allowed,
+            "spec": needs.spec,
+            "results": described,
+            "progress": runs.last_metrics(run),
+        }
+
+
+@router.get("/jobs/{reference}/logs")
+def job_logs(
+    request: Request,
+    reference: str,
+    node: int | None = None,
+    rank: int | None = None,
+    attempt: int | None = None,
+    follow: bool = False,
+) -> StreamingResponse:
+    """The job's log lines as JSON lines, all nodes merged; with ``follow`` until the job is over."""
+    controller = _controller(request)
+    with controller.database.session() as session:
+        job = _job(session, reference)
+        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt)
+        job_id = job.id
+    closing: threading.Event = request.app.state.closing
+    lines = _follow(controller, job_id, follower, closing) if follow else _stored(follower)
+    return StreamingResponse(lines, media_type="application/x-ndjson")
+
+
+@router.post("/jobs/{reference}/checkpoint")
+def save_now(request: Request, reference: str) -> dict[str, str]:
+    """Have a training job save now; answers when the checkpoint is durable."""
+    controller = _controller(request)
+    job, attempt, nodes = _running(controller, reference)
+    return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
+
+
+@router.get("/jobs/{reference}/stacks")
+def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
+    """The Python and native stacks of every rank, node by node."""
+    controller = _controller(request)
+    job, attempt, nodes = _running(controller, reference)
+    return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
+
+
+def _running(controller: Controller, reference: str) -> tuple[str, int, list[int]]:
+    """Id, attempt and nodes of a running job. Raises ClientError."""
+    with controller.database.session() as session:
+        job = _job(session, reference)
+        attempt = job.open_attempt
+        if job.status != Status.RUNNING or attempt is None:
+            raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", runs.CONFLICT)
+        main = int(job.node_properties["mainNode"])
+        return (
+            job.id,
+            attempt.number,
+            sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main),
+        )
+
+
+def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
+    try:
+        return controller.bus.command(job, attempt, node, name, seconds)
+    except BusError as error:
+        raise ClientError(str(error), 503) from None
+
+
+@router.get("/runs")
+def list_runs(request: Request) -> list[dict[str, Any]]:
+    """Every run of the store."""
+    controller = _controller(request)
+    with controller.database.session() as session:
+        return [runs.describe_run(controller, session, run) for run in controller.store.runs()]
+
+
+@router.get("/runs/{name}")
+def run_detail(request: Request, name: str) -> dict[str, Any]:
+    """One run."""
+    controller = _controller(request)
+    with controller.database.session() as session:
+        return runs.describe_run(controller, session, runs.find_run(controller, name))
+
+
+@router.get("/runs/{name}/checkpoints")
+def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
+    """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
+    run = runs.find_run(_controller(request), name)
+    return [runs.describe_checkpoint(checkpoint, verify) for checkpoint in list_checkpoints(run)]
+
+
+@router.get("/runs/{name}/metrics")
+def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, Any]]:
+    """The run's metrics, one record an iteration, for iterations greater than ``after``."""
+    return read_metrics(runs.find_run(_controller(request), name), after)
+
+
+@router.post("/runs/{name}/resume")
+def resume_run(request: Request, name: str, body: ResumeRequest) -> dict[str, Any]:
+    """Submit a job that continues the run."""
+    controller = _controller(request)
+    return runs.resume(
+        controller, runs.find_run(controller, name), body.checkpoint, body.set, body.directory, body.nodes
+    )
+
+
+def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
+    attempt = job.attempts[number - 1]
+    run = controller.store.run(job.run)
+    nodes = [
+        {
+            **node,
+            "progress": controller.bus.progress(job.id, number, node["index"]),
+            "running": attempt.stopped_at is None and "exitCode" not in node,
+            "log": str(run.log(job.id, number, node["index"])),
+        }
+        for node in attempt.nodes
+    ]
+    return {
+        "number": number,
+        "epoch": attempt.epoch,
+        "startedAt": attempt.started_at,
+        "stoppedAt": attempt.stopped_at,
+        "ending": attempt.ending,
+        "exitCode": attempt.exit_code,
+        "statusReason": attempt.status_reason,
+        "spent": attempt.spent,
+        "nodes": nodes,
+    }
+
+
+def _stored(follower: LogFollower) -> Iterator[str]:
+    for line in follower.drain():
+        yield json.dumps(asdict(line)) + "\n"
+
+
+def _follow(controller: Controller, job_id: str, follower: LogFollower, closing: threading.Event) -> Iterator[str]:
+    spoken = time.monotonic()
+    while not closing.is_set():
+        with controller.database.session() as session:
+            job = session.get(Job, job_id)
+            over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
+        for line in follower.poll():
+            yield json.dumps(asdict(line)) + "\n"
+            spoken = time.monotonic()
+        if over:
+            yield from _stored(follower)
+            return
+        if time.monotonic() - spoken > _HEARTBEAT:
+            yield "\n"
+            spoken = time.monotonic()
+        closing.wait(_POLL)

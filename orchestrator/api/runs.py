@@ -1,0 +1,245 @@
+"""Runs as the native API shows them, and the rules of resuming one."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.api import batch
+from orchestrator.api.errors import ClientError
+from orchestrator.controller import Controller
+from orchestrator.database import Job
+from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.scheduler import never_fits
+from orchestrator.spec import Spec, SpecError, override, validate
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
+from shared_store.files import read_json
+from shared_store.layout import Run, StoreError
+from shared_store.metrics import read_metrics
+
+CONFLICT = 409
+"""The request is well formed, but the state of things refuses it."""
+
+
+def find_run(controller: Controller, name: str) -> Run:
+    """The run called ``name``. Raises ClientError (404) naming the nearest one that exists."""
+    try:
+        run = controller.store.run(name)
+    except StoreError as error:
+        raise ClientError(str(error)) from None
+    if run.description() is None:
+        nearest = difflib.get_close_matches(name, [each.name for each in controller.store.runs()], 1, cutoff=0.3)
+        hint = f"; did you mean {nearest[0]}?" if nearest else "; no run exists yet"
+        raise ClientError(f"run {name} does not exist in {controller.store.path}{hint}", 404)
+    return run
+
+
+def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:
+    """Facts of a run: its jobs, its newest checkpoint, and where its results lie."""
+    description = run.description() or {}
+    jobs = session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at)).all()
+    checkpoints = list_checkpoints(run)
+    evaluation = _newest_evaluation(run, checkpoints)
+    plot = run.metrics / "reward.png"
+    return {
+        "run": run.name,
+        "path": str(run.path),
+        "created": description.get("created"),
+        "spec": spec_of(session, run),
+        "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
+        "checkpoints": len(checkpoints),
+        "iteration": checkpoints[-1].iteration if checkpoints else 0,
+        "checkpoint": str(checkpoints[-1].path) if checkpoints else None,
+        "plot": str(plot) if plot.exists() else None,
+        "evaluation": evaluation,
+    }
+
+
+def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
+    """Name, iteration, size [bytes], reward and creation time [Unix s]; with ``verify`` also what is wrong with it."""
+    facts: dict[str, Any] = {"name": checkpoint.name, "iteration": checkpoint.iteration, "epoch": checkpoint.epoch}
+    facts["path"] = str(checkpoint.path)
+    try:
+        manifest = checkpoint.manifest
+        facts |= {"size": checkpoint.size, "created": manifest.get("created"), "reward": manifest.get("reward")}
+        facts |= {"worlds": manifest.get("worlds"), "worldSize": manifest.get("world_size")}
+        if verify:
+            checkpoint.verify()
+            facts["verified"] = True
+    except DamagedCheckpoint as error:
+        facts |= {"verified": False, "problem": str(error)}
+    return facts
+
+
+def spec_of(session: Session, run: Run) -> dict[str, Any] | None:
+    """The spec with which a run goes on: that of its newest job, else the one that it was created with."""
+    newest = session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)).first()
+    if newest:
+        return gang_needs(newest.node_properties).spec
+    return (run.description() or {}).get("spec")
+
+
+def resume(
+    controller: Controller,
+    run: Run,
+    checkpoint: int | None,
+    assignments: Sequence[str],
+    directory: str,
+    nodes: int | None = None,
+) -> dict[str, Any]:
+    """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
+
+    Args:
+        controller: The controller.
+        run: The run.
+        checkpoint: Iteration to go on from; the newest checkpoint where None.
+        assignments: ``key.path=value`` changes of the spec.
+        directory: Working directory of the job.
+        nodes: Another number of nodes; the run's worlds stay the same and are dealt out anew.
+
+    Raises:
+        ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
+    """
+    with controller.writing, controller.database.session() as session:
+        document = spec_of(session, run)
+        if document is None:
+            raise ClientError(
+                f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
+            )
+        try:
+            before = validate(document, f"run {run.name}")
+            resized = [f"nodes={nodes}"] if nodes is not None else []
+            spec = validate(override(document, [*assignments, *resized]), f"run {run.name}")
+        except SpecError as error:
+            raise ClientError(str(error)) from None
+        _check_changes(run, before, spec)
+        chosen = _choose(run, checkpoint)
+        environment = {"MUSTER_RUN": run.name}
+        if spec.train:
+            if chosen:
+                _check_progress(run, spec, chosen)
+            environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
+        definition = compile_definition(spec, directory)
+        if impossible := never_fits(gang_needs(definition["nodeProperties"]), controller.engine.capacity()):
+            raise ClientError(f"run {run.name}: {impossible}")
+        registered = batch.register_job_definition(session, batch.validate("RegisterJobDefinition", definition))
+        if chosen and checkpoint is not None:
+            environment["MUSTER_CHECKPOINT"] = chosen.name
+        submission = compile_submission(spec, registered["jobDefinitionArn"], environment)
+        submitted = batch.submit_job(session, batch.validate("SubmitJob", submission))
+    controller.wake()
+    return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
+
+
+def last_metrics(run: Run) -> dict[str, Any] | None:
+    """The newest record of the run's metrics."""
+    history = read_metrics(run)
+    return history[-1] if history else None
+
+
+def _check_changes(run: Run, before: Spec, after: Spec) -> None:
+    """A run is one history: what its state depends on can't change under it."""
+    if before.train is None or after.train is None:
+        if before.kind != after.kind:
+            raise ClientError(f"run {run.name} is a {before.kind} job; it can't go on as {after.kind}")
+        return
+    for key in ("task", "seed", "config"):
+        old, new = getattr(before.train, key), getattr(after.train, key)
+        if old != new:
+            raise ClientError(
+                f"run {run.name}: train.{key} is {old!r} and can't become {new!r}; start a new run for that"
+            )
+    for key in ("hidden_sizes", "activation", "normalize_observations"):
+        old, new = getattr(before.train.ppo, key), getattr(after.train.ppo, key)
+        if old != new:
+            was, wanted = ("the task's own" if value is None else repr(value) for value in (old, new))
+            raise ClientError(
+                f"run {run.name}: train.ppo.{key} is {was} and can't become {wanted}: it shapes the network; "
+                "start a new run for that"
+            )
+
+
+def _choose(run: Run, iteration: int | None) -> Checkpoint | None:
+    checkpoints = list_checkpoints(run)
+    if iteration is None:
+        return checkpoints[-1] if checkpoints else None
+    matching = [checkpoint for checkpoint in checkpoints if checkpoint.iteration == iteration]
+    if not matching:
+        there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
+        raise ClientError(f"run {run.name} has no checkpoint of iteration {iteration}; it has: {there}", 404)
+    try:
+        matching[-1].verify()
+    except DamagedCheckpoint as error:
+        others = [str(each.iteration) for each in checkpoints if each.iteration != iteration]
+        raise ClientError(
+            f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT
+        ) from None
+    return matching[-1]
+
+
+def _check_progress(run: Run, after: Spec, chosen: Checkpoint) -> None:
+    """Refuse a run that is complete, and one that a newer Muster wrote."""
+    assert after.train is not None
+    try:
+        _ = chosen.manifest
+    except NewerFormat as error:
+        raise ClientError(f"run {run.name}: {error}", CONFLICT) from None
+    except DamagedCheckpoint:
+        pass  # the worker names it, sets it aside and uses the one before
+    if chosen.iteration >= after.train.iterations:
+        raise ClientError(
+            f"run {run.name} is complete at iteration {chosen.iteration} of {after.train.iterations}; "
+            f"to go on: --set train.iterations={chosen.iteration * 2}",
+            CONFLICT,
+        )
+
+
+def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Checkpoint | None) -> int:
+    """How many worlds the run goes on with: those that it has, whatever ranks there are. Refuses what does not fit them."""
+    assert before.train is not None and after.train is not None
+    ranks = after.nodes.max * after.ranks_per_node
+    wanted = after.train.worlds * ranks
+    changed = before.train.worlds != after.train.worlds
+    if changed and chosen is None:  # nothing is there that would have to be dealt out
+        return wanted
+    worlds = _worlds_of(session, run, before, chosen)
+    if changed and wanted != worlds:
+        assert chosen is not None
+        raise ClientError(
+            f"run {run.name}: checkpoint {chosen.name} holds {worlds} worlds, this job would have {wanted} "
+            f"({after.nodes.max} nodes × {after.ranks_per_node} ranks × {after.train.worlds}); "
+            "leave train.worlds as it is: the worlds are dealt out to whatever ranks there are"
+        )
+    if worlds < ranks:
+        raise ClientError(f"run {run.name}: {worlds} worlds can't be dealt out to {ranks} ranks; use fewer nodes")
+    return worlds
+
+
+def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | None) -> int:
+    """How many worlds the run has: as its checkpoint says, else as its newest job was told or had by its spec."""
+    assert before.train is not None
+    try:
+        if chosen and isinstance(told := chosen.manifest.get("worlds"), int):
+            return told
+    except DamagedCheckpoint:
+        pass
+    query = select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)
+    if newest := session.scalars(query).first():
+        given = gang_needs(newest.node_properties).setting("MUSTER_WORLDS")
+        if given.isdecimal():
+            return int(given)
+    return before.train.worlds * before.ranks_per_node * before.nodes.max
+
+
+def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:
+    for checkpoint in reversed(checkpoints):
+        try:
+            if evaluation := read_json(run.evaluations / f"{checkpoint.name}.json"):
+                return evaluation
+        except ValueError:
+            continue
+    return None

@@ -1,0 +1,69 @@
+"""The ``muster`` command: one module a group of commands; errors end as one line and an exit code.
+
+Exit codes: 0 done, 1 failure, 2 wrong use.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from orchestrator.cli import jobs, logs, runs, serving, verify
+from orchestrator.client import ApiError, Unreachable
+from orchestrator.home import ServerError
+from orchestrator.spec import SpecError
+from shared_store import __version__
+from shared_store.layout import StoreError
+
+app = typer.Typer(
+    name="muster",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Runs one robot-learning job on many machines as if they were one.",
+    epilog="Start with:  muster run job_specs/cartpole.yaml",
+)
+serving.register(app)
+jobs.register(app)
+logs.register(app)
+runs.register(app)
+verify.register(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"muster {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
+    ),
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Entry point of the command."""
+    try:
+        app()
+    except SpecError as error:
+        _fail(error, 2)
+    except ApiError as error:
+        _fail(error, 2 if error.status in (400, 404) else 1)
+    except (Unreachable, ServerError, StoreError) as error:
+        _fail(error, 1)
+    except BrokenPipeError:  # `muster logs … | head`
+        sys.stderr.close()
+        sys.exit(0)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _fail(error: Exception, code: int) -> None:
+    print(f"muster: {' '.join(str(error).split())}", file=sys.stderr)
+    sys.exit(code)

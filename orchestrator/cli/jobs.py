@@ -1,0 +1,226 @@
+"""``muster submit``, ``list``, ``show``, ``stop``, ``schema``."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from orchestrator import specfile
+from orchestrator.cli.progress import follow
+from orchestrator.client import Client
+from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.engines.base import Host
+from orchestrator.scheduler import never_fits
+from orchestrator.spec import Spec, SpecError, schema
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Change a key of the spec: train.iterations=600. Repeatable.")
+]
+SpecArgument = Annotated[str, typer.Argument(help="A job YAML, such as job_specs/cartpole.yaml.")]
+JobArgument = Annotated[
+    str, typer.Argument(help="Job id, the first letters of one (4 or more), or a job name (the newest).")
+]
+
+_COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Example:  muster submit job_specs/ant.yaml --set train.iterations=600 -f")(submit)
+    app.command("list", epilog="Example:  muster list --json | jq '.[].jobId'")(list_jobs)
+    app.command(epilog="Example:  muster show ant")(show)
+    app.command(epilog="Example:  muster stop ant   then   muster resume RUN")(stop)
+    app.command(epilog="Example:  muster checkpoint ant")(checkpoint)
+    app.command(epilog="Example:  muster stacks ant > stacks.txt")(stacks)
+    app.command("schema", epilog="Example:  muster schema > muster.schema.json")(print_schema)
+
+
+def submit_spec(
+    client: Client, spec: Spec, source: str, environment: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Register and submit a spec; refused before anything is registered if no host could ever hold it. Raises SpecError.
+
+    ``environment`` is added on every node.
+    """
+    definition = compile_definition(spec, os.getcwd())
+    capacity = client.get("/api/capacity")
+    hosts = [Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"]) for host in capacity["hosts"]]
+    if impossible := never_fits(gang_needs(definition["nodeProperties"]), hosts):
+        raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
+    if spec.queue not in capacity["queues"]:
+        raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")
+    registered = client.batch("RegisterJobDefinition", **definition)
+    return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
+
+
+def submit(
+    spec: SpecArgument,
+    set_: SetOption = None,
+    follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Submit a job to a running controller."""
+    loaded = specfile.load(spec, set_)
+    with Client.connect() as client:
+        submitted = submit_spec(client, loaded, spec)
+        if as_json:
+            typer.echo(json.dumps(submitted))
+        else:
+            typer.echo(f"submitted {submitted['jobName']} as {submitted['jobId']}")
+            if not follow_:
+                typer.echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
+        if follow_:
+            raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def list_jobs(
+    all_: Annotated[bool, typer.Option("--all", "-a", help="All jobs, not the newest 20.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """List jobs, the newest first."""
+    summaries: list[dict[str, Any]] = []
+    with Client.connect() as client:
+        token: str | None = None
+        while True:
+            # a filter, because a listing by status shows one status at a time
+            page = client.batch(
+                "ListJobs",
+                jobQueue="default",
+                filters=[{"name": "AFTER_CREATED_AT", "values": ["0"]}],
+                **({"nextToken": token} if token else {}),
+            )
+            summaries += page["jobSummaryList"]
+            token = page.get("nextToken")
+            if not token or (not all_ and len(summaries) >= 20):
+                break
+    shown = summaries if all_ else summaries[:20]
+    if as_json:
+        typer.echo(json.dumps(shown, indent=1))
+        return
+    if not shown:
+        typer.echo("no jobs yet; start one with: muster submit job_specs/cartpole.yaml")
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("JOB", "NAME", "STATUS", "NODES", "CREATED", "TOOK"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("REASON", overflow="fold")
+    for summary in shown:
+        colour = _COLOURS.get(summary["status"], "white")
+        took = _took(summary.get("startedAt"), summary.get("stoppedAt"))
+        reason = summary.get("statusReason", "") if summary["status"] != "SUCCEEDED" else ""
+        nodes = str(summary["nodeProperties"]["numNodes"])
+        created = _when(summary["createdAt"])
+        table.add_row(
+            summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took, reason
+        )
+    Console().print(table)
+
+
+def show(job: JobArgument, as_json: JsonOption = False) -> None:
+    """Show a job: its state and why, its attempts and nodes, its run and results."""
+    with Client.connect() as client:
+        detail = client.get(f"/api/jobs/{job}")
+        detail["job"] = client.batch("DescribeJobs", jobs=[detail["id"]])["jobs"][0]
+    if as_json:
+        typer.echo(json.dumps(detail, indent=1))
+        return
+    console = Console(highlight=False, soft_wrap=True)
+    colour = _COLOURS.get(detail["status"], "white")
+    console.print(f"[bold]{detail['name']}[/]  {detail['id']}  [{colour}]{detail['status']}[/]")
+    facts = {
+        "why": detail["statusReason"],
+        "created": _when(detail["createdAt"]),
+        "took": _took(detail["startedAt"], detail["stoppedAt"]),
+        "run": detail["run"],
+        "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
+    }
+    results = detail["results"] or {}
+    if progress := detail["progress"]:
+        total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
+        facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
+    facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "store": results.get("path")}
+    for name, value in facts.items():
+        if value:
+            console.print(f"  {name + ':':12} {value}", markup=False)
+    for attempt in detail["attempts"]:
+        ended = attempt["ending"] or "running"
+        counted = "" if attempt["spent"] else ", not counted"
+        reason = f": {attempt['statusReason']}" if attempt["statusReason"] else ""
+        took = _took(attempt["startedAt"], attempt["stoppedAt"])
+        console.print(
+            f"  attempt {attempt['number']} of {detail['attemptsAllowed']} (epoch {attempt['epoch']}, {took}) {ended}{counted}{reason}",
+            markup=False,
+        )
+        for node in attempt["nodes"]:
+            state = "running" if node["running"] else f"exit {node.get('exitCode', '?')}: {node.get('reason', '')}"
+            gpus = f", GPUs {','.join(node['gpus'])}" if node["gpus"] else ""
+            console.print(
+                f"    node {node['index']}  {node.get('address', '-')} on {node['host']}{gpus}  {state}", markup=False
+            )
+            console.print(f"      {node['log']}", markup=False, style="dim")
+
+
+def stop(
+    job: JobArgument,
+    reason: Annotated[str, typer.Option(help="Kept with the job.")] = "stopped by the user",
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return when the job has ended.")] = True,
+) -> None:
+    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there."""
+    with Client.connect() as client:
+        detail = client.get(f"/api/jobs/{job}")
+        if detail["status"] in ("SUCCEEDED", "FAILED"):
+            typer.echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
+            return
+        client.batch("TerminateJob", jobId=detail["id"], reason=reason)
+        while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
+            time.sleep(0.2)
+            detail = client.get(f"/api/jobs/{detail['id']}")
+    if not wait:
+        typer.echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
+        return
+    typer.echo(f"{detail['name']} ({detail['id'][:8]}) ended: {detail['statusReason']}")
+    if (detail["results"] or {}).get("checkpoint"):
+        typer.echo(f"go on with: muster resume {detail['run']}")
+
+
+def checkpoint(job: JobArgument) -> None:
+    """Have a training job save now; returns when the checkpoint is durable."""
+    with Client.connect() as client:
+        answer = client.post(f"/api/jobs/{job}/checkpoint", {}, seconds=180)["answer"]
+    typer.echo(answer)
+    if not answer.startswith("checkpoint "):
+        raise typer.Exit(1)
+
+
+def stacks(job: JobArgument) -> None:
+    """Print where every rank of a running job is: Python and native stacks. They go to the job's log too."""
+    with Client.connect() as client:
+        for node in client.get(f"/api/jobs/{job}/stacks", seconds=180):
+            typer.echo(f"== node {node['node']}\n{node['stacks']}")
+
+
+def print_schema() -> None:
+    """Print the JSON Schema of the job YAML, for editors."""
+    typer.echo(json.dumps(schema(), indent=2))
+
+
+def _when(milliseconds: int | None) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(milliseconds / 1000)) if milliseconds else "-"
+
+
+def _took(start: int | None, end: int | None) -> str:
+    if not start:
+        return "-"
+    seconds = int((end or time.time() * 1000) - start) // 1000
+    return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

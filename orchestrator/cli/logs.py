@@ -1,0 +1,66 @@
+"""``muster logs``."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from datetime import UTC, datetime, timedelta
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.cli.jobs import JobArgument, JsonOption
+from orchestrator.client import Client
+from orchestrator.spec import SpecError
+
+_COLOURS = (36, 33, 35, 32, 34, 31)
+"""ANSI colours of the node prefixes, by node index."""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Examples:  muster logs ant -f    muster logs ant --node 1 --since 10m --grep 'reward|Error'")(
+        logs
+    )
+
+
+def logs(
+    job: JobArgument,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until the job ends.")] = False,
+    node: Annotated[int | None, typer.Option(help="Only this node.")] = None,
+    rank: Annotated[int | None, typer.Option(help="Only this rank.")] = None,
+    attempt: Annotated[int | None, typer.Option(help="Only this attempt.")] = None,
+    since: Annotated[str | None, typer.Option(help="Only lines newer than 90s, 10m, 2h or 1d.")] = None,
+    grep: Annotated[str | None, typer.Option(help="Only lines that match this regular expression.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print a job's log, all nodes and attempts merged by time."""
+    oldest = _oldest(since)
+    try:
+        pattern = re.compile(grep) if grep else None
+    except re.error as error:
+        raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
+    colour = sys.stdout.isatty()
+    with Client.connect() as client:
+        for line in client.logs(job, follow=follow, node=node, rank=rank, attempt=attempt):
+            if (oldest and line["time"] < oldest) or (pattern and not pattern.search(line["text"])):
+                continue
+            print(json.dumps(line) if as_json else _format(line, colour), flush=True)
+
+
+def _format(line: dict[str, Any], colour: bool) -> str:
+    who = "node" if line["rank"] is None else f"rank {line['rank']}"
+    prefix = f"[{line['time'][11:23]} {line['attempt']}.{line['node']} {who}]"
+    if colour:
+        prefix = f"\033[{_COLOURS[line['node'] % len(_COLOURS)]}m{prefix}\033[0m"
+    return f"{prefix} {line['text']}"
+
+
+def _oldest(since: str | None) -> str | None:
+    if since is None:
+        return None
+    match = re.fullmatch(r"(\d+)([smhd])", since)
+    if not match:
+        raise SpecError(f"--since {since}: expected a duration such as 90s, 10m, 2h or 1d")
+    seconds = int(match[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[match[2]]
+    return (datetime.now(UTC) - timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

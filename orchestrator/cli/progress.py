@@ -1,0 +1,208 @@
+"""Following a job to its end: a live bar on a terminal, plain lines otherwise, and what came of it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from orchestrator.client import Client, Unreachable
+
+_TERMINAL = ("SUCCEEDED", "FAILED")
+_POLL = 0.3
+_PLAIN_INTERVAL = 2.0
+"""Seconds between two plain lines of progress."""
+
+
+def follow(client: Client, job_id: str) -> int:
+    """Show a job until it ends, then its results; returns the command's exit code (0 where it SUCCEEDED).
+
+    A controller that goes away is waited for, or replaced (:attr:`Client.successor`). Raises Unreachable.
+    """
+    detail = client.get(f"/api/jobs/{job_id}")
+    if detail["kind"] != "train":
+        return _follow_logs(client, job_id)
+    display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
+    seen, reason = 0, None
+    with display:
+        while True:
+            try:
+                job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
+                over = job["status"] in _TERMINAL
+                if job.get("statusReason") != reason:  # another attempt may have another number of nodes
+                    reason = job.get("statusReason")
+                    attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
+                    display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
+                records = (
+                    client.get(f"/api/runs/{detail['run']}/metrics", after=seen)
+                    if job["status"] not in ("SUBMITTED", "RUNNABLE")
+                    else []
+                )
+            except Unreachable:
+                client.await_return()
+                continue
+            if records:
+                seen = records[-1]["iteration"]
+                records = [
+                    each for each in records if each["time"] * 1000 >= detail["createdAt"]
+                ]  # not those before a resume
+            display.show(job, records[-1] if records else None)
+            if over:
+                break
+            time.sleep(_POLL)
+    return summary(client, job_id)
+
+
+def summary(client: Client, job_id: str) -> int:
+    """Print how a job ended and where its results lie; returns the command's exit code."""
+    detail = client.get(f"/api/jobs/{job_id}")
+    console = Console(highlight=False, soft_wrap=True)
+    succeeded = detail["status"] == "SUCCEEDED"
+    colour = "green" if succeeded else "red"
+    reason = "" if succeeded else f": {detail['statusReason']}"
+    console.print(f"[{colour}]{detail['status']}[/]  {detail['name']} ({detail['id'][:8]})", end="")
+    console.print(reason, markup=False)
+    results = detail["results"] or {}
+    attempt = detail["attempts"][-1] if detail["attempts"] else None
+    if attempt and not succeeded:
+        for node in attempt["nodes"]:
+            if node.get("error"):
+                console.print(f"  first error: node {node['index']}: {node['error']}", markup=False)
+                break
+    evaluation = results.get("evaluation")
+    if succeeded and evaluation:
+        length, longest = evaluation["mean_length"], evaluation["max_length"]
+        console.print(
+            f"  evaluation:  mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
+            f"mean return {evaluation['mean_return']:.2f} over {evaluation['episodes']} episodes"
+        )
+    log = attempt["nodes"][0]["log"] if attempt else None
+    for name, value in {"checkpoint": results.get("checkpoint"), "log": log, "plot": results.get("plot")}.items():
+        if value:
+            console.print(f"  {name + ':':12} {value}", markup=False)
+    if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
+        console.print(f"  go on with:  muster resume {detail['run']}", markup=False)
+    return 0 if succeeded else 1
+
+
+def _follow_logs(client: Client, job_id: str) -> int:
+    for line in client.logs(job_id, follow=True):
+        who = "-" if line["rank"] is None else line["rank"]
+        print(f"[node {line['node']} rank {who}] {line['text']}", flush=True)
+    return summary(client, job_id)
+
+
+def _describe(record: dict[str, Any]) -> dict[str, str]:
+    def number(key: str, pattern: str) -> str:
+        value = record.get(key)
+        return "-" if value is None else format(value, pattern)
+
+    return {
+        "reward": number("reward", ".2f"),
+        "length": number("episode_length", ".1f"),
+        "rate": number("steps_per_second", ",.0f"),
+    }
+
+
+class _Display:
+    """What both displays know: how far the job is, and how long it will still take."""
+
+    def __init__(self, detail: dict[str, Any]) -> None:
+        self.total = int(detail["spec"]["train"]["iterations"])
+        self.nodes = int(detail["nodes"])
+        self.name = f"{detail['name']} ({detail['id'][:8]})"
+        self._first: tuple[float, int] | None = None
+        self.started = time.monotonic()
+
+    def eta(self, iteration: int) -> str:
+        """Time left at the pace since the first iteration that was seen, as h:mm:ss."""
+        now = time.monotonic()
+        if self._first is None or iteration < self._first[1]:
+            self._first = (now, iteration)
+        done = iteration - self._first[1]
+        if done < 1:
+            return "-:--:--"
+        left = int((self.total - iteration) * (now - self._first[0]) / done)
+        return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
+
+    def state(self, job: dict[str, Any]) -> str:
+        """State and reason, with what a first start is busy with."""
+        if job["status"] == "RUNNING":
+            return f"starting {self.nodes} nodes: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
+        return f"{job['status']}: {job.get('statusReason', '')}"
+
+
+class _Bar(_Display):
+    """A live bar on a terminal."""
+
+    def __init__(self, detail: dict[str, Any]) -> None:
+        super().__init__(detail)
+        self._progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[text]}", markup=False),
+        )
+        self._task: TaskID = self._progress.add_task(self.name, total=self.total, text="")
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
+        task = self._progress.tasks[0]
+        if record:
+            values = _describe(record)
+            iteration = record["iteration"]
+            text = (
+                f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
+                f"{values['rate']} steps/s  ETA {self.eta(iteration)}  {self.nodes} node{'s' if self.nodes != 1 else ''}"
+            )
+            self._progress.update(self._task, completed=iteration, text=text)
+        elif task.completed == 0 or job["status"] not in ("RUNNING", *_TERMINAL):
+            self._progress.update(self._task, text=self.state(job))
+
+
+class _Lines(_Display):
+    """Plain lines for logs and pipes."""
+
+    def __init__(self, detail: dict[str, Any]) -> None:
+        super().__init__(detail)
+        self._state = ""
+        self._latest: dict[str, Any] | None = None
+        self._printed = 0.0
+
+    def __enter__(self) -> _Lines:
+        print(f"{self.name}: following", flush=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._flush()
+
+    def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
+        state = f"{job['status']} {job.get('statusReason', '')}"
+        if state != self._state and job["status"] not in _TERMINAL:
+            self._flush()
+            print(f"{job['status']}: {job.get('statusReason', '')}", flush=True)
+            self._state = state
+        if record:
+            self.eta(record["iteration"])
+            self._latest = record
+        if time.monotonic() - self._printed >= _PLAIN_INTERVAL:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._latest is None:
+            return
+        values, iteration = _describe(self._latest), self._latest["iteration"]
+        print(
+            f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
+            f"steps/s {values['rate']}  ETA {self.eta(iteration)}  nodes {self.nodes}",
+            flush=True,
+        )
+        self._latest, self._printed = None, time.monotonic()

@@ -1,0 +1,80 @@
+"""``muster resume`` and ``muster checkpoints``."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption, SetOption
+from orchestrator.cli.progress import follow
+from orchestrator.client import Client
+
+RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Example:  muster resume ant-1f2e3d4c --set train.iterations=600 -f")(resume)
+    app.command(epilog="Example:  muster checkpoints ant-1f2e3d4c --verify")(checkpoints)
+
+
+def resume(
+    run: RunArgument,
+    checkpoint: Annotated[int | None, typer.Option(help="Go on from this iteration instead of the newest.")] = None,
+    nodes: Annotated[
+        int | None, typer.Option(min=1, help="Another number of nodes; the worlds are dealt out anew.")
+    ] = None,
+    set_: SetOption = None,
+    follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Go on with a run from its newest checkpoint, at the next iteration."""
+    with Client.connect() as client:
+        body = {"checkpoint": checkpoint, "nodes": nodes, "set": set_ or [], "directory": os.getcwd()}
+        resumed = client.post(f"/api/runs/{run}/resume", body)
+        if as_json:
+            typer.echo(json.dumps(resumed))
+        else:
+            at = f" from iteration {resumed['iteration']}" if resumed["kind"] == "train" else ""
+            typer.echo(f"resumed {resumed['run']}{at} as job {resumed['jobId']}")
+            if not follow_:
+                typer.echo(f"follow it with: muster logs {resumed['jobId'][:8]} -f")
+        if follow_:
+            raise typer.Exit(follow(client, resumed["jobId"]))
+
+
+def checkpoints(
+    run: RunArgument,
+    verify: Annotated[bool, typer.Option("--verify", help="Read every file and check its digest.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """List a run's checkpoints; with --verify exit 1 where one is damaged."""
+    with Client.connect() as client:
+        found = client.get(f"/api/runs/{run}/checkpoints", verify=verify)
+    damaged = [each for each in found if each.get("problem")]
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+    elif not found:
+        typer.echo(f"run {run} has no checkpoint yet")
+    else:
+        table = Table(box=None, pad_edge=False)
+        for column in ("CHECKPOINT", "ITERATION", "REWARD", "WORLDS", "SIZE", "CREATED", "STATE"):
+            table.add_column(column, no_wrap=column != "STATE")
+        for each in found:
+            reward = "-" if each.get("reward") is None else f"{each['reward']:.2f}"
+            size = f"{each['size'] / 2**20:.1f} MiB" if "size" in each else "-"
+            created = (
+                time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each["created"])) if each.get("created") else "-"
+            )
+            state = each.get("problem") or ("verified" if each.get("verified") else "committed")
+            table.add_row(
+                each["name"], str(each["iteration"]), reward, str(each.get("worlds", "-")), size, created, state
+            )
+        Console(soft_wrap=True).print(table)
+    if damaged:
+        raise typer.Exit(1)

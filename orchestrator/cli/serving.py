@@ -1,0 +1,120 @@
+"""``muster run`` and ``muster serve``: the commands that own a controller."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orchestrator import specfile
+from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
+from orchestrator.cli.progress import follow
+from orchestrator.client import Client, Unreachable
+from orchestrator.home import ServerError, local_url, muster_home
+
+StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
+CpusOption = Annotated[
+    float | None, typer.Option(min=0.1, help="CPU cores to hand out; those of the machine by default.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Example:  muster run job_specs/cartpole.yaml --set train.iterations=100")(run)
+    app.command(epilog="Example:  muster serve --store /mnt/efs/muster")(serve)
+
+
+def run(spec: SpecArgument, set_: SetOption = None, store: StoreOption = None, cpus: CpusOption = None) -> None:
+    """Run a job to its end, with a controller of its own where none is running; exit with its result.
+
+    Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
+    """
+    loaded = specfile.load(spec, set_)
+    with controller(store, cpus) as connect:
+        client = connect()
+        job = submit_spec(client, loaded, spec)["jobId"]
+        code = see_through(client, job)
+    raise typer.Exit(code)
+
+
+def see_through(client: Client, job: str) -> int:
+    """Follow a job to its end; Ctrl-C and SIGTERM stop it after a checkpoint. Returns the command's exit code."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return follow(client, job)
+    except KeyboardInterrupt:
+        typer.echo("\nstopping: the job checkpoints and leaves (Ctrl-C again: leave it running)")
+        client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
+        follow(client, job)
+        return 130
+
+
+def serve(
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; off loopback MUSTER_TOKEN must be set.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free port.")] = 8080,
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+) -> None:
+    """Run the controller as a server. Running jobs outlive it; the next one finds them."""
+    from orchestrator.server import Server  # imports what only a controller needs
+
+    server = Server(muster_home(), host=host, port=port, store=store, token=os.environ.get("MUSTER_TOKEN"), cpus=cpus)
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda _number, _frame: ended.set())
+    server.start()
+    typer.echo(f"Muster serves {server.url}  (API: {server.url}/api/docs)")
+    typer.echo(f"home {muster_home()}, store {server.store.path}")
+    try:
+        ended.wait()
+    finally:
+        server.close()
+    typer.echo("stopped; running jobs go on and the next `muster serve` finds them")
+
+
+@contextlib.contextmanager
+def controller(store: str | None, cpus: float | None) -> Iterator[Callable[[], Client]]:
+    """A function that connects to the controller of this home directory, or brings one where there is none (any more)."""
+    with contextlib.ExitStack() as stack:
+
+        def connect() -> Client:
+            client = stack.enter_context(_controller(store, cpus))
+            client.successor = connect
+            return client
+
+        yield connect
+
+
+@contextlib.contextmanager
+def _controller(store: str | None, cpus: float | None) -> Iterator[Client]:
+    """A client of the controller that serves this home directory, or of a new one in this process."""
+    url = os.environ.get("MUSTER_URL") or local_url()
+    if url:
+        try:
+            with Client.connect(url) as client:
+                there = client.get("/api/capacity")["store"]
+                if store is not None and str(Path(store).expanduser().absolute()) != there:
+                    raise ServerError(
+                        f"--store {store}: the controller at {url} keeps {there}; leave --store out, or stop it"
+                    )
+                yield client
+            return
+        except Unreachable:
+            if os.environ.get("MUSTER_URL"):
+                raise
+    from orchestrator.server import Server
+
+    server = Server(muster_home(), store=store, cpus=cpus)
+    server.start()
+    try:
+        with Client.connect(server.url) as client:
+            yield client
+    finally:
+        server.close()

@@ -1,0 +1,136 @@
+"""``muster verify-resume``: whether a run that is killed and goes on ends with the same bits as one that is not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator import specfile
+from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
+from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
+from orchestrator.client import Client
+from orchestrator.spec import Resources, Retry, Spec, SpecError
+
+Connect = Callable[[], Client]
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "verify-resume",
+        epilog="Example:  muster verify-resume job_specs/cartpole.yaml --at 10 --set checkpoint.every=4",
+    )(verify_resume)
+
+
+def verify_resume(
+    spec: SpecArgument,
+    at: Annotated[int, typer.Option(help="Kill the main rank right after this iteration.")],
+    iterations: Annotated[
+        int | None, typer.Option(help="Iterations to train after that one; as many as before it by default.")
+    ] = None,
+    set_: SetOption = None,
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+) -> None:
+    """Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.
+
+    The spec's training runs for AT + ITERATIONS iterations, once straight and once with SIGKILL of the main rank right after
+    iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment; it counts in the first
+    attempt only). The gang starts again from its last checkpoint. Then every tensor and value of both last checkpoints, worlds
+    by their global index, and every metric but times is compared bit by bit: exit 0 where all are equal, 1 at the first that
+    differs. On CPUs they must be equal; a GPU adds in no fixed order. Both runs stay in the store.
+    """
+    loaded = specfile.load(spec, set_)
+    straight, killed = _pair(loaded, spec, at, iterations)
+    for note in _notes(loaded, at):
+        typer.echo(note)
+    with controller(store, cpus) as connect:
+        first = _train(connect, straight, spec)
+        second = _train(connect, killed, spec, MUSTER_KILL_AT=str(at))
+        typer.echo(f"straight: {first['run']}")
+        typer.echo(f"killed:   {second['run']}, {_restart(connect(), second, at)}")
+        code = _compare(connect(), loaded, spec, first["run"], second["run"])
+    raise typer.Exit(code)
+
+
+def _pair(spec: Spec, source: str, at: int, iterations: int | None) -> tuple[Spec, Spec]:
+    """The specs of the straight run and of the one that is killed. Raises SpecError."""
+    if spec.train is None:
+        raise SpecError(f"{source}: verify-resume needs a job that trains; this is a {spec.kind} job")
+    if at < 1:
+        raise SpecError(f"--at {at}: expected an iteration, from 1")
+    after = at if iterations is None else iterations
+    if after < 1:
+        raise SpecError(
+            f"--iterations {after}: at least one iteration must follow --at {at}, or there is nothing to go on with"
+        )
+    changes: dict[str, Any] = {
+        "train": spec.train.model_copy(update={"iterations": at + after}),
+        "nodes": spec.nodes.model_copy(update={"min": spec.nodes.max}),
+        "on_child_failure": "restart",
+    }
+    attempts = max(2, spec.retry.attempts)
+    # a straight run that was restarted would not be one
+    straight = {"name": f"{spec.name[:80]}-straight", "retry": Retry(attempts=1)}
+    killed = {"name": f"{spec.name[:80]}-killed", "retry": Retry(attempts=attempts)}
+    return spec.model_copy(update=changes | straight), spec.model_copy(update=changes | killed)
+
+
+def _notes(spec: Spec, at: int) -> list[str]:
+    """What to know about this verification before it runs."""
+    notes, every = [], spec.checkpoint.every
+    if isinstance(every, int) and every >= at:
+        notes.append(
+            f"note: checkpoint.every is {every}, so there is no checkpoint before iteration {at} ends: "
+            "the restart begins at iteration 0"
+        )
+    if spec.nodes.min != spec.nodes.max:
+        notes.append(f"note: both runs take {spec.nodes.max} nodes; another number of ranks adds in another order")
+    if spec.resources.gpus:
+        notes.append("note: GPUs add in no fixed order; a difference in the last bits is no defect there")
+    return notes
+
+
+def _train(connect: Connect, spec: Spec, source: str, **environment: str) -> dict[str, Any]:
+    """Run one training to its end; returns the job's detail. Raises typer.Exit where it does not succeed."""
+    client = connect()
+    job = submit_spec(client, spec, source, environment)["jobId"]
+    if code := see_through(client, job):
+        raise typer.Exit(code)
+    detail: dict[str, Any] = connect().get(f"/api/jobs/{job}")
+    return detail
+
+
+def _restart(client: Client, detail: dict[str, Any], at: int) -> str:
+    """How the killed run died and where it went on. Raises typer.Exit where it was not killed as asked."""
+    ended = detail["attempts"][0]["nodes"][0].get("reason", "")
+    if len(detail["attempts"]) < 2 or "SIGKILL" not in ended:
+        typer.echo(f"the main rank was not killed after iteration {at} ({ended or 'no reason'}): nothing is proven")
+        raise typer.Exit(1)
+    log = "\n".join(line["text"] for line in client.logs(detail["id"], attempt=2, rank=0))
+    found = re.search(r"resumed from checkpoint (\d{8})-", log)
+    return f"by SIGKILL after iteration {at}; it went on from iteration {int(found[1]) if found else 0}"
+
+
+def _compare(client: Client, spec: Spec, source: str, first: str, second: str) -> int:
+    """Compare both runs where torch is: in a job. Prints what it says; returns the exit code."""
+    comparison = Spec(
+        name=f"{spec.name[:80]}-compare",
+        queue=spec.queue,
+        image=spec.image,
+        resources=Resources(cpus=min(1.0, spec.resources.cpus), memory=spec.resources.memory),
+        command=["python", "-P", "-m", "worker.compare", first, second],
+        retry=Retry(attempts=1),
+    )
+    job = submit_spec(client, comparison, source)["jobId"]
+    for line in client.logs(job, follow=True):
+        if line["rank"] is not None:
+            typer.echo(line["text"])
+    detail = client.get(f"/api/jobs/{job}")
+    if detail["status"] == "SUCCEEDED":
+        return 0
+    if not detail["attempts"] or detail["attempts"][-1]["exitCode"] != 1:
+        typer.echo(f"the comparison failed: {detail['statusReason']}")
+    return 1

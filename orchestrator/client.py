@@ -1,0 +1,159 @@
+"""The HTTP client that the command uses, and that a Python program may use.
+
+>>> client = Client.connect()
+>>> client.batch("ListJobs", jobQueue="default", filters=[{"name": "JOB_NAME", "values": ["ant*"]}])
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any
+
+import httpx
+
+from orchestrator.home import local_url
+
+DEFAULT_URL = "http://127.0.0.1:8080"
+
+
+class ApiError(Exception):
+    """The controller refused a request; ``status`` is the HTTP status."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Unreachable(Exception):
+    """No controller answers; the message says where one was looked for and how to start one."""
+
+
+class Client:
+    """Requests to one controller."""
+
+    def __init__(self, url: str, token: str | None = None) -> None:
+        self.url = url
+        self._found = False
+        self.successor: Callable[[], Client] | None = None
+        """Where to find, or how to start, another controller when this one is gone; else it is waited for."""
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False)
+
+    @classmethod
+    def connect(cls, url: str | None = None) -> Client:
+        """The controller at ``url``, else at ``$MUSTER_URL``, else that of ``$MUSTER_HOME``, else on port 8080.
+
+        Raises Unreachable where none answers, ApiError where the token is refused.
+        """
+        found = not (url or os.environ.get("MUSTER_URL"))
+        url = url or os.environ.get("MUSTER_URL") or local_url() or DEFAULT_URL
+        client = cls(url, os.environ.get("MUSTER_TOKEN"))
+        client._found = found
+        client.get("/healthz")
+        return client
+
+    def batch(self, operation: str, **request: Any) -> dict[str, Any]:
+        """An AWS Batch operation, such as ``SubmitJob``, with its members as keywords. Raises ApiError, Unreachable."""
+        answer: dict[str, Any] = self._request("POST", f"/v1/{operation.lower()}", request)
+        return answer
+
+    def get(self, path: str, *, seconds: float = 30, **query: Any) -> Any:
+        """GET of a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
+        return self._request("GET", path, query={k: v for k, v in query.items() if v is not None}, seconds=seconds)
+
+    def post(self, path: str, body: dict[str, Any], *, seconds: float = 30) -> Any:
+        """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
+        return self._request("POST", path, body, seconds=seconds)
+
+    def logs(self, job: str, **query: Any) -> Iterator[dict[str, Any]]:
+        """The job's log lines. Raises ApiError, Unreachable.
+
+        With ``follow=True`` until the job is over: a controller that goes away is waited for, and its successor's stream is taken
+        up where this one broke off, no line twice and none left out.
+        """
+        seen: Counter[tuple[int, int]] = Counter()
+        while True:
+            passed: Counter[tuple[int, int]] = Counter()
+            try:
+                for line in self._stream(job, query):
+                    source = (line["attempt"], line["node"])
+                    passed[source] += 1
+                    if passed[source] > seen[source]:  # a node's file only grows, so its lines keep their order
+                        seen[source] += 1
+                        yield line
+                if not query.get("follow") or self.get(f"/api/jobs/{job}")["status"] in ("SUCCEEDED", "FAILED"):
+                    return
+                self.await_return()  # a controller that was stopped ends its streams in order
+            except Unreachable:
+                if not query.get("follow"):
+                    raise
+                self.await_return()
+
+    def _stream(self, job: str, query: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        wanted = {key: value for key, value in query.items() if value is not None}
+        try:
+            with self._http.stream(
+                "GET", f"/api/jobs/{job}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
+            ) as answer:
+                if answer.is_error:
+                    answer.read()
+                    self._raise(answer)
+                for line in answer.iter_lines():
+                    if line:
+                        yield json.loads(line)
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from None
+
+    def _request(
+        self, method: str, path: str, body: Any = None, query: dict[str, Any] | None = None, seconds: float = 30
+    ) -> Any:
+        try:
+            answer = self._http.request(method, path, json=body, params=query, timeout=seconds)
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from None
+        if answer.is_error:
+            self._raise(answer)
+        return answer.json()
+
+    @staticmethod
+    def _raise(answer: httpx.Response) -> None:
+        try:
+            message = answer.json()["message"]
+        except (ValueError, KeyError, TypeError):
+            message = f"{answer.request.url} answered {answer.status_code}; is that a Muster controller?"
+        raise ApiError(message, answer.status_code)
+
+    def _unreachable(self, error: httpx.HTTPError) -> Unreachable:
+        return Unreachable(
+            f"no controller answers at {self.url} ({error or type(error).__name__}); start one with `muster serve`"
+        )
+
+    def await_return(self, seconds: float = 120) -> None:
+        """Wait until the controller, or its successor on the same home directory, answers again. Raises Unreachable."""
+        deadline = time.monotonic() + seconds
+        while True:
+            try:
+                successor = self.successor() if self.successor else Client.connect(None if self._found else self.url)
+                break
+            except Unreachable:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.5)
+        self._http.close()
+        self.url, self._http = successor.url, successor._http
+
+    def close(self) -> None:
+        self._http.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,148 @@
+"""From a spec to the AWS Batch requests that carry it, and from a Batch definition to what a gang needs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from orchestrator.spec import Spec
+
+_MODULES = {"train": "worker.train", "evaluate": "worker.evaluate", "export": "worker.export"}
+
+
+def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
+    """The ``RegisterJobDefinition`` request of a spec.
+
+    Args:
+        spec: The job.
+        directory: Where the job was submitted from: the working directory of its command, where the engine has it.
+    """
+    module = _MODULES.get(spec.kind)
+    command = ["python", "-P", "-m", module] if module else list(spec.command or [])
+    ours = {
+        "MUSTER_SPEC": json.dumps(spec.model_dump(mode="json", exclude_none=True), separators=(",", ":")),
+        "MUSTER_ON_CHILD_FAILURE": spec.on_child_failure,
+        "MUSTER_RANKS_PER_NODE": str(spec.ranks_per_node),
+        "MUSTER_MIN_NODES": str(spec.nodes.min),
+        "MUSTER_DIRECTORY": directory,
+    }
+    if spec.train:
+        ours["MUSTER_STALL_TIMEOUT"] = f"{spec.stall_timeout:g}"
+    resources = {"VCPU": f"{spec.resources.cpus:g}", "MEMORY": str(spec.resources.memory)}
+    if spec.resources.gpus:
+        resources["GPU"] = str(spec.resources.gpus)
+    container = {
+        "image": spec.image,
+        "command": command,
+        "environment": [{"name": name, "value": value} for name, value in {**spec.environment, **ours}.items()],
+        "resourceRequirements": [{"type": kind, "value": value} for kind, value in resources.items()],
+    }
+    request: dict[str, Any] = {
+        "jobDefinitionName": spec.name,
+        "type": "multinode",
+        "nodeProperties": {
+            "numNodes": spec.nodes.max,
+            "mainNode": 0,
+            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
+        },
+        "retryStrategy": {"attempts": spec.retry.attempts},
+    }
+    if spec.timeout is not None:
+        request["timeout"] = {"attemptDurationSeconds": int(spec.timeout)}
+    return request
+
+
+def compile_submission(spec: Spec, definition: str, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The ``SubmitJob`` request of a spec whose definition (ARN) is registered.
+
+    ``environment`` is added on every node: the run that is continued, the checkpoint to start from.
+    """
+    request: dict[str, Any] = {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition}
+    if environment:
+        pairs = [{"name": name, "value": value} for name, value in environment.items()]
+        request["nodeOverrides"] = {
+            "nodePropertyOverrides": [{"targetNodes": "0:", "containerOverrides": {"environment": pairs}}]
+        }
+    return request
+
+
+@dataclass(frozen=True)
+class NodeNeeds:
+    """What one node runs and takes."""
+
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+    cpus: float
+    gpus: int
+    memory: int
+    """MiB."""
+
+
+@dataclass(frozen=True)
+class GangNeeds:
+    """What a whole job needs, as read from its Batch definition with the overrides applied."""
+
+    main: int
+    nodes: tuple[NodeNeeds, ...]
+    """By index."""
+    minimum: int
+    """With how few nodes it may start; native jobs only."""
+
+    def setting(self, name: str, default: str = "") -> str:
+        """A ``MUSTER_*`` variable of the main node."""
+        return self.nodes[self.main].environment.get(name, default)
+
+    @property
+    def spec(self) -> dict[str, Any] | None:
+        """The spec that the job was compiled from; None for a job that came through the Batch API."""
+        text = self.setting("MUSTER_SPEC")
+        return json.loads(text) if text else None
+
+    @property
+    def on_child_failure(self) -> str:
+        return self.setting("MUSTER_ON_CHILD_FAILURE", "ignore")
+
+
+def target_nodes(text: str, count: int) -> range:
+    """Node indices of ``a:b``, ``:b``, ``a:`` or ``n``, of ``count`` nodes. Raises ValueError."""
+    first, colon, last = text.partition(":")
+    if not all(part.isdigit() or (colon and part == "") for part in (first, last if colon else first)):
+        raise ValueError(f"targetNodes {text!r}: expected n, a:b, a: or :b")
+    start = int(first or 0)
+    stop = (int(last) if last else count - 1) if colon else start
+    return range(start, stop + 1)
+
+
+def gang_needs(node_properties: Mapping[str, Any]) -> GangNeeds:
+    """Read ``nodeProperties`` (overrides applied already); of nested ranges the later, inner one counts. Raises ValueError."""
+    count = int(node_properties["numNodes"])
+    nodes: list[NodeNeeds | None] = [None] * count
+    for entry in sorted(
+        node_properties["nodeRangeProperties"], key=lambda e: -len(target_nodes(e["targetNodes"], count))
+    ):
+        needs = _node_needs(entry.get("container") or {})
+        for index in target_nodes(entry["targetNodes"], count):
+            if index < count:
+                nodes[index] = needs
+    missing = [index for index, node in enumerate(nodes) if node is None]
+    if missing:
+        raise ValueError(
+            f"nodeRangeProperties cover no node {missing[0]}; every node from 0 to {count - 1} needs a range"
+        )
+    main = int(node_properties["mainNode"])
+    whole = tuple(node for node in nodes if node is not None)
+    minimum = int(whole[main].environment.get("MUSTER_MIN_NODES", count))
+    return GangNeeds(main, whole, min(max(minimum, main + 1), count))  # never without the main node
+
+
+def _node_needs(container: Mapping[str, Any]) -> NodeNeeds:
+    resources = {entry["type"]: entry["value"] for entry in container.get("resourceRequirements") or []}
+    return NodeNeeds(
+        command=tuple(container.get("command") or ()),
+        environment={entry["name"]: entry.get("value", "") for entry in container.get("environment") or []},
+        cpus=float(resources.get("VCPU", container.get("vcpus", 1))),
+        gpus=int(resources.get("GPU", 0)),
+        memory=int(resources.get("MEMORY", container.get("memory", 4))),
+    )

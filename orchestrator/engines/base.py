@@ -1,0 +1,129 @@
+"""The engine protocol: what Muster asks of whatever starts processes on machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from shared_store.contract import NodeContract
+
+
+class EngineError(Exception):
+    """The engine can't do what was asked; the message is the reason that the job is given."""
+
+
+@dataclass(frozen=True)
+class Host:
+    """A machine (or what is free of it)."""
+
+    name: str
+    cpus: float
+    gpus: tuple[str, ...]
+    """Ids, as ``CUDA_VISIBLE_DEVICES`` takes them."""
+    memory: int
+    """MiB."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where one node goes and what it takes there."""
+
+    host: str
+    gpus: tuple[str, ...]
+    cpus: float
+    memory: int
+    """MiB."""
+
+
+@dataclass(frozen=True)
+class Gang:
+    """All nodes of one attempt, as the controller hands them to an engine."""
+
+    job: str
+    attempt: int
+    epoch: int
+    job_epoch: int
+    run: str
+    store: str
+    queue: str
+    main: int
+    commands: Sequence[Sequence[str]]
+    environments: Sequence[Mapping[str, str]]
+    placements: Sequence[Placement]
+    """Commands, user environments and placements by node index."""
+    grace: float
+    """Seconds between SIGTERM and SIGKILL."""
+    directory: str | None
+    """Working directory of the commands."""
+    stall_timeout: float | None = None
+    """Seconds without an iteration after which a rank counts as stuck."""
+    bus: str | None = None
+    bus_token: str | None = None
+    """Where the controller's bus router listens, and its password."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.job}/{self.attempt}/{self.epoch}"
+
+
+@dataclass(frozen=True)
+class NodePlan:
+    """One node as it will be started."""
+
+    contract: NodeContract
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a launch will do; printable."""
+
+    gang: Gang
+    nodes: Sequence[NodePlan]
+
+
+@dataclass(frozen=True)
+class NodeStatus:
+    """What the engine knows of one node."""
+
+    running: bool
+    address: str
+    exit_code: int | None = None
+    """128 + n for signal n; None while it runs, or where nobody saw the end."""
+    detail: str = ""
+    """What the node's supervisor said on stderr, where it could not say it in the store."""
+
+
+GangStatus = Sequence[NodeStatus]
+
+
+class Engine(Protocol):
+    """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart."""
+
+    name: str
+
+    def capacity(self) -> Sequence[Host]:
+        """Every host with all that it has, free or not."""
+        ...
+
+    def plan(self, gang: Gang) -> Plan:
+        """What :meth:`launch` would do. Pure."""
+        ...
+
+    def launch(self, plan: Plan) -> str:
+        """Start the gang, the main node first; returns its handle.
+
+        Idempotent by (job, attempt, epoch): nodes that run already are found, not started twice. Raises EngineError.
+        """
+        ...
+
+    def observe(self, handle: str) -> GangStatus:
+        """The gang's nodes by index."""
+        ...
+
+    def stop(self, handle: str, grace: float) -> None:
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left."""
+        ...

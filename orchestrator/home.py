@@ -1,0 +1,66 @@
+"""The home directory: where it is, and that one controller at a time owns it."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from pathlib import Path
+from typing import IO
+
+
+class ServerError(Exception):
+    """A controller can't start; the message says why and what to do."""
+
+
+def muster_home() -> Path:
+    """``$MUSTER_HOME``, by default ``~/.muster``: database, store and kernel cache."""
+    return Path(os.environ.get("MUSTER_HOME") or "~/.muster").expanduser().absolute()
+
+
+def local_url() -> str | None:
+    """Where the controller of this home directory says that it listens; None where it does not run."""
+    try:
+        told = json.loads((muster_home() / "controller.json").read_text())
+        os.kill(int(told["pid"]), 0)
+        return str(told["url"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+class ControllerRuns(ServerError):
+    """Another controller has this home directory; the message says which."""
+
+
+class HomeLock:
+    """One controller a home directory: a lock that the kernel drops when the process dies, however it dies."""
+
+    def __init__(self, home: Path) -> None:
+        home.mkdir(parents=True, exist_ok=True)
+        self.path = home / "controller.json"
+        self._file: IO[str] = open(home / "controller.lock", "a")  # noqa: SIM115 - held until release()
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.close()
+            holder = describe_holder(home)
+            raise ControllerRuns(
+                f"{home}: already served by {holder}; use that one, stop it, or set MUSTER_HOME to another directory"
+            ) from None
+
+    def publish(self, url: str) -> None:
+        """Say where the controller listens, for commands on this machine."""
+        self.path.write_text(json.dumps({"pid": os.getpid(), "url": url}))
+
+    def release(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def describe_holder(home: Path) -> str:
+    """Who holds the lock of ``home``, as far as it said."""
+    try:
+        told = json.loads((home / "controller.json").read_text())
+        return f"a controller (pid {told['pid']}, {told['url']})"
+    except (OSError, ValueError, KeyError):
+        return "another controller"

@@ -1,0 +1,113 @@
+"""Jobs and attempts: the states of AWS Batch, their legal transitions, and how a gang's end is judged. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from shared_store.outcomes import EX_TEMPFAIL
+
+
+class Status(StrEnum):
+    """State of a job (AWS Batch user guide, "Job states")."""
+
+    SUBMITTED = "SUBMITTED"
+    PENDING = "PENDING"
+    RUNNABLE = "RUNNABLE"
+    STARTING = "STARTING"
+    RUNNING = "RUNNING"
+    SUCCEEDED = "SUCCEEDED"
+    FAILED = "FAILED"
+
+    @property
+    def is_terminal(self) -> bool:
+        return self in (Status.SUCCEEDED, Status.FAILED)
+
+
+TRANSITIONS = {
+    Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
+    Status.PENDING: {Status.RUNNABLE, Status.FAILED},
+    Status.RUNNABLE: {Status.STARTING, Status.FAILED},
+    Status.STARTING: {Status.RUNNING, Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
+    Status.RUNNING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
+    Status.SUCCEEDED: set[Status](),
+    Status.FAILED: set[Status](),
+}
+"""A failed attempt with tries left goes back to RUNNABLE, as on AWS."""
+
+
+def check_transition(before: Status, after: Status) -> None:
+    """Raises ValueError for a transition that AWS Batch does not have."""
+    if after != before and after not in TRANSITIONS[before]:
+        raise ValueError(f"a job can't go from {before} to {after}")
+
+
+class Ending(StrEnum):
+    """Why an attempt is over."""
+
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    """A failure that a retry may mend."""
+    FATAL = "fatal"
+    """A failure after which the job is not tried again."""
+    REQUEUE = "requeue"
+    """Checkpointed and left on request (exit 75): started again without spending an attempt."""
+    STOPPED = "stopped"
+    """A person or the API asked for it."""
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True)
+class NodeEnd:
+    """How one node ended; ``ended`` is the Unix time [s] of its first error, or of its end."""
+
+    exit_code: int
+    reason: str
+    ended: float
+    error: str | None = None
+    """Message of the node's first error."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the ends seen so far mean for the attempt."""
+
+    ending: Ending
+    reason: str
+    exit_code: int | None = None
+
+
+def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | None:
+    """Whether the attempt is over, from how its nodes ended; None while it goes on.
+
+    The main node's end ends the job and decides (AWS Batch). What a child's failure means is ``policy``: ``ignore`` nothing
+    (what AWS does), ``restart`` a new attempt, ``fail`` the end of the job.
+
+    Args:
+        policy: ``restart``, ``fail`` or ``ignore``.
+        main: Index of the main node.
+        ends: By node index; None for a node that runs or has not started.
+    """
+    failures = [
+        (end.ended, index, end) for index, end in enumerate(ends) if end and end.exit_code not in (0, EX_TEMPFAIL)
+    ]
+    head = ends[main]
+    if head is not None and head.exit_code == 0:
+        return Verdict(Ending.SUCCEEDED, "Essential container in task exited", 0)
+    if head is not None and head.exit_code == EX_TEMPFAIL:
+        return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
+    if head is not None and (policy == "ignore" or len(failures) == 1):
+        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code)
+    if not failures or policy == "ignore":
+        return None
+    # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
+    _, index, first = min(failures)
+    ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
+    return Verdict(ending, f"{'main node' if index == main else f'node {index}'}: {first.reason}", first.exit_code)
+
+
+def main_container(job_nodes: Sequence[dict[str, Any]], main: int) -> dict[str, Any]:
+    """The main node's record of an attempt; empty before it started."""
+    return next((node for node in job_nodes if node["index"] == main), {})

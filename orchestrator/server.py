@@ -1,0 +1,114 @@
+"""A controller with its HTTP server in this process: what ``muster serve`` runs, and ``muster run`` where none is running."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import uvicorn
+from sqlalchemy.exc import SQLAlchemyError
+
+from orchestrator.api.app import create_app
+from orchestrator.bus import Bus
+from orchestrator.controller import Controller
+from orchestrator.database import Database
+from orchestrator.engines.local import LocalEngine
+from orchestrator.home import HomeLock, ServerError
+from shared_store.layout import Store
+
+
+class Server:
+    """Owns the home directory from construction to :meth:`close`."""
+
+    def __init__(
+        self,
+        home: Path,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        store: str | None = None,
+        token: str | None = None,
+        cpus: float | None = None,
+        gpus: Sequence[str] | None = None,
+    ) -> None:
+        """Take the lock, the port, the store and the database, in this order; nothing runs until :meth:`start`.
+
+        Raises:
+            ServerError, StoreError: One line each: what is in the way, and what to do.
+        """
+        _check_exposure(host, token)
+        try:
+            self._lock = HomeLock(home)
+        except OSError as error:
+            raise ServerError(
+                f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"
+            ) from None
+        try:
+            self._socket = _listen(host, port)
+            self.store = Store(store or home / "store").open()
+            try:
+                database = Database.at(home)
+            except SQLAlchemyError as error:
+                raise ServerError(f"database {home / 'muster.db'}: {str(error).splitlines()[0]}") from None
+        except BaseException:
+            self._lock.release()
+            raise
+        self.bus = Bus(home)
+        self.controller = Controller(database, LocalEngine(home, cpus, gpus), self.store, self.bus)
+        self.app = create_app(self.controller, token)
+        bound = self._socket.getsockname()[1]
+        self.url = (
+            f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
+        )
+        config = uvicorn.Config(self.app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
+        self._uvicorn = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
+        )
+
+    def start(self) -> None:
+        """Start the controller and the server, and tell commands on this machine where it is."""
+        self.bus.open()
+        self.controller.start()
+        self._thread.start()
+        self._lock.publish(self.url)
+
+    def close(self) -> None:
+        """Stop serving; running gangs go on, and the next controller of this home finds them."""
+        self.app.state.closing.set()
+        self._uvicorn.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(timeout=5)
+        self.controller.close()
+        self.bus.close()
+        self.controller.database.close()
+        self._socket.close()
+        self._lock.release()
+
+
+def _check_exposure(host: str, token: str | None) -> None:
+    try:
+        local = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = False
+    if not local and not token:
+        raise ServerError(
+            f"--host {host} is reachable from other machines: set MUSTER_TOKEN to a secret first, here and for the clients"
+        )
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(128)
+        return listener
+    except OSError as error:
+        raise ServerError(
+            f"can't listen on {host}:{port}: {error.strerror or error}; choose another with --port"
+        ) from None

@@ -1,0 +1,372 @@
+"""The job YAML: what may be written in it, with the file, line and key of what may not.
+
+The spec compiles to ``RegisterJobDefinition`` and ``SubmitJob`` requests (:mod:`orchestrator.definition`); there is no second
+job model. It is carried whole in the definition's environment, so that a run can be resumed with changes.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from shared_store.layout import NAME
+
+KINDS = ("train", "evaluate", "export", "command")
+"""What a job can do: exactly one of these keys is in a spec."""
+
+_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+_BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+class SpecError(Exception):
+    """A spec can't be used; the message is one line: file, line, key, what was expected."""
+
+
+def _duration(value: object) -> object:
+    """``90s``, ``45m``, ``2h``, ``1d`` or a number of seconds → seconds."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd])", value.strip())
+        if not match:
+            raise ValueError("expected a duration such as 90s, 45m, 2h or 1d")
+        return float(match[1]) * _UNITS[match[2]]
+    return value
+
+
+def _mebibytes(value: object) -> object:
+    """``512MiB``, ``4GiB`` or a number of MiB → whole MiB."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
+        if not match:
+            raise ValueError("expected an amount of memory such as 512MiB or 4GiB")
+        return int(float(match[1]) * _BYTES[match[2]] / 2**20)
+    return value
+
+
+def _run_name(value: str) -> str:
+    if not NAME.fullmatch(value):
+        raise ValueError("expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128")
+    return value
+
+
+def _job_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}", value):
+        raise ValueError("expected letters, digits, '_' and '-', starting with a letter or digit, at most 100")
+    return value
+
+
+def _task_name(value: str) -> str:
+    known = known_tasks()
+    if ":" in value or value in known:
+        return value
+    nearest = difflib.get_close_matches(value, known, 1, cutoff=0.4)
+    hint = f"; did you mean {nearest[0]}?" if nearest else ""
+    raise ValueError(f"no task is called {value!r}{hint} (known: {', '.join(known)}; your own: module:Class)")
+
+
+def _environment(value: dict[str, str]) -> dict[str, str]:
+    for name, text in value.items():
+        if name.startswith(("AWS_BATCH", "MUSTER_")):
+            raise ValueError(f"{name} is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster")
+        if not name or "=" in name or "\0" in name + text:
+            raise ValueError(f"{name!r} can't be set: a name has no '=', and neither name nor value a zero byte")
+    return value
+
+
+def _argument(value: str) -> str:
+    if "\0" in value:
+        raise ValueError("expected a text without a zero byte")
+    return value
+
+
+def known_tasks() -> list[str]:
+    """Names of the installed tasks, from the entry-point group ``muster.tasks``; nothing is imported."""
+    return sorted({entry.name for entry in entry_points(group="muster.tasks")})
+
+
+Duration = Annotated[float, BeforeValidator(_duration)]
+Memory = Annotated[int, BeforeValidator(_mebibytes)]
+RunName = Annotated[str, AfterValidator(_run_name)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class NodeRange(_Section):
+    """How many nodes: ``nodes: 3`` or ``nodes: {min: 2, max: 4}`` (start with what is free)."""
+
+    min: int = Field(ge=1, le=250)
+    max: int = Field(ge=1, le=250)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_number(cls, value: object) -> object:
+        if isinstance(value, dict):
+            return value
+        if isinstance(value, int) and not isinstance(value, bool):
+            return {"min": value, "max": value}
+        raise ValueError("expected a whole number of nodes, or {min: 2, max: 4}")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> NodeRange:
+        if self.min > self.max:
+            raise ValueError(f"min ({self.min}) is more than max ({self.max})")
+        return self
+
+
+class Resources(_Section):
+    """What each node gets."""
+
+    cpus: float = Field(default=1.0, gt=0, description="CPU cores; fractions are allowed")
+    gpus: int = Field(default=0, ge=0, description="GPUs; one rank process is started for each")
+    memory: Memory = Field(default=1024, ge=4, description="memory, such as 4GiB")
+
+
+class PPO(_Section):
+    """Overrides of the task's own PPO configuration; what is not given stays as the task has it."""
+
+    steps: int | None = Field(default=None, ge=1, description="steps per world and iteration")
+    hidden_sizes: list[int] | None = Field(default=None, min_length=1)
+    activation: str | None = None
+    epochs: int | None = Field(default=None, ge=1)
+    minibatches: int | None = Field(default=None, ge=1)
+    learning_rate: float | None = Field(default=None, gt=0)
+    schedule: Literal["adaptive", "fixed"] | None = None
+    desired_kl: float | None = Field(default=None, gt=0)
+    gamma: float | None = Field(default=None, ge=0, le=1)
+    lam: float | None = Field(default=None, ge=0, le=1)
+    clip: float | None = Field(default=None, gt=0)
+    entropy_coef: float | None = Field(default=None, ge=0)
+    value_loss_coef: float | None = Field(default=None, ge=0)
+    max_grad_norm: float | None = Field(default=None, gt=0)
+    init_std: float | None = Field(default=None, gt=0)
+    normalize_observations: bool | None = None
+
+
+class Train(_Section):
+    """Train a policy with PPO."""
+
+    task: Annotated[str, AfterValidator(_task_name)] = Field(description="name of a task, or module:Class")
+    worlds: int = Field(ge=1, description="simulated worlds of each rank")
+    iterations: int = Field(ge=1)
+    seed: int = Field(default=1, ge=0, lt=2**31)
+    ppo: PPO = Field(default_factory=PPO)
+    config: dict[str, Any] = Field(default_factory=dict, description="overrides of the task's own configuration")
+
+
+class Evaluate(_Section):
+    """Evaluate a checkpoint of a run with the mean action."""
+
+    run: RunName
+    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    episodes: int = Field(default=1, ge=1, description="episodes of each world")
+    worlds: int = Field(default=64, ge=1, description="simulated worlds of each rank")
+
+
+class Export(_Section):
+    """Export the policy of a checkpoint as ONNX."""
+
+    run: RunName
+    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+
+
+class CheckpointPolicy(_Section):
+    """When training is saved, and how many checkpoints are kept (the best one is always kept too)."""
+
+    every: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
+        default=25, description="iterations; auto: as often as 1 % of the time allows"
+    )
+    keep: int = Field(default=5, ge=2)
+
+
+class Retry(_Section):
+    """How often a failed gang is started, in all."""
+
+    attempts: int = Field(default=3, ge=1, le=10)
+
+
+class Spec(_Section):
+    """One job."""
+
+    name: Annotated[str, AfterValidator(_job_name)]
+    queue: str = "default"
+    nodes: NodeRange = Field(default_factory=lambda: NodeRange(min=1, max=1))
+    resources: Resources = Field(default_factory=Resources)
+    train: Train | None = None
+    evaluate: Evaluate | None = None
+    export: Export | None = None
+    command: list[Annotated[str, AfterValidator(_argument)]] | None = Field(
+        default=None, min_length=1, description="program and arguments, run on every node"
+    )
+    environment: Annotated[dict[str, str], AfterValidator(_environment)] = Field(default_factory=dict)
+    image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
+    checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
+    retry: Retry = Field(default_factory=Retry)
+    on_child_failure: Literal["restart", "fail", "ignore"] = "restart"
+    timeout: Annotated[Duration, Field(ge=60)] | None = Field(default=None, description="of each attempt, such as 2h")
+
+    stall_timeout: Annotated[Duration, Field(gt=0)] = Field(
+        default=300.0, description="of one training iteration; a rank that takes longer is stuck, such as 5m"
+    )
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Spec:
+        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            found = f"found {' and '.join(given)}" if given else "found none"
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Which of :data:`KINDS` this job is."""
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+
+    @property
+    def ranks_per_node(self) -> int:
+        return max(1, self.resources.gpus)
+
+
+def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], int] | None = None) -> Spec:
+    """A spec from a plain mapping.
+
+    Args:
+        value: What the YAML or a request holds.
+        source: What to call it in an error (a file name).
+        lines: Line of each key path in the file, for errors.
+
+    Raises:
+        SpecError: One line naming the file, line and key, what was expected, and the nearest valid name.
+    """
+    if not isinstance(value, dict):
+        raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {_kind_of(value)}")
+    try:
+        return Spec.model_validate(value)
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        # a misspelt key comes before the one that is missing for it: it has a line, and a nearest name
+        first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
+        path = tuple(part for part in first["loc"] if isinstance(part, str | int))
+        line = _line_of(path, lines or {})
+        where = f"{source}:{line}" if line else source
+        key = ".".join(str(part) for part in path)
+        raise SpecError(f"{where}: {f'{key}: ' if key else ''}{_explain(first, path)}{more}") from None
+
+
+def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
+    """The document with ``key.path=value`` assignments applied (values are read as YAML). Raises SpecError."""
+    import copy
+
+    import yaml
+
+    result = copy.deepcopy(dict(document))
+    for assignment in assignments:
+        key, sign, text = assignment.partition("=")
+        if not sign or not all(key.split(".")):
+            raise SpecError(f"--set {assignment}: expected KEY=VALUE, such as train.iterations=600")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise SpecError(f"--set {assignment}: the value is not valid YAML") from None
+        *parents, last = key.split(".")
+        section: Any = result
+        for parent in parents:
+            section = section.setdefault(parent, {})
+            if not isinstance(section, dict):
+                raise SpecError(f"--set {assignment}: {parent} is not a section")
+        section[last] = value
+    return result
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema of the job YAML, for editors."""
+    document = Spec.model_json_schema()
+    definitions = document["$defs"]
+    definitions["NodeRange"] = {"anyOf": [{"type": "integer", "minimum": 1, "maximum": 250}, definitions["NodeRange"]]}
+    definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
+    text = {"type": ["string", "number"]}
+    definitions["Resources"]["properties"]["memory"] |= text
+    document["properties"]["stall_timeout"] = {**text, "default": "5m", "description": "of one training iteration"}
+    document["properties"]["timeout"] = {**text, "description": "of each attempt, such as 2h"}
+    document["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    document["title"] = "Muster job"
+    return document
+
+
+_EXPECTED = {
+    "missing": "is required",
+    "int_type": "expected a whole number",
+    "int_from_float": "expected a whole number",
+    "float_type": "expected a number",
+    "finite_number": "expected a finite number",
+    "string_type": "expected a text",
+    "list_type": "expected a list",
+    "dict_type": "expected a mapping",
+    "bool_type": "expected true or false",
+    "model_type": "expected a mapping",
+}
+
+
+def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
+    kind, found = problem["type"], problem.get("input")
+    if kind == "extra_forbidden":
+        valid = _keys_at(path[:-1])
+        nearest = difflib.get_close_matches(str(path[-1]), valid, 1, cutoff=0.5)
+        hint = f"did you mean {nearest[0]}?" if nearest else f"valid here: {', '.join(valid)}"
+        return f"unknown key; {hint}"
+    if kind == "missing":
+        return "is required"
+    if kind == "value_error":
+        text = str(problem["ctx"]["error"])
+        return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {_shown(found)}"
+    if kind == "literal_error":
+        return f"expected {problem['ctx']['expected']}, found {_shown(found)}"
+    if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
+        written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
+        return f"expected a number, found a text ({found!r}); in YAML it is written {written}"
+    if kind in _EXPECTED:
+        return f"{_EXPECTED[kind]}, found {_kind_of(found)}"
+    message = str(problem["msg"])
+    return f"{message.replace('Input should be', 'expected a value', 1)}, found {_shown(found)}"
+
+
+def _keys_at(path: tuple[str | int, ...]) -> list[str]:
+    model: type[BaseModel] = Spec
+    for part in path:
+        annotation = str(model.model_fields[str(part)].annotation) if str(part) in model.model_fields else ""
+        section = next((s for s in _Section.__subclasses__() if re.search(rf"\b{s.__name__}\b", annotation)), None)
+        if section is None:
+            return []
+        model = section
+    return list(model.model_fields)
+
+
+def _line_of(path: tuple[str | int, ...], lines: Mapping[tuple[str | int, ...], int]) -> int | None:
+    for end in range(len(path), 0, -1):
+        if path[:end] in lines:
+            return lines[path[:end]]
+    return None
+
+
+def _kind_of(value: object) -> str:
+    names = {
+        dict: "a mapping",
+        list: "a list",
+        str: "a text",
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+    }
+    shown = f" ({_shown(value)})" if isinstance(value, str | int | float) else ""
+    return "nothing" if value is None else names.get(type(value), type(value).__name__) + shown
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "…"

@@ -1,0 +1,265 @@
+"""Checkpoints: committed whole or not at all, verified when they are read, never written twice.
+
+``checkpoints/<iteration, 8 digits>-e<epoch>/`` holds ``manifest.json`` and the files that it lists with size and SHA-256. The
+directory appears by a rename, after everything in it is durable. ``LATEST`` is a hint for people; the truth is the listing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.files import read_json, remove_tree, sync_directory, sync_file, write_atomic, write_json
+from shared_store.layout import Run
+
+FORMAT = 1
+_NAME = re.compile(r"(\d{8})-e(\d+)")
+_MAKING = re.compile(r"\.(\d{8})-e(\d+)\.tmp")
+
+
+class DamagedCheckpoint(Exception):
+    """A checkpoint can't be used; the message names it, the file, and what is wrong with it."""
+
+
+class NewerFormat(DamagedCheckpoint):
+    """A newer Muster wrote the checkpoint: nothing is wrong with it, so nobody may set it aside."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A committed checkpoint. ``iteration`` is how many iterations were done when it was taken."""
+
+    path: Path
+    iteration: int
+    epoch: int
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """The content of ``manifest.json``. Raises DamagedCheckpoint where there is none that can be read."""
+        try:
+            manifest = read_json(self.path / "manifest.json")
+        except (OSError, ValueError) as error:
+            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json can't be read ({error})") from error
+        if manifest is None or not isinstance(manifest.get("files"), dict):
+            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json is missing or empty")
+        for name, entry in manifest["files"].items():
+            if not isinstance(entry, dict) or not {"size", "sha256"} <= entry.keys():
+                raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no size and digest of {name}")
+        if not isinstance(manifest.get("format"), int):
+            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no format")
+        if manifest["format"] > FORMAT:
+            raise NewerFormat(
+                f"checkpoint {self.name}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
+            )
+        return manifest
+
+    @property
+    def size(self) -> int:
+        """Bytes of all the files that the manifest lists."""
+        return sum(int(entry["size"]) for entry in self.manifest["files"].values())
+
+    def verify(self) -> None:
+        """Raises DamagedCheckpoint, naming the first file that is missing, truncated or altered."""
+        for name, entry in sorted(self.manifest["files"].items()):
+            path = self.path / name
+            try:
+                size = path.stat().st_size
+                if size != entry["size"]:
+                    raise DamagedCheckpoint(
+                        f"checkpoint {self.name}: {name} has {size} bytes, {entry['size']} were written"
+                    )
+                if _digest(path) != entry["sha256"]:
+                    raise DamagedCheckpoint(
+                        f"checkpoint {self.name}: the content of {name} was altered (SHA-256 differs)"
+                    )
+            except FileNotFoundError:
+                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is missing") from None
+            except OSError as error:
+                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} can't be read ({error.strerror})") from error
+
+
+def list_checkpoints(run: Run) -> list[Checkpoint]:
+    """Every committed checkpoint, the newest last.
+
+    A later epoch is newer whatever its iteration: each attempt starts from the newest of those before it, unless a person
+    chose an older one, and then the later history is the one that counts.
+    """
+    try:
+        entries = os.listdir(run.checkpoints)
+    except FileNotFoundError:
+        return []
+    matches = filter(None, map(_NAME.fullmatch, entries))
+    found = [Checkpoint(run.checkpoints / match[0], int(match[1]), int(match[2])) for match in matches]
+    return sorted(found, key=lambda checkpoint: (checkpoint.epoch, checkpoint.iteration))
+
+
+def newest_checkpoint(
+    run: Run,
+    *,
+    chosen: str | None = None,
+    chosen_since: int = 0,
+    damaged: Callable[[Checkpoint, DamagedCheckpoint], None] | None = None,
+) -> Checkpoint | None:
+    """The checkpoint that an attempt goes on from: the newest one that verifies; None where there is none.
+
+    Args:
+        run: The run.
+        chosen: Name of the checkpoint that a person asked for. It stands until the job that was asked has committed one of
+            its own, that is one of epoch ``chosen_since`` or later.
+        chosen_since: Epoch of that job's first attempt.
+        damaged: Called for each newer one that does not verify (to name it and to set it aside).
+
+    Raises:
+        DamagedCheckpoint: The chosen one is missing or does not verify: a person's choice is never replaced by a guess.
+    """
+    for checkpoint in reversed(list_checkpoints(run)):
+        if chosen is not None and checkpoint.epoch < chosen_since:
+            break
+        try:
+            checkpoint.verify()
+            return checkpoint
+        except DamagedCheckpoint as error:
+            if damaged:
+                damaged(checkpoint, error)
+    if chosen is None:
+        return None
+    for checkpoint in list_checkpoints(run):
+        if checkpoint.name == chosen:
+            checkpoint.verify()
+            return checkpoint
+    raise DamagedCheckpoint(f"checkpoint {chosen}: not in run {run.name}")
+
+
+def set_aside(checkpoint: Checkpoint) -> Path:
+    """Take a damaged checkpoint out of the listing without deleting it; returns where it is now."""
+    target = checkpoint.path.with_name(f"{checkpoint.name}.damaged")
+    suffix = 1
+    while target.exists():
+        suffix += 1
+        target = checkpoint.path.with_name(f"{checkpoint.name}.damaged-{suffix}")
+    os.rename(checkpoint.path, target)
+    sync_directory(target.parent)
+    return target
+
+
+def sweep(run: Run, up_to: tuple[int, int] | None = None) -> list[str]:
+    """Delete what interrupted commits and deletions left behind; returns the names. For the newest epoch's main rank only.
+
+    ``up_to``: epoch and iteration of a checkpoint; those in the making that come after it are left alone.
+    """
+    swept = []
+    for entry in os.listdir(run.checkpoints) if run.checkpoints.exists() else []:
+        making = _MAKING.fullmatch(entry)
+        if up_to and making and (int(making[2]), int(making[1])) > up_to:
+            continue
+        if entry.startswith(".") and entry.endswith((".tmp", ".trash")):
+            path = run.checkpoints / entry
+            if path.is_dir():
+                remove_tree(path)
+            else:
+                path.unlink(missing_ok=True)
+            swept.append(entry)
+    return swept
+
+
+class CheckpointWriter:
+    """One checkpoint in the making: every rank writes its own files into ``path``, then the main rank commits."""
+
+    def __init__(self, run: Run, iteration: int, epoch: int) -> None:
+        self.run, self.iteration, self.epoch = run, iteration, epoch
+        self.name = f"{iteration:08d}-e{epoch}"
+        self.path = run.checkpoints / f".{self.name}.tmp"
+        run.checkpoints.mkdir(exist_ok=True)  # not its parents: a run that somebody deleted does not come back in part
+        self.path.mkdir(exist_ok=True)
+
+    def add_file(self, name: str) -> None:
+        """Make a file that was written into ``path`` durable. Raises OSError."""
+        sync_file(self.path / name)
+
+    def commit(
+        self, facts: Mapping[str, Any], keep: int | None = None, digests: Mapping[str, Any] | None = None
+    ) -> Checkpoint:
+        """Publish the checkpoint: manifest, fsync, fence, rename, ``LATEST``, retention. Main rank only, after all files.
+
+        Args:
+            facts: What else the manifest says (world size, worlds, reward, versions); JSON values.
+            keep: How many of the newest checkpoints to keep; None keeps all. The best by ``reward`` is always kept.
+            digests: ``{name: {"size", "sha256"}}`` of every file, as those who wrote them know them; read back where None.
+
+        Raises:
+            StaleEpoch: A newer attempt owns the run; nothing was published.
+            FileExistsError: The name is committed already; it is never written twice.
+            OSError: The volume is full or gone; the last checkpoint stands.
+        """
+        for notes in self.path.glob(".*"):
+            notes.unlink()
+        files = digests or {
+            entry.name: {"size": entry.stat().st_size, "sha256": _digest(Path(entry.path))}
+            for entry in sorted(os.scandir(self.path), key=lambda entry: entry.name)
+            if entry.name != "manifest.json"
+        }
+        manifest = {
+            "format": FORMAT,
+            "iteration": self.iteration,
+            "epoch": self.epoch,
+            "created": time.time(),
+            "files": files,
+        }
+        write_json(self.path / "manifest.json", {**facts, **manifest})
+        target = self.run.checkpoints / self.name
+        if target.exists():
+            raise FileExistsError(f"checkpoint {self.name} exists already in {self.run.checkpoints}")
+        check_epoch(self.run, self.epoch)
+        os.rename(self.path, target)
+        sync_directory(self.run.checkpoints)
+        # The checkpoint is committed. What fails from here on costs a hint or space, and an attempt that was frozen in the rename
+        # must not prune what its successor made.
+        with contextlib.suppress(OSError, StaleEpoch):
+            check_epoch(self.run, self.epoch)
+            if keep is not None:
+                retain(self.run, keep)
+            # every rank's writer takes its saves in order: nobody works any more on an earlier one that failed
+            sweep(self.run, up_to=(self.epoch, self.iteration))
+            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode())
+        return Checkpoint(target, self.iteration, self.epoch)
+
+
+def retain(run: Run, keep: int) -> list[str]:
+    """Delete all but the newest ``keep`` checkpoints, the best one (greatest ``reward``) and those that an evaluation or an export
+    was made of; returns the deleted names.
+    """
+    checkpoints = list_checkpoints(run)
+    scored = [(score, c.name) for c in checkpoints if (score := _reward(c)) is not None]
+    kept = {c.name for c in checkpoints[-max(1, keep) :]} | ({max(scored)[1]} if scored else set())
+    kept |= {path.stem for path in run.evaluations.glob("*.json")} | {path.name for path in run.exports.glob("*")}
+    deleted = [checkpoint for checkpoint in checkpoints if checkpoint.name not in kept]
+    for checkpoint in deleted:
+        remove_tree(checkpoint.path)
+    return [checkpoint.name for checkpoint in deleted]
+
+
+def _reward(checkpoint: Checkpoint) -> float | None:
+    try:
+        reward = checkpoint.manifest.get("reward")
+    except DamagedCheckpoint:
+        return None
+    return float(reward) if isinstance(reward, int | float) and math.isfinite(reward) else None
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,149 @@
+"""The node contract: the environment variables with which every engine starts every node.
+
+The ``AWS_BATCH_*`` names mean what they mean on AWS; ``MASTER_ADDR`` and its kin are torch.distributed's; ``MUSTER_*`` are ours.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+class ContractError(Exception):
+    """A variable of the node contract is missing or malformed; the message names it."""
+
+
+@dataclass(frozen=True)
+class NodeContract:
+    """What a node of a gang is told when it starts."""
+
+    job: str
+    """Job id, without ``#``."""
+    attempt: int
+    """From 1; grows with every launch of the job."""
+    node_index: int
+    node_count: int
+    main_index: int
+    """AWS's node indices; ``node_index == main_index`` on the main node."""
+    master_address: str
+    master_port: int
+    run: str
+    store: str
+    epoch: int
+    """Fencing number of this attempt in the run."""
+    job_epoch: int
+    """Epoch of the job's first attempt."""
+    ranks_per_node: int = 1
+    grace: float = 30.0
+    """Seconds between SIGTERM and SIGKILL."""
+    queue: str = "default"
+    compute_environment: str = "local"
+    cpus: float = 1.0
+    """The node's share of CPUs, divided among its ranks."""
+    stall_timeout: float | None = None
+    """Seconds without an iteration after which a rank counts as stuck; None where nobody asked."""
+    address: str | None = None
+    """The node's own address, where the engine gives it one."""
+    bus: str | None = None
+    bus_token: str | None = None
+
+    @property
+    def node_rank(self) -> int:
+        """The main node is rank 0 whatever its index; the others follow in the order of theirs."""
+        if self.node_index == self.main_index:
+            return 0
+        return self.node_index + (1 if self.node_index < self.main_index else 0)
+
+    @property
+    def world_size(self) -> int:
+        return self.node_count * self.ranks_per_node
+
+    @property
+    def gang(self) -> str:
+        """Names the attempt; carried by every process of it, so that none can be missed when it is stopped."""
+        return f"{self.job}/{self.attempt}/{self.epoch}"
+
+    def to_env(self) -> dict[str, str]:
+        """The variables, as an engine sets them on this node."""
+        main = self.node_index == self.main_index
+        env = {
+            "AWS_BATCH_JOB_ID": f"{self.job}#{self.node_index}",
+            "AWS_BATCH_JOB_ATTEMPT": str(self.attempt),
+            "AWS_BATCH_JOB_NODE_INDEX": str(self.node_index),
+            "AWS_BATCH_JOB_NUM_NODES": str(self.node_count),
+            "AWS_BATCH_JOB_MAIN_NODE_INDEX": str(self.main_index),
+            "AWS_BATCH_CE_NAME": self.compute_environment,
+            "AWS_BATCH_JQ_NAME": self.queue,
+            "AWS_EXECUTION_ENV": "MUSTER",
+            "MASTER_ADDR": self.master_address,
+            "MASTER_PORT": str(self.master_port),
+            "NODE_RANK": str(self.node_rank),
+            "NNODES": str(self.node_count),
+            "MUSTER_JOB_ID": self.job,
+            "MUSTER_RUN": self.run,
+            "MUSTER_STORE": self.store,
+            "MUSTER_EPOCH": str(self.epoch),
+            "MUSTER_JOB_EPOCH": str(self.job_epoch),
+            "MUSTER_GANG": self.gang,
+            "MUSTER_RANKS_PER_NODE": str(self.ranks_per_node),
+            "MUSTER_GRACE_SECONDS": f"{self.grace:g}",
+            "MUSTER_CPUS": f"{self.cpus:g}",
+        }
+        if not main:
+            env["AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"] = self.master_address
+        stall = None if self.stall_timeout is None else f"{self.stall_timeout:g}"
+        optional = {
+            "MUSTER_STALL_TIMEOUT": stall,
+            "MUSTER_ADDRESS": self.address,
+            "MUSTER_BUS": self.bus,
+            "MUSTER_BUS_TOKEN": self.bus_token,
+        }
+        return env | {name: value for name, value in optional.items() if value}
+
+    @classmethod
+    def from_env(cls, env: Mapping[str, str]) -> NodeContract:
+        """Read the contract. Raises ContractError naming the variable that is missing or malformed."""
+
+        def integer(name: str, default: int | None = None) -> int:
+            value = env.get(name, "" if default is None else str(default))
+            if not re.fullmatch(r"-?[0-9]+", value):
+                problem = f"is {value!r}, not a whole number" if value else "is missing"
+                raise ContractError(f"{name} {problem}; a node is started by one of Muster's engines")
+            return int(value)
+
+        def number(name: str, default: float) -> float:
+            value = env.get(name, str(default))
+            if not re.fullmatch(r"[0-9]+(\.[0-9]*)?(e[+-]?[0-9]+)?", value):
+                raise ContractError(f"{name} is {value!r}, not a number; a node is started by one of Muster's engines")
+            return float(value)
+
+        def text(name: str) -> str:
+            if not env.get(name):
+                raise ContractError(f"{name} is missing; a node is started by one of Muster's engines")
+            return env[name]
+
+        index, main = integer("AWS_BATCH_JOB_NODE_INDEX", 0), integer("AWS_BATCH_JOB_MAIN_NODE_INDEX", 0)
+        epoch = integer("MUSTER_EPOCH")
+        return cls(
+            job=text("MUSTER_JOB_ID"),
+            attempt=integer("AWS_BATCH_JOB_ATTEMPT", 1),
+            node_index=index,
+            node_count=integer("AWS_BATCH_JOB_NUM_NODES", 1),
+            main_index=main,
+            master_address=env.get("MASTER_ADDR", "127.0.0.1"),
+            master_port=integer("MASTER_PORT", 29500),
+            run=text("MUSTER_RUN"),
+            store=text("MUSTER_STORE"),
+            epoch=epoch,
+            job_epoch=integer("MUSTER_JOB_EPOCH", epoch),
+            ranks_per_node=integer("MUSTER_RANKS_PER_NODE", 1),
+            grace=number("MUSTER_GRACE_SECONDS", 30.0),
+            queue=env.get("AWS_BATCH_JQ_NAME", "default"),
+            compute_environment=env.get("AWS_BATCH_CE_NAME", "local"),
+            cpus=number("MUSTER_CPUS", 1.0),
+            stall_timeout=float(env["MUSTER_STALL_TIMEOUT"]) if env.get("MUSTER_STALL_TIMEOUT") else None,
+            address=env.get("MUSTER_ADDRESS"),
+            bus=env.get("MUSTER_BUS"),
+            bus_token=env.get("MUSTER_BUS_TOKEN"),
+        )

@@ -1,0 +1,116 @@
+"""Where everything lies on the shared volume (``<store>/runs/<run>/…``)."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shared_store.files import read_json, write_json
+
+FORMAT = 1
+"""Version of the layout; a store with a newer one is refused."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+"""What a run may be called: it becomes a directory name."""
+
+
+class StoreError(Exception):
+    """The store can't be used; the message says which path, why, and what to do."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training history, continued by one or more jobs. Paths only; nothing is created by asking for them."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics"
+
+    @property
+    def evaluations(self) -> Path:
+        return self.path / "evaluations"
+
+    @property
+    def exports(self) -> Path:
+        return self.path / "exports"
+
+    def logs(self, job: str, attempt: int) -> Path:
+        return self.path / "logs" / job / str(attempt)
+
+    def log(self, job: str, attempt: int, node: int) -> Path:
+        return self.logs(job, attempt) / f"node-{node}.log"
+
+    def outcome(self, job: str, attempt: int, node: int) -> Path:
+        return self.path / "outcomes" / job / str(attempt) / f"node-{node}.json"
+
+    def description(self) -> dict[str, Any] | None:
+        """The content of ``run.json`` (spec, code versions, creation time); None where the run does not exist."""
+        return read_json(self.path / "run.json")
+
+    def create(self, description: dict[str, Any]) -> None:
+        """Write ``run.json`` once; a run that exists keeps the one it has."""
+        if not (self.path / "run.json").exists():
+            write_json(self.path / "run.json", description)
+
+
+@dataclass(frozen=True)
+class Store:
+    """The shared volume at ``path``."""
+
+    path: Path
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        object.__setattr__(self, "path", Path(path).expanduser().absolute())
+
+    def open(self) -> Store:
+        """Create the layout where it is missing and prove that it can be written.
+
+        Raises StoreError for a path that can't be created or written, or that holds a newer format.
+        """
+        try:
+            (self.path / "runs").mkdir(parents=True, exist_ok=True)
+            description = read_json(self.path / "store.json")
+            if description is None:
+                write_json(self.path / "store.json", {"format": FORMAT})
+                description = {"format": FORMAT}
+            probe = self.path / "runs" / f".probe-{os.getpid()}"
+            probe.write_bytes(b"")
+            probe.unlink()
+        except OSError as error:
+            raise StoreError(
+                f"store {self.path}: not writable ({error.strerror or error}); choose another with --store"
+            ) from error
+        except ValueError as error:
+            raise StoreError(f"store {self.path}: store.json is damaged ({error})") from error
+        if not isinstance(description.get("format"), int) or description["format"] > FORMAT:
+            raise StoreError(
+                f"store {self.path}: has format {description.get('format')}, this Muster reads up to {FORMAT}; upgrade Muster"
+            )
+        return self
+
+    def run(self, name: str) -> Run:
+        """The run called ``name``, whether it exists or not. Raises StoreError for a name that can't be a directory."""
+        if not NAME.fullmatch(name):
+            raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
+        return Run(self.path / "runs" / name)
+
+    def runs(self) -> list[Run]:
+        """Every run that exists, by name."""
+        try:
+            names = sorted(entry.name for entry in os.scandir(self.path / "runs") if NAME.fullmatch(entry.name))
+        except FileNotFoundError:
+            return []
+        return [run for run in map(self.run, names) if (run.path / "run.json").exists()]

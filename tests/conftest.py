@@ -1,0 +1,169 @@
+"""A real controller for tests: ``muster serve`` as a subprocess on a home directory of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.client import Client
+
+REPOSITORY = Path(__file__).parent.parent
+MUSTER = str(Path(sys.executable).parent / "muster")
+
+# One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
+os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
+
+
+def run_muster(*arguments: str, home: Path, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
+    """The real command in a subprocess."""
+    return subprocess.run(
+        [MUSTER, *arguments],
+        env={**os.environ, "MUSTER_HOME": str(home), "COLUMNS": "200", **env},
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+    )
+
+
+def processes_of(home: Path) -> list[int]:
+    """Pids of the nodes and ranks whose store is below ``home``."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit() and f"MUSTER_STORE={home}".encode() in (entry / "environ").read_bytes():
+                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+                if state != "Z":
+                    found.append(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+def wait_for(condition: Callable[[], Any], timeout: float = 60, what: str = "condition") -> Any:
+    """Poll until ``condition`` gives something true; that is returned."""
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        if value := condition():
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"{what}: not within {timeout} s")
+
+
+class Serving:
+    """A ``muster serve`` subprocess."""
+
+    def __init__(self, home: Path, *options: str) -> None:
+        self.home, self.options = home, options
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [MUSTER, "serve", "--port", "0", *self.options],
+            env={**os.environ, "MUSTER_HOME": str(self.home)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith("Muster serves "), line + (self.process.stderr.read() if self.process.stderr else "")
+        self.url = line.split()[2]
+        self.client = Client(self.url)
+
+    def kill(self) -> None:
+        """SIGKILL, as a crash would end it."""
+        self.process.kill()
+        self.process.wait()
+
+    def muster(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+        return run_muster(*arguments, home=self.home, timeout=timeout)
+
+    def gang(self, script: str, nodes: int = 1, name: str = "test", **container: Any) -> str:
+        """Submit ``script`` (Python) as a gang with plain Batch requests; returns the job id. ``env``: environment."""
+        return submit_gang(self.client, script, nodes, name, **container)
+
+    def detail(self, job: str) -> dict[str, Any]:
+        detail: dict[str, Any] = self.client.get(f"/api/jobs/{job}")
+        return detail
+
+    def wait(self, job: str, *statuses: str, timeout: float = 60) -> dict[str, Any]:
+        """The job's detail, once it is in one of ``statuses`` (by default, over)."""
+        wanted = statuses or ("SUCCEEDED", "FAILED")
+
+        def there() -> dict[str, Any] | None:
+            detail = self.detail(job)
+            return detail if detail["status"] in wanted else None
+
+        found: dict[str, Any] = wait_for(there, timeout, f"job {job} {wanted}")
+        return found
+
+    def log(self, job: str, **query: Any) -> list[str]:
+        return [line["text"] for line in self.client.logs(job, **query)]
+
+    def close(self) -> None:
+        """End the server, and whatever a failed test left running."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            self.process.wait(10)
+        self.client.close()
+        for pid in processes_of(self.home):
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+
+
+def submit_gang(
+    client: Client,
+    script: str,
+    nodes: int = 1,
+    name: str = "test",
+    *,
+    env: dict[str, str] | None = None,
+    cpus: str = "0.1",
+    attempts: int = 1,
+    timeout: int | None = None,
+) -> str:
+    """Register and submit a Python script as a multi-node job; returns the job id."""
+    container = {
+        "image": "muster",
+        "command": ["python", "-u", "-c", script],
+        "environment": [{"name": key, "value": value} for key, value in (env or {}).items()],
+        "resourceRequirements": [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "16"}],
+    }
+    ranges = [{"targetNodes": "0:", "container": container}]
+    properties = {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": ranges}
+    definition: dict[str, Any] = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+    definition["retryStrategy"] = {"attempts": attempts}
+    if timeout:
+        definition["timeout"] = {"attemptDurationSeconds": timeout}
+    registered = client.batch("RegisterJobDefinition", **definition)
+    submitted = client.batch(
+        "SubmitJob", jobName=name, jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
+    )
+    return str(submitted["jobId"])
+
+
+@pytest.fixture(scope="session")
+def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    """One server for the tests that neither kill it nor fill it."""
+    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "8")
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Serving]:
+    """A server of the test's own."""
+    server = Serving(tmp_path / "home", "--cpus", "4")
+    yield server
+    server.close()

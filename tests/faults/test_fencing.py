@@ -1,0 +1,95 @@
+"""Law 4a: a gang that was frozen through a whole restart and then wakes stops by itself and can't touch the run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+from orchestrator import specfile
+from orchestrator.definition import compile_definition, gang_needs
+from orchestrator.engines.base import Gang, Placement
+from orchestrator.engines.local import LocalEngine
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.conftest import REPOSITORY, processes_of, wait_for
+
+
+def gang(store: Store, job: str, epoch: int) -> Gang:
+    """One node that trains the cart-pole for ever on run ``r``."""
+    small = ["nodes=1", "train.worlds=16", "train.iterations=100000", "checkpoint.every=3", "checkpoint.keep=3"]
+    spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), small)
+    needs = gang_needs(compile_definition(spec, str(REPOSITORY))["nodeProperties"])
+    node = needs.nodes[0]
+    return Gang(
+        job=job,
+        attempt=1,
+        epoch=epoch,
+        job_epoch=epoch,
+        run="r",
+        store=str(store.path),
+        queue="default",
+        main=0,
+        commands=[node.command],
+        environments=[node.environment],
+        placements=[Placement("localhost", (), node.cpus, node.memory)],
+        grace=30.0,
+        directory=str(REPOSITORY),
+    )
+
+
+def members(store: Store, job: str) -> list[int]:
+    """Pids of a gang's supervisor, ranks and writers."""
+    found = []
+    for pid in processes_of(store.path):
+        try:
+            if f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{pid}/environ").read_bytes():
+                found.append(pid)
+        except OSError:
+            continue
+    return found
+
+
+def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(tmp_path: Path) -> None:
+    store = Store(tmp_path).open()
+    run = store.run("r")
+    run.create({"run": "r"})
+    engine = LocalEngine(tmp_path / "home")
+    raise_epoch(run, 1)
+    stale = engine.launch(engine.plan(gang(store, "stale", 1)))
+    try:
+        wait_for(lambda: len(list_checkpoints(run)) >= 2, 180, "checkpoints of the first gang")
+        frozen = members(store, "stale")
+        assert len(frozen) == 3, "supervisor, rank and writer"
+        for pid in frozen:
+            os.kill(pid, signal.SIGSTOP)
+
+        raise_epoch(run, 2)
+        successor = engine.launch(engine.plan(gang(store, "successor", 2)))
+        wait_for(lambda: sum(c.epoch == 2 for c in list_checkpoints(run)) >= 2, 180, "checkpoints of its successor")
+        log = run.log("stale", 1, 0)
+        before = (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size)
+        for pid in frozen:
+            os.kill(pid, signal.SIGCONT)
+        wait_for(lambda: not members(store, "stale"), 10, "the end of the gang that woke")
+
+        wait_for(lambda: not engine.observe(stale)[0].running, 5, "its supervisor's end")
+        assert engine.observe(stale)[0].exit_code == 3
+        assert (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size) == before
+        assert not run.outcome("stale", 1, 0).exists()
+        assert engine.observe(successor)[0].running
+        newest = list_checkpoints(run)[-1]
+        wait_for(lambda: list_checkpoints(run)[-1].iteration > newest.iteration + 3, 60, "undisturbed progress")
+        assert all(checkpoint.epoch == 2 for checkpoint in list_checkpoints(run)[-3:])
+        for checkpoint in list_checkpoints(run)[-2:-1]:
+            checkpoint.verify()
+        iterations = [record["iteration"] for record in read_metrics(run)]
+        assert iterations == list(range(1, len(iterations) + 1))
+        engine.stop(successor, 30)
+        assert json.loads(run.outcome("successor", 1, 0).read_text())["exit_code"] == 75
+    finally:
+        for pid in processes_of(store.path):
+            os.kill(pid, signal.SIGKILL)

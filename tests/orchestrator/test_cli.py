@@ -1,0 +1,183 @@
+"""The command as a person types it: bad input ends with one clear line and an exit code, and leaves nothing half made."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY, Serving, run_muster, wait_for
+
+
+def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
+    """The command exits with ``code`` and one line on stderr that holds all ``parts``."""
+    done = run_muster(*arguments, home=home, **env)
+    assert done.returncode == code, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
+    for part in parts:
+        assert part in lines[0], f"{part!r} is not in: {lines[0]}"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("- a\n- list\n", ["expected a mapping", "found a list"]),
+        ("name: [unclosed\n", ["not valid YAML"]),
+        ("", ["expected a mapping", "found nothing"]),
+        ("name: a\ntrain: {task: Cartpol, worlds: 4, iterations: 1}\n", [":2: train.task", "did you mean Cartpole?"]),
+        ("name: a\nnodes: 0\ncommand: [x]\n", [":2: nodes", "greater than or equal to 1", "found 0"]),
+        ("name: a\nnodes: two\ncommand: [x]\n", [":2: nodes", "whole number of nodes"]),
+        ("name: a\nnode: 2\ncommand: [x]\n", [":2: node: unknown key; did you mean nodes?"]),
+        (
+            "name: a\ncommand: [x]\ntrain: {task: Ant, worlds: 1, iterations: 1}\n",
+            ["exactly one of", "found train and command"],
+        ),
+        ("name: a\nresources: {memory: lots}\ncommand: [x]\n", [":2: resources.memory", "such as 512MiB or 4GiB"]),
+    ],
+)
+def test_a_bad_spec_is_refused_with_file_line_and_key(tmp_path: Path, text: str, parts: list[str]) -> None:
+    spec = tmp_path / "job.yaml"
+    spec.write_text(text)
+    home = tmp_path / "home"
+    refused(["run", str(spec)], home, 2, str(spec), *parts)
+    assert not home.exists(), "a refused spec must not start a controller"
+
+
+def test_a_missing_file_and_a_bad_override_are_named(tmp_path: Path) -> None:
+    refused(["submit", "nowhere.yaml"], tmp_path, 2, "nowhere.yaml: No such file")
+    spec = "job_specs/cartpole.yaml"
+    refused(
+        ["submit", spec, "--set", "train.iteration=5"],
+        tmp_path,
+        2,
+        "train.iteration: unknown key; did you mean iterations?",
+    )
+    refused(["submit", spec, "--set", "novalue"], tmp_path, 2, "--set novalue: expected KEY=VALUE")
+
+
+def test_more_than_any_host_has_is_refused_before_anything_is_registered(shared_server: Serving) -> None:
+    before = shared_server.client.batch(
+        "ListJobs", jobQueue="default", filters=[{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+    )
+    for change, parts in [
+        ("resources.gpus=99", ["99 GPUs", "the largest host has"]),
+        ("resources.cpus=512", ["512 CPUs", "the largest host has 8 CPUs"]),
+        ("nodes=200", ["needs 200 nodes", "all hosts together have"]),
+    ]:
+        refused(
+            ["submit", "job_specs/cartpole.yaml", "--set", change],
+            shared_server.home,
+            2,
+            "cartpole.yaml: resources:",
+            *parts,
+        )
+    after = shared_server.client.batch(
+        "ListJobs", jobQueue="default", filters=[{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+    )
+    assert before == after
+
+
+def test_a_store_that_is_not_writable_is_refused(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a directory")
+    refused(
+        ["serve", "--port", "0", "--store", str(blocked / "store")], tmp_path / "home", 1, "not writable", "--store"
+    )
+    assert not (tmp_path / "home" / "muster.db").exists()
+    refused(
+        ["run", "job_specs/cartpole.yaml", "--store", "/proc/store"],
+        tmp_path / "home",
+        1,
+        "store /proc/store: not writable",
+    )
+
+
+def test_a_port_in_use_is_refused(tmp_path: Path) -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = str(holder.getsockname()[1])
+        refused(["serve", "--port", port], tmp_path, 1, f"can't listen on 127.0.0.1:{port}", "--port")
+
+
+def test_a_second_controller_on_the_same_home_is_refused(shared_server: Serving) -> None:
+    refused(["serve", "--port", "0"], shared_server.home, 1, "already served by a controller (pid ", shared_server.url)
+
+
+def test_off_loopback_a_token_is_demanded_and_then_checked(tmp_path: Path) -> None:
+    refused(["serve", "--host", "0.0.0.0", "--port", "0"], tmp_path, 1, "set MUSTER_TOKEN")
+    os.environ["MUSTER_TOKEN"] = "secret"
+    try:
+        server = Serving(tmp_path / "home", "--host", "0.0.0.0")
+    finally:
+        del os.environ["MUSTER_TOKEN"]
+    try:
+        refused(["list"], server.home, 1, "a token is needed", MUSTER_TOKEN="wrong")
+        assert run_muster("list", home=server.home, MUSTER_TOKEN="secret").returncode == 0
+    finally:
+        server.close()
+
+
+def test_commands_without_a_controller_say_how_to_start_one(tmp_path: Path) -> None:
+    with socket.socket() as holder:  # a port that nobody serves
+        holder.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{holder.getsockname()[1]}"
+        refused(["list"], tmp_path, 1, f"no controller answers at {url}", "muster serve", MUSTER_URL=url)
+
+
+def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
+    home = shared_server.home
+    refused(["show", "nonsense"], home, 2, "job nonsense does not exist")
+    refused(["logs", "nonsense"], home, 2, "job nonsense does not exist")
+    refused(["stop", "nonsense"], home, 2, "job nonsense does not exist")
+    refused(["resume", "nonsense"], home, 2, "run nonsense does not exist")
+    refused(["checkpoints", "nonsense"], home, 2, "run nonsense does not exist")
+    refused(["checkpoints", "../../etc"], home, 2, "")
+
+
+def test_a_run_that_no_spec_started_is_not_resumed_blindly(shared_server: Serving) -> None:
+    job = shared_server.gang("pass", name="plain")
+    detail = shared_server.wait(job)
+    refused(["resume", detail["run"]], shared_server.home, 2, "was not started from a YAML spec")
+
+
+def test_help_has_examples_for_every_command(tmp_path: Path) -> None:
+    listing = run_muster("--help", home=tmp_path).stdout
+    for command in ("run", "serve", "submit", "list", "show", "stop", "schema", "logs", "resume", "checkpoints"):
+        assert f" {command} " in listing
+        assert "Example" in run_muster(command, "--help", home=tmp_path).stdout or command == "schema"
+
+
+def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server: Serving, tmp_path: Path) -> None:
+    spec = tmp_path / "job.yaml"
+    spec.write_text(
+        "name: greeter\nnodes: 2\nresources: {cpus: 0.1, memory: 16MiB}\n"
+        'command: [python, -u, -c, \'import os, time; print("hello from", os.environ["RANK"]); time.sleep(60)\']\n'
+    )
+    submitted = json.loads(shared_server.muster("submit", str(spec), "--json").stdout)
+    shared_server.wait(submitted["jobId"], "RUNNING")
+    wait_for(lambda: len(shared_server.log(submitted["jobId"])) == 2, what="both greetings")
+    assert "greeter" in shared_server.muster("list").stdout
+    shown = shared_server.muster("show", "greeter").stdout
+    assert "RUNNING" in shown and "node 1" in shown and "attempt 1 of 3" in shown
+    assert "hello from 1" in shared_server.muster("logs", "greeter", "--node", "1").stdout
+    only = shared_server.muster(
+        "logs", submitted["jobId"][:8], "--rank", "0", "--since", "10m", "--grep", "hello"
+    ).stdout
+    assert "hello from 0" in only and "hello from 1" not in only
+    stopped = shared_server.muster("stop", "greeter")
+    assert stopped.returncode == 0 and "ended: stopped by the user" in stopped.stdout
+    assert json.loads(shared_server.muster("show", "greeter", "--json").stdout)["status"] == "FAILED"
+    assert "FAILED already" in shared_server.muster("stop", "greeter").stdout
+
+
+def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -> None:
+    assert "muster" not in (REPOSITORY / "job_specs" / "all_reduce.py").read_text().lower()
+    done = shared_server.muster("run", "job_specs/all-reduce.yaml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    for rank in range(3):
+        assert f"rank {rank} of 3 on node {rank}: sum = 6, expected 6" in done.stdout

@@ -1,0 +1,372 @@
+"""The local engine: real supervisors on this machine, found again, told apart, and gone when they are stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.engines.base import EngineError, Gang, NodeStatus, Placement
+from orchestrator.engines.local import LocalEngine
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower
+from shared_store.outcomes import read_outcome
+from tests.conftest import processes_of, wait_for
+
+WAIT = "echo ready; exec sleep 600"
+STAY = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
+
+
+def command_line(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+
+JOB = "local-engine-job"
+"""A name that no other test gives: gangs are found by their name on the whole machine."""
+
+
+class Bench:
+    """An engine with a home and a store of its own, and the gangs that it started."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.store = Store(home / "store").open()
+        self.engine = LocalEngine(home / "home", cpus=8, gpus=["0", "1", "2", "3"])
+
+    def gang(self, script: str = WAIT, nodes: int = 2, **changes: Any) -> Gang:
+        facts: dict[str, Any] = {
+            "job": JOB,
+            "attempt": 1,
+            "epoch": 1,
+            "job_epoch": 1,
+            "run": "run",
+            "store": str(self.store.path),
+            "queue": "default",
+            "main": 0,
+            "commands": [["sh", "-c", script]] * nodes,
+            "environments": [{}] * nodes,
+            "placements": [Placement("localhost", (), 0.5, 64)] * nodes,
+            "grace": 5.0,
+            "directory": str(self.home),
+        }
+        return Gang(**{**facts, **changes})
+
+    def launch(self, gang: Gang, engine: LocalEngine | None = None) -> str:
+        engine = engine or self.engine
+        return engine.launch(engine.plan(gang))
+
+    def lines(self, job: str = JOB) -> list[tuple[int, str]]:
+        """(node, text) of what the ranks printed."""
+        found = LogFollower(self.store.run("run"), job).drain()
+        return [(line.node, line.text) for line in found if line.rank is not None]
+
+    def ready(self, nodes: int = 2, job: str = JOB) -> None:
+        wait_for(lambda: [text for _, text in self.lines(job)].count("ready") == nodes, 10, f"{nodes} nodes")
+
+    def wait_for_end(self, handle: str, engine: LocalEngine | None = None) -> Sequence[NodeStatus]:
+        def ended() -> Sequence[NodeStatus] | None:
+            status = (engine or self.engine).observe(handle)
+            return None if any(node.running for node in status) else status
+
+        found: Sequence[NodeStatus] = wait_for(ended, 15, "the end of the gang")
+        return found
+
+    def environments(self, nodes: int) -> list[dict[str, str]]:
+        """What a gang that prints its environment as JSON printed, by node index."""
+        found: dict[int, dict[str, str]] = {}
+        for node, text in self.lines():
+            found[node] = json.loads(text)
+        return [found[index] for index in range(nodes)]
+
+    def processes(self) -> list[int]:
+        return processes_of(self.store.path)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    yield bench
+    while left := bench.processes():
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+
+
+def pids(handle: str) -> list[int]:
+    return [node["pid"] for node in json.loads(handle)["nodes"]]
+
+
+# -- capacity and plan ------------------------------------------------------------------------------------------------
+
+
+def test_the_machine_is_the_only_host_with_what_it_was_given() -> None:
+    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity()
+    assert (host.name, host.cpus, host.gpus) == ("localhost", 6, ("2", "5"))
+    assert host.memory == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
+
+
+def test_without_a_limit_the_machine_s_own_cpus_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1,3")
+    [host] = LocalEngine(Path("/nowhere")).capacity()
+    assert (host.cpus, host.gpus) == (float(os.cpu_count() or 1), ("1", "3"))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert LocalEngine(Path("/nowhere")).capacity()[0].gpus == ()
+
+
+def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: Bench) -> None:
+    gang = bench.gang(nodes=3)
+    assert bench.engine.plan(gang) == bench.engine.plan(gang)
+    assert bench.processes() == []
+
+
+def test_every_node_has_a_loopback_address_of_its_own_and_all_know_the_main_node_s(bench: Bench) -> None:
+    contracts = [node.contract for node in bench.engine.plan(bench.gang(nodes=4, main=2)).nodes]
+    addresses = [contract.address for contract in contracts]
+    assert len(set(addresses)) == 4
+    assert all(address and address.startswith("127.") for address in addresses)
+    assert {contract.master_address for contract in contracts} == {addresses[2]}
+    for address in addresses:
+        with socket.socket() as probe:
+            probe.bind((address, 0))
+
+
+def test_two_gangs_have_different_addresses(bench: Bench) -> None:
+    first, second = (
+        {node.contract.address for node in bench.engine.plan(bench.gang(attempt=attempt)).nodes} for attempt in (1, 2)
+    )
+    assert not first & second
+
+
+def test_the_addresses_of_the_largest_gang_are_addresses(bench: Bench) -> None:
+    addresses = [node.contract.address for node in bench.engine.plan(bench.gang(nodes=250)).nodes]
+    assert len(set(addresses)) == 250
+    for address in addresses:
+        socket.inet_aton(address or "")
+
+
+# -- what a node gets -------------------------------------------------------------------------------------------------
+
+PRINT_ENVIRONMENT = "import json, os; print(json.dumps(dict(os.environ)))"
+
+
+def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MUSTER_TOKEN", "MUSTER_URL"):
+        monkeypatch.setenv(name, "/the/controller's/own")
+    monkeypatch.setenv("INHERITED", "yes")
+    gang = bench.gang(
+        nodes=2,
+        main=1,
+        commands=[["python", "-c", PRINT_ENVIRONMENT]] * 2,
+        environments=[{"MINE": "first", "MUSTER_EPOCH": "99", "RANK": "99"}, {"MINE": "second", "INHERITED": "no"}],
+        placements=[Placement("localhost", ("3", "1"), 2, 64), Placement("localhost", (), 0.5, 64)],
+        attempt=4,
+        epoch=7,
+        job_epoch=5,
+        queue="gpu",
+    )
+    bench.wait_for_end(bench.launch(gang))
+    plan = bench.engine.plan(gang)
+    for index, found in enumerate(bench.environments(2)):
+        expected = plan.nodes[index].contract.to_env()
+        del expected["MASTER_PORT"]
+        assert {name: found.get(name) for name in expected} == expected
+        assert not found.keys() & {"MUSTER_TOKEN", "MUSTER_URL"}
+        assert "WARP_CACHE_PATH" in found
+    first, second = bench.environments(2)
+    assert (first["MINE"], second["MINE"]) == ("first", "second")
+    assert (first["INHERITED"], second["INHERITED"]) == ("yes", "no")
+    assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("3,1", "")
+    assert (first["RANK"], second["RANK"]) == ("1", "0"), "the main node has rank 0, whatever its index"
+    assert first["MUSTER_EPOCH"] == "7", "a job's environment can't replace the contract"
+    assert first["MASTER_PORT"] == second["MASTER_PORT"]
+    main = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
+    assert (first.get(main), second.get(main)) == (first["MASTER_ADDR"], None)
+
+
+def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: Bench) -> None:
+    gang = bench.gang("echo $RANK of $WORLD_SIZE", environments=[{"MUSTER_RANKS_PER_NODE": "2"}] * 2)
+    bench.wait_for_end(bench.launch(gang))
+    assert sorted(bench.lines()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
+
+
+def test_commands_run_in_the_job_s_directory_which_can_not_hide_our_own_packages(bench: Bench, tmp_path: Path) -> None:
+    directory = tmp_path / "mine"
+    (directory / "worker").mkdir(parents=True)
+    (directory / "worker" / "__init__.py").write_text("raise SystemExit('the wrong worker')")
+    bench.wait_for_end(bench.launch(bench.gang("pwd", nodes=1, directory=str(directory))))
+    assert bench.lines() == [(0, str(directory))]
+
+
+def test_a_directory_that_is_not_there_is_refused_before_anything_starts(bench: Bench) -> None:
+    with pytest.raises(EngineError, match=r"^working directory /no/such/place is not on this machine$"):
+        bench.launch(bench.gang(directory="/no/such/place"))
+    assert bench.processes() == []
+
+
+def test_a_port_that_is_taken_is_not_given_to_the_gang(bench: Bench) -> None:
+    gang = bench.gang("echo $MASTER_PORT")
+    with socket.socket() as taken:
+        taken.bind((bench.engine.plan(gang).nodes[0].contract.master_address, 29500))
+        taken.listen()
+        bench.wait_for_end(bench.launch(gang))
+    assert sorted(bench.lines()) == [(0, "29501"), (1, "29501")]
+
+
+def test_the_main_node_is_started_first(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=3, main=2))
+    starts = [int(node["start"]) for node in json.loads(handle)["nodes"]]
+    first, second, main = pids(handle)
+    assert main < first < second or starts[2] < min(starts[:2]), "pids grow until they wrap around"
+
+
+# -- launching and observing ------------------------------------------------------------------------------------------
+
+
+def test_launching_again_finds_what_runs_and_starts_nothing(bench: Bench) -> None:
+    gang = bench.gang(nodes=3)
+    handle = bench.launch(gang)
+    bench.ready(3)
+    before = sorted(bench.processes())
+    assert bench.launch(gang) == handle
+    assert bench.launch(gang, LocalEngine(bench.home / "home")) == handle, "nor does the controller that comes after"
+    assert sorted(bench.processes()) == before
+
+
+def test_launching_again_starts_only_the_node_that_is_missing(bench: Bench) -> None:
+    gang = bench.gang(nodes=2)
+    handle = bench.launch(gang)
+    bench.ready(2)
+    os.kill(pids(handle)[1], signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
+    again = bench.launch(gang)
+    assert pids(again)[0] == pids(handle)[0]
+    assert pids(again)[1] != pids(handle)[1]
+    assert [node.running for node in bench.engine.observe(again)] == [True, True]
+
+
+def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: Bench) -> None:
+    listen = (
+        "import os, socket, time; s = socket.socket(); s.bind((os.environ['MASTER_ADDR'], int(os.environ['MASTER_PORT'])))"
+        " if os.environ['RANK'] == '0' else None; s.listen() if os.environ['RANK'] == '0' else None;"
+        " print('port', os.environ['MASTER_PORT'], flush=True); time.sleep(600)"
+    )
+    gang = bench.gang(commands=[["python", "-c", listen]] * 2)
+    handle = bench.launch(gang)
+    wait_for(lambda: len(bench.lines()) == 2, 10, "two nodes")
+    os.kill(pids(handle)[1], signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
+    bench.launch(gang)
+    wait_for(lambda: len(bench.lines()) == 3, 10, "node 1 again")
+    assert {text for _, text in bench.lines()} == {"port 29500"}
+
+
+def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: Bench) -> None:
+    gang = bench.gang(nodes=4, commands=[["sh", "-c", each] for each in ("exit 0", "exit 75", "exit 3", "kill -9 $$")])
+    status = bench.wait_for_end(bench.launch(gang))
+    assert [node.exit_code for node in status] == [0, 75, 3, 137]
+    contracts = [node.contract for node in bench.engine.plan(gang).nodes]
+    assert [node.address for node in status] == [contract.address for contract in contracts]
+
+
+def test_a_supervisor_killed_by_a_signal_ends_with_128_and_its_number(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=1))
+    bench.ready(1)
+    os.kill(pids(handle)[0], signal.SIGKILL)
+    assert bench.wait_for_end(handle)[0].exit_code == 137
+
+
+def test_a_new_engine_observes_from_the_handle_alone(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "echo ready; exit 4"]]))
+    bench.ready(2)
+    other = LocalEngine(bench.home / "home")
+    wait_for(lambda: not other.observe(handle)[1].running, 10, "the end of node 1")
+    first, second = other.observe(handle)
+    assert (first.running, first.exit_code) == (True, None)
+    assert (second.running, second.exit_code) == (False, None), "nobody that it knows saw the end"
+    outcome = read_outcome(bench.store.run("run"), JOB, 1, 1)
+    assert outcome
+    assert outcome.exit_code == 4, "but the store knows"
+
+
+def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=1))
+    bench.ready(1)
+    state = json.loads(handle)
+    state["nodes"][0]["start"] = "1"
+    assert not LocalEngine(bench.home / "home").observe(json.dumps(state))[0].running
+
+
+def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: Bench) -> None:
+    raise_epoch(bench.store.run("run"), 5)
+    status = bench.wait_for_end(bench.launch(bench.gang(nodes=1, epoch=4)))
+    assert (status[0].exit_code, status[0].detail) == (
+        3,
+        "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving",
+    )
+
+
+# -- stopping ---------------------------------------------------------------------------------------------------------
+
+
+def test_stopping_asks_first(bench: Bench) -> None:
+    leaves = 'trap "echo leaving; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+    handle = bench.launch(bench.gang(leaves))
+    bench.ready(2)
+    bench.engine.stop(handle, 10.0)
+    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75]
+    assert [text for _, text in bench.lines()].count("leaving") == 2
+    assert bench.processes() == []
+
+
+def make_new_engine(bench: Bench) -> LocalEngine:
+    return LocalEngine(bench.home / "home")
+
+
+@pytest.mark.parametrize("stopper", [lambda bench: bench.engine, make_new_engine], ids=["same engine", "new engine"])
+def test_stopping_leaves_no_process_whatever_they_do(bench: Bench, stopper: Callable[[Bench], LocalEngine]) -> None:
+    stubborn = f'setsid sh -c "trap \\"\\" TERM; sleep 600" & (setsid sleep 600 &); {STAY}'
+    handle = bench.launch(bench.gang(stubborn))
+    bench.ready(2)
+    assert len(bench.processes()) >= 8
+    asked = time.monotonic()
+    stopper(bench).stop(handle, 0.5)
+    assert bench.processes() == []
+    assert time.monotonic() - asked < 5
+
+
+def test_stopping_ends_what_a_dead_supervisor_left_behind(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(f"setsid sleep 600 & {WAIT}", nodes=1))
+    bench.ready(1)
+    os.kill(pids(handle)[0], signal.SIGKILL)
+    bench.wait_for_end(handle)
+    assert [pid for pid in bench.processes() if "sleep 600" in command_line(pid)], "there is something to end"
+    bench.engine.stop(handle, 5.0)
+    assert bench.processes() == []
+
+
+def test_stopping_one_gang_leaves_the_others_alone(bench: Bench) -> None:
+    handle = bench.launch(bench.gang())
+    # a name that the first one's begins with: job/1/1 and job/1/12
+    other = bench.launch(bench.gang(epoch=12, attempt=1))
+    wait_for(lambda: [text for _, text in bench.lines()].count("ready") == 4, 10, "both gangs")
+    bench.engine.stop(handle, 5.0)
+    assert [node.running for node in bench.engine.observe(handle)] == [False, False]
+    assert [node.running for node in bench.engine.observe(other)] == [True, True]
+
+
+def test_stopping_twice_and_stopping_what_has_ended_is_nothing(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("exit 0"))
+    bench.wait_for_end(handle)
+    bench.engine.stop(handle, 5.0)
+    bench.engine.stop(handle, 5.0)
+    assert [node.exit_code for node in bench.engine.observe(handle)] == [0, 0]

@@ -1,0 +1,150 @@
+"""The node contract: what an engine sets is what a node reads, and AWS's names mean what they mean on AWS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared_store.contract import ContractError, NodeContract
+
+
+def contract(**changes: Any) -> NodeContract:
+    facts = {
+        "job": "1f2e",
+        "attempt": 2,
+        "node_index": 0,
+        "node_count": 3,
+        "main_index": 0,
+        "master_address": "127.64.0.1",
+        "master_port": 29500,
+        "run": "ant",
+        "store": "/store",
+        "epoch": 7,
+        "job_epoch": 6,
+    }
+    return NodeContract(**{**facts, **changes})
+
+
+names = st.text("abcXYZ019-_.", min_size=1, max_size=20)
+seconds = st.integers(0, 100_000).map(lambda n: n / 100)
+
+
+@given(
+    st.builds(
+        NodeContract,
+        job=names,
+        attempt=st.integers(1, 10**6),
+        node_index=st.integers(0, 249),
+        node_count=st.integers(1, 250),
+        main_index=st.integers(0, 249),
+        master_address=names,
+        master_port=st.integers(1, 65535),
+        run=names,
+        store=st.text(min_size=1).filter(lambda text: "\0" not in text),
+        epoch=st.integers(1, 10**9),
+        job_epoch=st.integers(1, 10**9),
+        ranks_per_node=st.integers(1, 16),
+        grace=seconds,
+        queue=names,
+        compute_environment=names,
+        cpus=seconds,
+        address=st.none() | names,
+        bus=st.none() | names,
+        bus_token=st.none() | names,
+    )
+)
+def test_a_node_reads_what_its_engine_set(given_contract: NodeContract) -> None:
+    assert NodeContract.from_env(given_contract.to_env()) == given_contract
+
+
+def test_aws_variables_are_exactly_those_of_aws_on_the_main_node() -> None:
+    env = contract(queue="q", compute_environment="ce").to_env()
+    assert {name: value for name, value in env.items() if name.startswith("AWS_")} == {
+        "AWS_BATCH_JOB_ID": "1f2e#0",
+        "AWS_BATCH_JOB_ATTEMPT": "2",
+        "AWS_BATCH_JOB_NODE_INDEX": "0",
+        "AWS_BATCH_JOB_NUM_NODES": "3",
+        "AWS_BATCH_JOB_MAIN_NODE_INDEX": "0",
+        "AWS_BATCH_CE_NAME": "ce",
+        "AWS_BATCH_JQ_NAME": "q",
+        "AWS_EXECUTION_ENV": "MUSTER",
+    }
+
+
+def test_children_alone_are_told_the_main_node_s_private_address() -> None:
+    name = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
+    for main in range(3):
+        told = [contract(node_index=i, main_index=main).to_env().get(name) for i in range(3)]
+        assert told == [None if index == main else "127.64.0.1" for index in range(3)]
+
+
+def test_every_node_has_what_torch_distributed_asks_for() -> None:
+    for index in range(3):
+        env = contract(node_index=index).to_env()
+        assert (env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"]) == ("127.64.0.1", "29500", "3")
+        assert env["NODE_RANK"] == str(index)
+
+
+@pytest.mark.parametrize(
+    ("main", "ranks"), [(0, [0, 1, 2, 3]), (1, [1, 0, 2, 3]), (2, [1, 2, 0, 3]), (3, [1, 2, 3, 0])]
+)
+def test_rank_zero_is_on_the_main_node_whatever_its_index(main: int, ranks: list[int]) -> None:
+    nodes = [contract(node_index=i, node_count=4, main_index=main) for i in range(4)]
+    assert [node.node_rank for node in nodes] == ranks
+    assert [node.to_env()["NODE_RANK"] for node in nodes] == [str(rank) for rank in ranks]
+
+
+def test_our_own_variables_name_the_job_the_run_and_the_attempt() -> None:
+    env = contract(ranks_per_node=2, grace=12.5, cpus=0.5, address="127.64.0.2").to_env()
+    assert {name: value for name, value in env.items() if name.startswith("MUSTER_")} == {
+        "MUSTER_JOB_ID": "1f2e",
+        "MUSTER_RUN": "ant",
+        "MUSTER_STORE": "/store",
+        "MUSTER_EPOCH": "7",
+        "MUSTER_JOB_EPOCH": "6",
+        "MUSTER_GANG": "1f2e/2/7",
+        "MUSTER_RANKS_PER_NODE": "2",
+        "MUSTER_GRACE_SECONDS": "12.5",
+        "MUSTER_CPUS": "0.5",
+        "MUSTER_ADDRESS": "127.64.0.2",
+    }
+
+
+def test_the_world_is_all_ranks_of_all_nodes() -> None:
+    assert contract(node_count=3, ranks_per_node=8).world_size == 24
+
+
+@pytest.mark.parametrize("name", ["MUSTER_JOB_ID", "MUSTER_RUN", "MUSTER_STORE", "MUSTER_EPOCH"])
+@pytest.mark.parametrize("how", ["absent", "empty"])
+def test_a_missing_variable_is_named(name: str, how: str) -> None:
+    env = contract().to_env()
+    if how == "absent":
+        del env[name]
+    else:
+        env[name] = ""
+    with pytest.raises(ContractError, match=f"^{name} is missing; a node is started by one of Muster's engines$"):
+        NodeContract.from_env(env)
+
+
+@pytest.mark.parametrize("value", ["two", "1.5", "--5", "²", "1_000", " 1"])
+@pytest.mark.parametrize("name", ["AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MUSTER_EPOCH"])
+def test_a_malformed_whole_number_is_named_with_what_was_found(name: str, value: str) -> None:
+    with pytest.raises(ContractError) as caught:
+        NodeContract.from_env({**contract().to_env(), name: value})
+    assert str(caught.value).startswith(f"{name} is {value!r}, not a whole number; ")
+
+
+@pytest.mark.parametrize("value", ["soon", "", "nan", "inf", "-1"])
+@pytest.mark.parametrize("name", ["MUSTER_GRACE_SECONDS", "MUSTER_CPUS"])
+def test_a_malformed_number_is_named_with_what_was_found(name: str, value: str) -> None:
+    with pytest.raises(ContractError) as caught:
+        NodeContract.from_env({**contract().to_env(), name: value})
+    assert str(caught.value).startswith(f"{name} is {value!r}, not a number; ")
+
+
+def test_what_an_engine_may_leave_out_has_a_default() -> None:
+    env = {"MUSTER_JOB_ID": "j", "MUSTER_RUN": "r", "MUSTER_STORE": "/s", "MUSTER_EPOCH": "4"}
+    assert NodeContract.from_env(env) == NodeContract("j", 1, 0, 1, 0, "127.0.0.1", 29500, "r", "/s", 4, 4)

@@ -1,0 +1,103 @@
+"""A run has one history of numbers, however often it was interrupted."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared_store.layout import Run
+from shared_store.metrics import MetricsWriter, read_metrics
+
+
+def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
+    with MetricsWriter(run, epoch, resumed_from) as writer:
+        for iteration in range(resumed_from + 1, last + 1):
+            writer.write({"iteration": iteration, "epoch": epoch})
+
+
+def history(run: Run) -> list[tuple[int, int]]:
+    return [(record["iteration"], record["epoch"]) for record in read_metrics(run)]
+
+
+def test_a_run_without_metrics_has_an_empty_history(tmp_path: Path) -> None:
+    assert read_metrics(Run(tmp_path)) == []
+
+
+def test_what_was_written_is_read_at_once(tmp_path: Path) -> None:
+    writer = MetricsWriter(Run(tmp_path), 1, 0)
+    writer.write({"iteration": 1, "reward": 2.5, "episode_length": None})
+    assert read_metrics(Run(tmp_path)) == [{"iteration": 1, "reward": 2.5, "episode_length": None}]
+    writer.close()
+
+
+def test_for_an_iteration_seen_twice_the_later_epoch_counts(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 9, 0, 4)
+    attempt(run, 10, 2, 6)
+    assert history(run) == [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]
+
+
+def test_a_resume_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 10)
+    attempt(run, 2, 4, 6)
+    assert history(run) == [(1, 1), (2, 1), (3, 1), (4, 1), (5, 2), (6, 2)]
+
+
+def test_an_attempt_that_died_before_its_first_iteration_still_gives_up_the_past(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 5)
+    attempt(run, 2, 3, 3)
+    assert history(run) == [(1, 1), (2, 1), (3, 1)]
+
+
+def test_only_iterations_after_the_given_one_are_returned(tmp_path: Path) -> None:
+    attempt(Run(tmp_path), 1, 0, 5)
+    assert [record["iteration"] for record in read_metrics(Run(tmp_path), after=3)] == [4, 5]
+
+
+@pytest.mark.parametrize("torn", [b"{", b'{"iteration": 3, "epoch"', b'{"iteration": 3, "epoch": 1}', b"\0\0\0\0"])
+def test_a_last_line_that_a_crash_cut_short_is_passed_over(tmp_path: Path, torn: bytes) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 2)
+    with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
+        file.write(torn)
+    assert history(run) == [(1, 1), (2, 1)]
+
+
+def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 1)
+    with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
+        file.write(b'[]\nnot json\n{"note": 1}\n\n{"iteration": 2, "epoch": 1}\n')
+    (run.metrics / "events.out.tfevents.1").write_bytes(b"\0")
+    (run.metrics / "metrics-e1.jsonl.bak").write_bytes(b'{"iteration": 9, "epoch": 1}\n')
+    assert history(run) == [(1, 1), (2, 1)]
+
+
+def test_a_number_that_is_not_finite_is_refused_instead_of_written_as_no_json(tmp_path: Path) -> None:
+    with MetricsWriter(Run(tmp_path), 1, 0) as writer, pytest.raises(ValueError):
+        writer.write({"iteration": 1, "reward": float("nan")})
+    assert read_metrics(Run(tmp_path)) == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 6), st.booleans()), min_size=1, max_size=6))
+def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
+    attempts: list[tuple[int, int, bool]],
+) -> None:
+    expected: list[tuple[int, int]] = []
+    with tempfile.TemporaryDirectory() as directory:
+        run = Run(Path(directory))
+        for epoch, (back, steps, torn) in enumerate(attempts, start=1):
+            resumed_from = max(0, len(expected) - back)
+            attempt(run, epoch, resumed_from, resumed_from + steps)
+            expected = expected[:resumed_from] + [(resumed_from + i + 1, epoch) for i in range(steps)]
+            if torn:
+                with open(run.metrics / f"metrics-e{epoch}.jsonl", "ab") as file:
+                    file.write(b'{"iteration": 1, "epo')
+        assert history(run) == expected

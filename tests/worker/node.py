@@ -1,0 +1,104 @@
+"""One node of a gang for the supervisor's tests: its contract, its store, and a real supervisor process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from shared_store.contract import NodeContract
+from shared_store.layout import Run, Store
+from shared_store.logs import LogFollower
+from shared_store.outcomes import Outcome, read_outcome
+from tests.conftest import wait_for
+
+ENVIRONMENT = {
+    name: value
+    for name, value in os.environ.items()
+    if not name.startswith(("MUSTER_", "AWS_", "OMP_", "NCCL_", "GLOO_", "TORCH", "PYTHONUN"))
+}
+
+
+class Node:
+    """One node of a gang: its contract, its store, and the supervisor process."""
+
+    def __init__(self, home: Path, **contract: Any) -> None:
+        facts = {
+            "job": "job",
+            "attempt": 1,
+            "node_index": 0,
+            "node_count": 1,
+            "main_index": 0,
+            "master_address": "127.0.0.1",
+            "master_port": 29500,
+            "run": "run",
+            "store": str(home),
+            "epoch": 1,
+            "job_epoch": 1,
+            "grace": 10.0,
+        }
+        self.contract = NodeContract(**{**facts, **contract})
+        self.run: Run = Store(home).open().run("run")
+        self.environment = {**ENVIRONMENT, **self.contract.to_env()}
+        self.stderr = home / "stderr"
+
+    def start(self, *command: str, program: tuple[str, ...] = ("-P", "-m", "worker.supervisor"), **env: str) -> None:
+        with open(self.stderr, "wb") as stderr:
+            self.process = subprocess.Popen(
+                [sys.executable, *program, "--", *command],
+                env={**self.environment, **env},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+            )
+
+    def wait(self, timeout: float = 20) -> int:
+        return self.process.wait(timeout)
+
+    def call(self, *command: str, **env: str) -> int:
+        """Start ``command`` and wait for the node's end; returns its exit code."""
+        self.start(*command, **env)
+        return self.wait()
+
+    def shell(self, script: str, **env: str) -> int:
+        return self.call("sh", "-c", script, **env)
+
+    def python(self, script: str, **env: str) -> int:
+        return self.call(sys.executable, "-c", script, **env)
+
+    def lines(self) -> list[tuple[int | None, str, str]]:
+        """(rank, stream, text) of every line in the node's log."""
+        return [(line.rank, line.stream, line.text) for line in LogFollower(self.run, "job").drain()]
+
+    def output(self) -> list[str]:
+        """What the ranks printed."""
+        return [text for rank, _, text in self.lines() if rank is not None]
+
+    def wait_for_output(self, text: str) -> None:
+        wait_for(lambda: text in self.output(), 10, f"{text!r} in the log")
+
+    @property
+    def outcome(self) -> Outcome | None:
+        return read_outcome(self.run, "job", self.contract.attempt, self.contract.node_index)
+
+    def ended(self) -> Outcome:
+        outcome = self.outcome
+        assert outcome, self.stderr.read_text()
+        return outcome
+
+
+Nodes = Callable[..., Node]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def gone(*pids: int) -> None:
+    wait_for(lambda: not any(alive(pid) for pid in pids), 5, f"end of {pids}")

@@ -1,0 +1,130 @@
+"""A test double for the *learning* tests: a point on a line, in plain torch, with the interface of a task.
+
+Every draw is a function of (seed, global world index, draws so far), as in the real tasks, and all state is in ``state_dict``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+
+@dataclass(frozen=True)
+class PointPPO:
+    steps: int = 8
+    hidden_sizes: tuple[int, ...] = (16, 16)
+    activation: str = "elu"
+    epochs: int = 2
+    minibatches: int = 2
+    learning_rate: float = 1.0e-3
+    schedule: str = "adaptive"
+    desired_kl: float = 0.01
+    gamma: float = 0.99
+    lam: float = 0.95
+    clip: float = 0.2
+    entropy_coef: float = 0.001
+    value_loss_coef: float = 1.0
+    max_grad_norm: float = 1.0
+    init_std: float = 1.0
+    normalize_observations: bool = True
+
+
+@dataclass(frozen=True)
+class PointConfig:
+    control_hz: float = 10.0
+    episode_seconds: float = 2.0
+    limit: float = 3.0
+    poison_at: int = 0
+    """Rewards are NaN from this step of the task on; 0 never."""
+    sleep: float = 0.0
+    """How long a step takes [s]."""
+    ppo: PointPPO = field(default_factory=PointPPO)
+
+
+class Point:
+    """Push a point to the middle: 2 observations (place, velocity), 1 action."""
+
+    config_type = PointConfig
+    statistic_names = ("episodes", "episode_return", "episode_length", "reward_place")
+    action_size, observation_size = 1, 2
+    action_names = ("push",)
+    observation_names = ("place", "velocity")
+
+    def __init__(
+        self, config: PointConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
+    ) -> None:
+        self.config, self.world_count, self.device = config, world_count, device
+        self.max_episode_length = round(config.control_hz * config.episode_seconds)
+        self._key = (torch.arange(first_world, first_world + world_count) * 7919 + seed * 104729).double()
+        self._draws = torch.zeros(world_count, dtype=torch.float64)
+        self._steps = torch.zeros(world_count, dtype=torch.int64)
+        self.place, self.velocity = torch.zeros(world_count), torch.zeros(world_count)
+        self._sums = torch.zeros(world_count)
+        self.observations = torch.zeros(world_count, 2)
+        self.terminal_observations = torch.full((world_count, 2), float("nan"))
+        self.rewards = torch.zeros(world_count)
+        self.dones = torch.zeros(world_count, dtype=torch.bool)
+        self.time_outs = torch.zeros(world_count, dtype=torch.bool)
+        self.episode_length = torch.zeros(world_count, dtype=torch.int32)
+        self.statistics = torch.zeros(4, dtype=torch.float64)
+        self.reset()
+
+    def _draw(self, mask: torch.Tensor) -> torch.Tensor:
+        """One number in [0, 1) for each world of ``mask``."""
+        value = torch.sin(self._key * 12.9898 + self._draws * 78.233) * 43758.5453
+        self._draws += mask
+        return (value - value.floor()).float()
+
+    def _restart(self, mask: torch.Tensor) -> None:
+        self.place.copy_(torch.where(mask, 4.0 * self._draw(mask) - 2.0, self.place))
+        self.velocity.masked_fill_(mask, 0.0)
+        self._sums.masked_fill_(mask, 0.0)
+        self.episode_length.masked_fill_(mask, 0)
+        self.observations.copy_(torch.stack((self.place, self.velocity), 1))
+
+    def reset(self) -> None:
+        self._restart(torch.ones(self.world_count, dtype=torch.bool))
+
+    def set_random_episode_length(self) -> None:
+        draw = self._draw(torch.ones(self.world_count, dtype=torch.bool))
+        self.episode_length.copy_((draw * self.max_episode_length).int())
+
+    def step(self, actions: torch.Tensor) -> None:
+        if self.config.sleep:
+            import time
+
+            time.sleep(self.config.sleep)
+        self.velocity.mul_(0.8).add_(0.3 * actions[:, 0].clamp(-1.0, 1.0))
+        self.place.add_(self.velocity)
+        self.episode_length += 1
+        self._steps += 1
+        self.rewards.copy_(1.0 - self.place.abs())
+        if self.config.poison_at:
+            self.rewards.masked_fill_(self._steps >= self.config.poison_at, float("nan"))
+        self._sums += self.rewards
+        fallen = self.place.abs() > self.config.limit
+        self.time_outs.copy_((self.episode_length >= self.max_episode_length) & ~fallen)
+        self.dones.copy_(fallen | self.time_outs)
+        self.terminal_observations.copy_(torch.stack((self.place, self.velocity), 1))
+        ended = self.dones.double()
+        returns, lengths = (self._sums * ended).sum(), (self.episode_length * ended).sum()
+        self.statistics += torch.stack((ended.sum(), returns, lengths, returns))
+        self._restart(self.dones)
+
+    def clear_statistics(self) -> None:
+        self.statistics.zero_()
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")
+        return {name: getattr(self, name) for name in names}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {name: tensor.clone() for name, tensor in self._tensors().items()}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        for name, tensor in self._tensors().items():
+            if state[name].shape != tensor.shape:
+                raise ValueError(f"{name}: expected shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}")
+            tensor.copy_(state[name])

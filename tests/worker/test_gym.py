@@ -1,0 +1,118 @@
+"""The tasks as Gymnasium vector environments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_space_limit
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+
+WORLDS = 8
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[VectorEnv]:
+    made = gymnasium.make_vec("worker.tasks.gym:Muster/Cartpole-v0", num_envs=WORLDS, episode_seconds=0.5)
+    yield made
+    made.close()
+
+
+def test_spaces_are_batched_and_metadata_tells_the_reset_mode(env: VectorEnv) -> None:
+    assert env.num_envs == WORLDS
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert env.spec is not None and env.spec.id == "Muster/Cartpole-v0"
+    assert env.single_action_space.shape == (1,) and env.action_space.shape == (WORLDS, 1)
+    assert env.single_observation_space.shape == (4,) and env.observation_space.shape == (WORLDS, 4)
+    assert env.observation_space.dtype == env.action_space.dtype == np.float32
+    check_space_limit(env.single_action_space, "action")
+
+
+def test_reset_honours_the_seed(env: VectorEnv) -> None:
+    first, info = env.reset(seed=7)
+    assert info == {}
+    assert env.observation_space.contains(first)
+    again, _ = env.reset(seed=7)
+    other, _ = env.reset(seed=8)
+    unseeded, _ = env.reset()
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(other, unseeded)
+    assert len({row.tobytes() for row in first}) == WORLDS, "every world starts differently"
+    with pytest.raises(ValueError, match="seed is -1"):
+        env.reset(seed=-1)
+
+
+def test_same_seed_and_actions_give_the_same_history(env: VectorEnv) -> None:
+    env.action_space.seed(3)
+    actions = [env.action_space.sample() for _ in range(40)]
+    histories = []
+    for _ in range(2):
+        env.reset(seed=11)
+        histories.append([env.step(action)[:4] for action in actions])
+    for left, right in zip(*histories, strict=True):
+        for a, b in zip(left, right, strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_same_step_reset_keeps_the_final_observation(env: VectorEnv) -> None:
+    """Push all carts right until the poles fall: the step that ends an episode returns the next episode's start."""
+    env.reset(seed=1)
+    terminated = truncated = 0
+    for _ in range(60):
+        observations, rewards, terminations, truncations, info = env.step(np.ones((WORLDS, 1), np.float32))
+        assert env.observation_space.contains(observations)
+        assert rewards.shape == (WORLDS,) and rewards.dtype == np.float32
+        assert terminations.dtype == truncations.dtype == np.bool_
+        assert not (terminations & truncations).any()
+        ended = terminations | truncations
+        assert np.array_equal(info.get("_final_obs", np.zeros(WORLDS, bool)), ended)
+        for world in range(WORLDS):
+            if not ended[world]:
+                assert "final_obs" not in info or info["final_obs"][world] is None
+                continue
+            final = info["final_obs"][world]
+            assert env.single_observation_space.contains(final)
+            # 0.4 rad is the limit of an episode and 0.15 rad that of a start.
+            assert (abs(final[1]) > 0.4) == terminations[world]
+            assert abs(observations[world, 1]) <= 0.15
+        terminated += terminations.sum()
+        truncated += truncations.sum()
+    assert terminated > 0, "a constant push drops poles"
+
+    env.reset(seed=2)
+    for _ in range(30):
+        *_, truncations, _ = env.step(np.zeros((WORLDS, 1), np.float32))
+        truncated += truncations.sum()
+    assert truncated > 0, "some poles stand for half a second by themselves"
+
+
+def test_returned_arrays_are_copies(env: VectorEnv) -> None:
+    env.reset(seed=5)
+    observations, rewards, *_ = env.step(np.zeros((WORLDS, 1), np.float32))
+    kept = observations.copy(), rewards.copy()
+    env.step(np.ones((WORLDS, 1), np.float32))
+    assert np.array_equal(observations, kept[0]) and np.array_equal(rewards, kept[1])
+
+
+def test_gymnasiums_own_wrappers_work(env: VectorEnv) -> None:
+    """RecordEpisodeStatistics counts 30 steps for an episode that the clock ends after half a second."""
+    wrapped = DictInfoToList(RecordEpisodeStatistics(env))
+    wrapped.reset(seed=2)
+    lengths = []
+    for _ in range(30):
+        *_, truncations, infos = wrapped.step(np.zeros((WORLDS, 1), np.float32))
+        lengths += [infos[world]["episode"]["l"] for world in np.flatnonzero(truncations)]
+    assert lengths and set(map(int, lengths)) == {30}
+
+
+def test_mistakes_are_named(env: VectorEnv) -> None:
+    with pytest.raises(ValueError, match="actions have shape"):
+        env.step(np.zeros((WORLDS + 1, 1), np.float32))
+    with pytest.raises(ValueError, match="no setting speed"):
+        gymnasium.make_vec("Muster/Cartpole-v0", num_envs=2, speed=3)
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options={"reset_mask": np.ones(WORLDS, bool)})

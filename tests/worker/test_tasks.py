@@ -1,0 +1,355 @@
+"""Tasks on the CPU: rewards and resets by hand, exact resume, the same worlds however they are dealt out."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import worker.tasks.cartpole as cartpole_module
+from worker.simulation.episodes import STEP
+from worker.tasks import find_task
+from worker.tasks.ant import Ant, AntConfig
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.task import Task
+
+torch.set_num_threads(1)
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def cartpole() -> Cartpole:
+    return Cartpole(CartpoleConfig(), 8, seed=1)
+
+
+@pytest.fixture(scope="module")
+def ant() -> Ant:
+    return Ant(AntConfig(episode_seconds=0.5), 8, seed=1)
+
+
+def put(task: Task, **rows: list) -> None:
+    """Overwrite parts of a task's state; what is not named is as after a reset from seed 1."""
+    task.seed(1)
+    task.reset()
+    task.clear_statistics()
+    state = task.state_dict()
+    for name, values in rows.items():
+        state[name][: len(values)] = torch.tensor(values, dtype=state[name].dtype)
+    task.load_state_dict(state)
+
+
+def observe(task: Task) -> None:
+    """Judge the state as it stands, as after a physics step."""
+    task._launch_observe(STEP)
+
+
+def statistics(task: Task) -> dict[str, float]:
+    return dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
+
+
+def play(task: Task, steps: int, seed: int) -> list[tuple[torch.Tensor, ...]]:
+    """Act at random, the same in every world of the same global index; clones of all that a step gives."""
+    generator = torch.Generator().manual_seed(seed)
+    history = []
+    for _ in range(steps):
+        actions = torch.randn(64, task.action_size, generator=generator)[task.first_world :][: task.world_count]
+        task.step(actions)
+        history.append((task.observations.clone(), task.rewards.clone(), task.dones.clone(), task.time_outs.clone()))
+    return history
+
+
+def same(left: list[tuple[torch.Tensor, ...]], right: list[tuple[torch.Tensor, ...]]) -> bool:
+    return all(torch.equal(a, b) for x, y in zip(left, right, strict=True) for a, b in zip(x, y, strict=True))
+
+
+def test_sizes_names_and_types(cartpole: Cartpole, ant: Ant) -> None:
+    assert (cartpole.observation_size, cartpole.action_size, cartpole.max_episode_length) == (4, 1, 300)
+    assert (ant.observation_size, ant.action_size) == (35, 8)
+    assert Ant.config_type().episode_seconds * Ant.config_type().control_hz == 960
+    for task in (cartpole, ant):
+        assert task.captured
+        assert task.observations.shape == task.terminal_observations.shape == (8, task.observation_size)
+        assert task.rewards.shape == task.dones.shape == task.time_outs.shape == task.episode_length.shape == (8,)
+        assert task.dones.dtype == task.time_outs.dtype == torch.bool and task.statistics.dtype == torch.float64
+        assert len(task.statistic_names) == len(task.statistics)
+
+
+def test_one_cartpole_reward_by_hand(cartpole: Cartpole) -> None:
+    put(cartpole, joint_q=[[2.0, 0.3], [1.0, -0.1], [-2.5, 0.0]], joint_qd=[[-0.5, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    cartpole.actions[:3, 0] = torch.tensor([0.5, -7.0, 0.0])
+    observe(cartpole)
+    # alive 0.1, minus 0.1 angle^2, minus 0.05 position^2, minus 0.05 velocity^2, minus 0.001 clipped action^2
+    assert cartpole.rewards[0].item() == pytest.approx(0.1 - 0.009 - 0.2 - 0.0125 - 0.00025, abs=1e-6)
+    assert cartpole.rewards[1].item() == pytest.approx(0.1 - 0.001 - 0.05 - 0.0 - 0.001, abs=1e-6)
+    # off the rail: no alive reward, 2 for the fall
+    assert cartpole.rewards[2].item() == pytest.approx(-2.0 - 0.05 * 6.25, abs=1e-6)
+    assert cartpole.dones[:3].tolist() == [False, False, True]
+
+
+def test_time_out_is_not_termination(cartpole: Cartpole) -> None:
+    """World 0 falls, 1 times out, 2 falls in its last step, 3 goes on; the rest are young."""
+    put(
+        cartpole,
+        joint_q=[[0.0, 0.5], [0.1, 0.2], [0.0, -0.6], [0.3, 0.1]],
+        episode_length=[10, 299, 299, 298],
+        solver_warm_start=[[5.0, 6.0]] * 8,
+    )
+    before = cartpole.state_dict()
+    observe(cartpole)
+    assert cartpole.dones[:4].tolist() == [True, True, True, False] and not cartpole.dones[4:].any()
+    assert cartpole.time_outs[:4].tolist() == [False, True, False, False]
+    assert cartpole.episode_length[:4].tolist() == [0, 0, 0, 299]
+    # The terminal observation is the state before the reset; the observation is the next episode's start.
+    expected = torch.cat([before["joint_q"], before["joint_qd"]], dim=1)
+    assert torch.equal(cartpole.terminal_observations[:3], expected[:3])
+    assert torch.equal(cartpole.observations[3:], expected[3:])
+    assert (cartpole.observations[:3, 1].abs() <= 0.15).all()
+    assert not torch.equal(cartpole.observations[:3], expected[:3])
+    assert cartpole.state_dict()["solver_warm_start"].tolist() == [[0.0, 0.0]] * 3 + [[5.0, 6.0]] * 5
+    totals = statistics(cartpole)
+    assert totals["episodes"] == 3 and totals["episode_length"] == 3 and totals["reward_fall"] == -4
+
+
+def test_one_step_agrees_with_mujoco_itself(cartpole: Cartpole) -> None:
+    model = mujoco.MjModel.from_xml_path(str(Path(cartpole_module.__file__).with_name("cartpole.xml")))
+    model.opt.timestep = 1.0 / 60.0
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    put(cartpole, joint_q=[[0.1, 0.1], [0.0, -0.2]], joint_qd=[[0.5, -0.3], [0.0, 0.4]])
+    state = cartpole.state_dict()
+    actions = torch.zeros(8, 1)
+    actions[:2, 0] = torch.tensor([0.7, -3.0])
+    cartpole.step(actions)
+    for world, control in ((0, 0.7), (1, -1.0)):
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel, data.ctrl[0] = state["joint_q"][world], state["joint_qd"][world], control
+        mujoco.mj_step(model, data)
+        assert np.allclose(cartpole.observations[world], [*data.qpos, *data.qvel], atol=1e-5)
+
+
+def test_any_number_of_substeps_steps_equally(cartpole: Cartpole) -> None:
+    """One control step of 3 (odd) or 2 (even) substeps is as many control steps of one substep at the same timestep."""
+    for substeps in (2, 3):
+        coarse = Cartpole(CartpoleConfig(substeps=substeps, control_hz=60), 8, seed=1)
+        fine = Cartpole(CartpoleConfig(substeps=1, control_hz=60 * substeps), 8, seed=1)
+        for _ in range(4):
+            coarse.step(torch.ones(8, 1) * 0.3)
+            for _ in range(substeps):
+                fine.step(torch.ones(8, 1) * 0.3)
+        assert torch.equal(coarse.observations, fine.observations)
+
+
+def test_replay_does_what_the_launches_do(cartpole: Cartpole) -> None:
+    put(cartpole)
+    start = cartpole.state_dict()
+    addresses = cartpole.observations.data_ptr(), cartpole.rewards.data_ptr(), cartpole.statistics.data_ptr()
+    replayed = play(cartpole, 60, seed=3)
+    cartpole.load_state_dict(start)
+    graph, cartpole._graph = cartpole._graph, None
+
+    class Eager:
+        launch = staticmethod(cartpole._launch_step)
+
+    cartpole._graph = Eager()
+    try:
+        eager = play(cartpole, 60, seed=3)
+    finally:
+        cartpole._graph = graph
+    assert same(replayed, eager) and any(dones.any() for _, _, dones, _ in eager)
+    assert addresses == (
+        cartpole.observations.data_ptr(),
+        cartpole.rewards.data_ptr(),
+        cartpole.statistics.data_ptr(),
+    )
+
+
+def test_statistics_are_sums_over_finished_episodes(cartpole: Cartpole) -> None:
+    put(cartpole)
+    returns, lengths = torch.zeros(8, dtype=torch.float64), torch.zeros(8)
+    episodes, total_return, total_length = 0, 0.0, 0.0
+    for _, rewards, dones, _ in play(cartpole, 200, seed=4):
+        returns += rewards
+        lengths += 1
+        episodes += int(dones.sum())
+        total_return += returns[dones].sum().item()
+        total_length += lengths[dones].sum().item()
+        returns[dones] = 0
+        lengths[dones] = 0
+    totals = statistics(cartpole)
+    assert episodes > 20
+    assert totals["episodes"] == episodes and totals["episode_length"] == total_length
+    assert totals["episode_return"] == pytest.approx(total_return, rel=1e-5)
+    assert sum(totals[f"reward_{term}"] for term in Cartpole.reward_terms) == pytest.approx(total_return, rel=1e-5)
+    cartpole.clear_statistics()
+    assert not cartpole.statistics.any()
+
+
+def test_a_world_that_is_nan_is_reset_and_counted_and_touches_no_other(cartpole: Cartpole) -> None:
+    put(cartpole)
+    clean = play(cartpole, 5, seed=5)
+    put(cartpole, joint_qd=[[math.nan, 0.0]], solver_warm_start=[[math.nan, math.inf]])
+    broken = play(cartpole, 5, seed=5)
+    observations, rewards, dones, time_outs = broken[0]
+    assert dones.tolist() == [True] + [False] * 7 and not time_outs.any()
+    assert rewards[0] == 0 and torch.equal(cartpole.terminal_observations[0], torch.zeros(4))
+    assert observations.isfinite().all() and all(step[0].isfinite().all() for step in broken)
+    assert same([tuple(t[1:] for t in step) for step in clean], [tuple(t[1:] for t in step) for step in broken])
+    totals = statistics(cartpole)
+    assert totals["nan_worlds"] == 1 and totals["episodes"] == sum(int(step[2][1:].sum()) for step in broken)
+
+
+def test_worlds_are_the_same_however_they_are_dealt_out(cartpole: Cartpole) -> None:
+    put(cartpole)
+    cartpole.set_random_episode_length()
+    ages = cartpole.episode_length.clone()
+    whole = play(cartpole, 120, seed=6)
+    parts = []
+    for first in (0, 4):
+        part = Cartpole(CartpoleConfig(), 4, seed=1, first_world=first)
+        part.set_random_episode_length()
+        assert torch.equal(part.episode_length, ages[first : first + 4])
+        parts.append(play(part, 120, seed=6))
+    joined = [tuple(torch.cat(pair) for pair in zip(*steps, strict=True)) for steps in zip(*parts, strict=True)]
+    assert same(whole, joined)
+    assert sum(int(step[2].sum()) for step in whole) > 8, "resets were compared, too"
+    assert len(set(ages.tolist())) > 4 and (ages >= 0).all() and (ages < 300).all()
+    other = Cartpole(CartpoleConfig(), 4, seed=2, first_world=0)
+    assert not torch.equal(other.observations, parts[0][0][0])
+
+
+RESUME = """
+import sys, torch
+from worker.tasks.ant import Ant, AntConfig
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from tests.worker.test_tasks import play
+saved = torch.load(sys.argv[1], weights_only=True)
+tasks = {"Cartpole": Cartpole(CartpoleConfig(), 8, seed=99), "Ant": Ant(AntConfig(episode_seconds=0.5), 8, seed=99)}
+for name, task in tasks.items():
+    task.load_state_dict(saved[name])
+torch.save({name: [list(step) for step in play(task, 80, seed=8)] for name, task in tasks.items()}, sys.argv[2])
+"""
+
+
+def test_a_fresh_process_goes_on_bit_for_bit(cartpole: Cartpole, ant: Ant, tmp_path: Path) -> None:
+    tasks = {"Cartpole": cartpole, "Ant": ant}
+    saved = {}
+    for name, task in tasks.items():
+        put(task)
+        play(task, 20, seed=7)
+        saved[name] = task.state_dict()
+        assert all(len(tensor) == 8 for tensor in saved[name].values())
+    torch.save(saved, tmp_path / "saved.pt")
+    subprocess.run(
+        [sys.executable, "-c", RESUME, str(tmp_path / "saved.pt"), str(tmp_path / "out.pt")],
+        check=True,
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        timeout=300,
+    )
+    resumed = torch.load(tmp_path / "out.pt", weights_only=True)
+    for name, task in tasks.items():
+        going_on = play(task, 80, seed=8)
+        assert same(going_on, resumed[name])
+        assert sum(int(step[2].sum()) for step in going_on) > 8, "resets were compared, too"
+
+
+def test_the_warm_start_belongs_to_the_state(ant: Ant) -> None:
+    put(ant)
+    play(ant, 20, seed=7)
+    state = ant.state_dict()
+    exact = play(ant, 20, seed=8)
+    ant.load_state_dict(state | {"solver_warm_start": torch.zeros_like(state["solver_warm_start"])})
+    assert not same(exact, play(ant, 20, seed=8))
+    ant.load_state_dict(state)
+    assert same(exact, play(ant, 20, seed=8))
+
+
+def test_a_state_that_does_not_fit_is_refused_whole(cartpole: Cartpole) -> None:
+    put(cartpole)
+    state = cartpole.state_dict()
+    with pytest.raises(ValueError, match=r"joint_q is \(4, 2\) torch.float32, expected \(8, 2\)"):
+        cartpole.load_state_dict(state | {"joint_q": state["joint_q"][:4], "joint_qd": state["joint_qd"] + 1})
+    with pytest.raises(ValueError, match="lacks random"):
+        cartpole.load_state_dict({name: tensor for name, tensor in state.items() if name != "random"})
+    with pytest.raises(ValueError, match="holds joint_w, which"):
+        cartpole.load_state_dict(state | {"joint_w": state["joint_q"]})
+    assert all(torch.equal(tensor, state[name]) for name, tensor in cartpole.state_dict().items())
+
+
+def test_a_step_that_replays_nothing_is_refused() -> None:
+    class Deaf(Cartpole):
+        def _launch_observe(self, mode: int) -> None:
+            if mode != STEP:
+                super()._launch_observe(mode)
+
+    with pytest.raises(RuntimeError, match="the captured step of task Deaf does not replay on cpu"):
+        Deaf(CartpoleConfig(), 2)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("task_type", [Cartpole, Ant])
+def test_on_a_gpu_a_step_is_one_graph_and_fits_into_a_larger_one(task_type: type[Task]) -> None:
+    task = task_type(task_type.config_type(), 64, seed=1, device="cuda:0")
+    host = task_type(task_type.config_type(), 64, seed=1)
+    assert torch.equal(task.observations.cpu(), host.observations), "random starts do not depend on the device"
+    actions = torch.zeros(64, task.action_size, device="cuda:0")
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(3):
+            task.step(actions)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for _ in range(3):
+        host.step(actions.cpu())
+    assert torch.allclose(task.observations.cpu(), host.observations, atol=1e-3)
+
+    larger = torch.cuda.CUDAGraph()
+    torch.cuda.synchronize()
+    with torch.cuda.graph(larger, capture_error_mode="thread_local"):
+        task.step(torch.tanh(actions))
+    ages = task.episode_length.clone()
+    larger.replay()
+    larger.replay()
+    assert torch.equal(task.episode_length, ages + 2)
+
+
+def test_an_overflow_counts_in_the_control_step_in_which_it_was(cartpole: Cartpole) -> None:
+    put(cartpole)
+    wp.to_torch(cartpole.worlds.arrays.overflow)[2:4] = 1
+    observe(cartpole)
+    observe(cartpole)
+    assert statistics(cartpole)["solver_overflows"] == 2
+
+
+def test_tasks_are_found_by_name_or_refused_with_the_nearest() -> None:
+    assert find_task("Cartpole") is Cartpole and find_task("worker.tasks.ant:Ant") is Ant
+    with pytest.raises(ValueError, match="no task is called 'cartpol'; did you mean Cartpole"):
+        find_task("cartpol")
+    with pytest.raises(ValueError, match="no module 'nowhere'"):
+        find_task("nowhere:Thing")
+    with pytest.raises(ValueError, match="no class 'Cat'"):
+        find_task("worker.tasks.ant:Cat")
+
+
+@pytest.mark.parametrize(
+    ("config", "arguments", "message"),
+    [
+        (CartpoleConfig(), {"world_count": 0}, "at least 1"),
+        (CartpoleConfig(), {"seed": -1}, "seed is -1"),
+        (CartpoleConfig(), {"first_world": -1}, "first_world is -1"),
+        (CartpoleConfig(substeps=0), {}, "substeps is 0"),
+        (CartpoleConfig(control_hz=0.0), {}, "control_hz is 0.0"),
+        (CartpoleConfig(episode_seconds=-1.0), {}, "episode_seconds is -1.0"),
+        (AntConfig(), {}, "takes a CartpoleConfig, not a AntConfig"),
+    ],
+)
+def test_impossible_arguments_are_refused_in_one_sentence(config: object, arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Cartpole(config, **{"world_count": 2, **arguments})

@@ -1,0 +1,55 @@
+"""``python -m worker.evaluate``: one rank of a job that evaluates a checkpoint, without noise, on fresh worlds."""
+
+from __future__ import annotations
+
+import os
+
+from worker.errors import UserError
+from worker.learning.job import Job, configure, end_startup, run_command, user_errors
+
+
+def main() -> int:
+    """Evaluate; returns the exit code."""
+    job = Job.from_env(os.environ, "evaluate")
+    run = job.named_run()
+    episodes = job.setting("episodes", 1)
+    from worker.distributed import REPORT_SECONDS, Placement, connect, use_cpu_threads
+
+    use_cpu_threads(os.environ)
+    with user_errors():
+        placement = Placement.from_env(os.environ)
+    gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    from worker.learning.evaluation import evaluate
+    from worker.learning.ppo import PPO, Share
+    from worker.learning.randomness import seed_generators
+    from worker.learning.runner import build_task
+    from worker.learning.trained import choose_checkpoint, load_learner
+    from worker.tasks import find_task
+
+    checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
+    facts = checkpoint.manifest
+    with user_errors("task"):
+        task_type = find_task(facts["task"])
+    config = configure(task_type, facts["train"])
+    seed = job.setting("seed", 0, least=0)
+    seed_generators(seed)
+    share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
+    task = build_task(task_type, config, share, gang, seed)
+    ppo = PPO(config.ppo, share, task.observation_size, task.action_size, gang)
+    try:
+        ppo.load(load_learner(checkpoint, gang.device)["ppo"], {"actor": True, "critic": True})
+    except RuntimeError as error:
+        raise UserError(
+            f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: {error}"
+        ) from error
+    end_startup()
+    result = evaluate(task, ppo, gang, checkpoint=checkpoint.name, episodes=episodes * share.total)
+    if gang.is_main:
+        print(result, flush=True)
+        print(f"written: {result.write(run)}", flush=True)
+    gang.close()
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,151 @@
+"""``python -m worker.export``: write a checkpoint's policy as one ONNX file with all that a robot needs to run it.
+
+``exports/<checkpoint>/policy.onnx`` takes ``obs``, shape (batch, observations), and gives ``actions``, shape (batch, actions): the
+mean action, with the observation normaliser inside. ``policy.json`` beside it says what the numbers mean and holds a self-test. The
+file is run with ONNX's own reference evaluator, and compared, before the directory appears.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+import time
+import uuid
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shared_store.checkpoints import Checkpoint
+from shared_store.files import remove_tree, sync_directory, write_atomic, write_json
+from shared_store.layout import Run
+from worker.errors import TrainingError
+from worker.learning.job import Job, run_command
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rsl_rl.models.mlp_model import MLPModel
+
+TOLERANCE = 1e-5
+"""Greatest absolute difference between the exported and the trained policy's actions."""
+SAMPLES = 1024
+"""Observations on which they are compared."""
+
+
+def export(run: Run, checkpoint: Checkpoint) -> Path:
+    """Export ``checkpoint`` to ``exports/<its name>/``, as a whole or not at all; returns that directory.
+
+    Raises TrainingError where the exported file computes something else than the policy; nothing is published then.
+    """
+    import torch
+
+    from worker.learning.trained import load_actor
+
+    actor = load_actor(checkpoint)
+    facts = checkpoint.manifest
+    observations = _observations(actor)
+    with torch.no_grad():
+        actions = actor.as_onnx(verbose=False)(observations)
+    metadata = {
+        "format": 1,
+        "task": facts["task"],
+        "run": run.name,
+        "checkpoint": checkpoint.name,
+        "iteration": checkpoint.iteration,
+        "reward": facts.get("reward"),
+        **facts["policy"],
+        "input": "obs",
+        "output": "actions",
+        "self_test": {"obs": observations[:8].tolist(), "actions": actions[:8].tolist(), "tolerance": TOLERANCE},
+    }
+    model = to_onnx(actor, metadata)
+    metadata["max_difference"] = check(model, observations.numpy(), actions.numpy())
+    metadata["sha256"] = hashlib.sha256(model).hexdigest()
+    metadata["created"] = time.time()
+    target = run.exports / checkpoint.name
+    hidden = run.exports / f".{checkpoint.name}.{uuid.uuid4().hex[:8]}.tmp"
+    try:
+        write_atomic(hidden / "policy.onnx", model)
+        write_json(hidden / "policy.json", metadata)
+        if target.exists():
+            remove_tree(target)
+        os.rename(hidden, target)
+        sync_directory(run.exports)
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+    return target
+
+
+def to_onnx(actor: MLPModel, metadata: dict[str, Any]) -> bytes:
+    """The policy as one self-contained ONNX file, batch size free; ``metadata`` is inside, as JSON under ``muster``."""
+    import onnx
+    import torch
+
+    module = actor.as_onnx(verbose=False).eval()
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        # torch's newer exporter takes ten times as long here and writes two files by default
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module,
+            module.get_dummy_inputs(),
+            buffer,
+            dynamo=False,
+            opset_version=18,
+            input_names=module.input_names,
+            output_names=module.output_names,
+            dynamic_axes={name: {0: "batch"} for name in (*module.input_names, *module.output_names)},
+        )
+    model = onnx.load_from_string(buffer.getvalue())
+    # the comma-separated keys are those that other consumers of RL policies read
+    lists = {key: ",".join(value) for key, value in metadata.items() if key.endswith("_names")}
+    onnx.helper.set_model_props(model, {"muster": json.dumps(metadata), **lists})
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def check(model: bytes, observations: np.ndarray, actions: np.ndarray) -> float:
+    """Run ``model`` with ONNX's reference evaluator; the greatest difference to ``actions``. Raises TrainingError above the tolerance."""
+    import numpy as np
+    import onnx
+    from onnx.reference import ReferenceEvaluator
+
+    (found,) = ReferenceEvaluator(onnx.load_from_string(model)).run(None, {"obs": observations})
+    difference = float(np.abs(found - actions).max())
+    if not difference <= TOLERANCE:
+        raise TrainingError(
+            f"the exported policy differs from the trained one by {difference:g} (at most {TOLERANCE:g} is allowed); not published"
+        )
+    return difference
+
+
+def _observations(actor: MLPModel) -> Any:
+    """Observations as the policy has met them (its normaliser's moments), a few far outside: shape (SAMPLES, observations)."""
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(SAMPLES, actor.obs_dim, generator=generator)
+    samples[-SAMPLES // 8 :] *= 5.0
+    if actor.obs_normalization:
+        samples = actor.obs_normalizer.inverse(samples)
+    return samples
+
+
+def main() -> int:
+    """Export on rank 0; the other ranks, if any, have nothing to do."""
+    job = Job.from_env(os.environ, "export")
+    if int(os.environ.get("RANK") or 0):
+        return 0
+    run = job.named_run()
+    from worker.learning.trained import find_checkpoint
+
+    target = export(run, find_checkpoint(run, job.section.get("checkpoint")))
+    print(f"exported: {target / 'policy.onnx'}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)

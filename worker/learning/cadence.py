@@ -1,0 +1,54 @@
+"""When to save, and whether this attempt still may."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Mapping
+
+from shared_store.epoch import check_epoch
+from shared_store.layout import Run
+
+OVERHEAD = 0.01
+"""Share of the time that ``every: auto`` spends on saving."""
+_FIRST = 5
+_LONGEST = 1000
+
+
+class Cadence:
+    """Every so many iterations, or (``auto``) as often as :data:`OVERHEAD` allows (after CheckFreq, FAST'21)."""
+
+    def __init__(self, every: int | str) -> None:
+        self.auto = every == "auto"
+        self.every = _FIRST if self.auto else int(every)
+        self._last = 0
+
+    def due(self, iteration: int, signals: Mapping[str, float]) -> bool:
+        """Whether to save after ``iteration``. All ranks decide alike, since ``signals`` are sums over all of them."""
+        if not self.auto:
+            return iteration % self.every == 0
+        if signals["stall"] > 0 and signals["iteration_seconds"] > 0:
+            wanted = math.ceil(signals["stall"] / (OVERHEAD * signals["iteration_seconds"]))
+            self.every = min(max(wanted, 1), _LONGEST)
+        if iteration - self._last < self.every:
+            return False
+        self._last = iteration
+        return True
+
+
+class Fence:
+    """Looks, at most once a second, whether a newer attempt owns the run: a rank that was frozen for long sees it at once."""
+
+    def __init__(self, run: Run, epoch: int) -> None:
+        self.run, self.epoch = run, epoch
+        self._next = 0.0
+
+    def check(self) -> None:
+        """Raises StaleEpoch where a newer attempt owns the run."""
+        if time.monotonic() >= self._next:
+            with contextlib.suppress(
+                OSError, ValueError
+            ):  # a volume that is away for a while: the next look reads it again
+                check_epoch(self.run, self.epoch)
+            self._next = time.monotonic() + 1.0

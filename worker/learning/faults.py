@@ -1,0 +1,30 @@
+"""Deaths on request, to prove that a run survives them.
+
+``MUSTER_KILL_AT=N`` in a training job's environment: in the job's first attempt the main rank kills itself with SIGKILL right
+after iteration N, when the gang has done it and nothing of it is written: no metrics, no checkpoint. ``muster verify-resume`` sets
+it, and a job that comes through the Batch API may.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Mapping
+
+from worker.errors import UserError
+from worker.learning.job import Job
+
+
+def kill_at(env: Mapping[str, str], job: Job) -> int | None:
+    """The iteration after which this attempt is to die; None for never. Raises UserError for a value that is no iteration."""
+    text = env.get("MUSTER_KILL_AT")
+    if not text:
+        return None
+    if not text.isdecimal() or int(text) < 1:
+        raise UserError(f"MUSTER_KILL_AT is {text!r}; set it to the number of an iteration, from 1")
+    return int(text) if job.epoch == job.job_epoch else None
+
+
+def die() -> None:
+    """End this process as a crash would: no handler runs, nothing is flushed."""
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -1,0 +1,197 @@
+"""What a rank was started to do (``MUSTER_*`` variables), and how it ends: exit codes and the error file."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import faulthandler
+import gc
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shared_store.checkpoints import DamagedCheckpoint
+from shared_store.epoch import StaleEpoch
+from shared_store.layout import Run, Store, StoreError
+from worker.errors import GangError, TrainingError, UserError
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task, TaskConfig
+
+EX_ERROR, EX_USAGE = 1, 2
+
+
+class StopRequest:
+    """What signals ask for: SIGTERM and SIGINT to leave at the next chance with a checkpoint, SIGUSR2 to save and go on."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.save_requested = False
+
+    def listen(self) -> StopRequest:
+        """Catch the signals from now on."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._request)
+        signal.signal(signal.SIGUSR2, self._request_save)
+        faulthandler.register(
+            signal.SIGUSR1, all_threads=True
+        )  # Python stacks to stderr, for where ptrace is not allowed
+        return self
+
+    def _request(self, number: int, frame: object) -> None:
+        self.requested = True
+
+    def _request_save(self, number: int, frame: object) -> None:
+        self.save_requested = True
+
+
+@dataclass(frozen=True)
+class Job:
+    """The job of this rank."""
+
+    spec: dict[str, Any]
+    """The job YAML."""
+    store: Store
+    run: Run
+    epoch: int
+    job_epoch: int
+    """Epoch of the job's first attempt."""
+    id: str
+    checkpoint: str | None = None
+    """Name of a checkpoint that a person chose to start from."""
+    section: dict[str, Any] = field(default_factory=dict)
+    """The part of the YAML for this command: ``train``, ``evaluate`` or ``export``."""
+
+    @classmethod
+    def from_env(cls, env: Mapping[str, str], kind: str) -> Job:
+        """Read the job for command ``kind``. Raises UserError naming the variable that is missing or malformed."""
+        for name in ("MUSTER_STORE", "MUSTER_RUN", "MUSTER_SPEC"):
+            if not env.get(name):
+                raise UserError(
+                    f"{name} is not set: `python -m worker.{kind}` is started by Muster (use `muster run SPEC`)"
+                )
+        try:
+            spec = json.loads(env["MUSTER_SPEC"])
+            section = spec[kind]
+            epoch = int(env.get("MUSTER_EPOCH") or 0)
+            job_epoch = int(env.get("MUSTER_JOB_EPOCH") or epoch)
+            assert isinstance(section, dict)
+        except (ValueError, KeyError, TypeError, AssertionError) as error:
+            raise UserError(
+                f"MUSTER_SPEC, MUSTER_EPOCH or MUSTER_JOB_EPOCH is malformed for `{kind}`: {error!r}"
+            ) from error
+        store = Store(env["MUSTER_STORE"])
+        run = store.run(env["MUSTER_RUN"])
+        chosen = env.get("MUSTER_CHECKPOINT") or None
+        return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, section)
+
+    def named_run(self) -> Run:
+        """The run that the section names (of ``evaluate`` and ``export``), else the job's own."""
+        return self.store.run(self.section["run"]) if self.section.get("run") else self.run
+
+    def setting(self, name: str, default: int, *, least: int = 1) -> int:
+        """The whole number ``name`` of the section. Raises UserError for anything else."""
+        value = self.section.get(name, default)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise UserError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+        return value
+
+
+def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
+    """``task``'s configuration with the overrides of a ``train`` section (``config`` and ``ppo``).
+
+    Raises UserError for a key that does not exist or a value of another type, naming both.
+    """
+    config = task.config_type()
+    ppo = _override(config.ppo, section.get("ppo") or {}, "ppo")
+    return _override(dataclasses.replace(config, ppo=ppo), section.get("config") or {}, "config")
+
+
+def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
+    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "ppo"}
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(known))}"
+            raise UserError(f"{where}.{key}: {type(config).__name__} has no such key; {hint}")
+        changes[key] = _as_type_of(known[key], value, f"{where}.{key}")
+    with user_errors(where):
+        return dataclasses.replace(config, **changes)
+
+
+def _as_type_of(default: Any, value: Any, where: str) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if default is None:
+        return value
+    if isinstance(default, tuple) and isinstance(value, list | tuple):
+        return tuple(_as_type_of(default[0], item, where) for item in value) if default else tuple(value)
+    if isinstance(default, float) and not isinstance(default, bool) and number:
+        return float(value)
+    if type(value) is type(default):
+        return value
+    raise UserError(f"{where}: expected {type(default).__name__}, as in {default!r}; got {value!r}")
+
+
+def end_startup() -> None:
+    """What was imported and built so far stays: leave it out of garbage collection, which begins now."""
+    gc.freeze()
+    gc.enable()
+
+
+@contextmanager
+def user_errors(where: str | None = None) -> Iterator[None]:
+    """In here a ValueError is the user's to put right; elsewhere it is a defect and shows its traceback."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(f"{where}: {error}" if where else str(error)) from error
+
+
+def run_command(body: Callable[[], int]) -> None:
+    """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
+    # importing the simulation parses hundreds of kernels: collecting garbage meanwhile takes half as long again
+    gc.disable()
+    try:
+        code = body()
+    except (UserError, StoreError) as error:
+        code = _fail(str(error), EX_USAGE)
+    except (GangError, TrainingError, StaleEpoch, DamagedCheckpoint) as error:
+        code = _fail(str(error), EX_ERROR)
+    except Exception as error:
+        trace = traceback.format_exc()
+        print(trace, file=sys.stderr, flush=True)
+        _write_error_file(f"{type(error).__name__}: {error}", trace)
+        code = EX_ERROR
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # the process group's threads of a gang that broke would keep a normal exit waiting for peers that are gone
+    os._exit(code)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"error: {message}", file=sys.stderr, flush=True)
+    _write_error_file(message, "")
+    return code
+
+
+def _write_error_file(message: str, trace: str) -> None:
+    """What ``torch.distributed.elastic``'s ``@record`` writes, without importing it."""
+    path = os.environ.get("TORCHELASTIC_ERROR_FILE")
+    if not path:
+        return
+    now = time.time()
+    # torch writes whole seconds; "time" is ours, so that the first failure of a gang is told from those that it caused
+    extra = {"py_callstack": trace, "timestamp": str(int(now)), "time": now}
+    try:
+        Path(path).write_text(json.dumps({"message": {"message": message, "extraInfo": extra}}))
+    except OSError as error:
+        print(f"error: {path} can't be written ({error.strerror})", file=sys.stderr, flush=True)

@@ -1,0 +1,367 @@
+"""PPO over a gang of ranks that computes what one rank with all the worlds would compute.
+
+rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and storage. What differs from rsl-rl 5.5.1, and why:
+
+- Advantage moments, observation moments, gradients, KL and losses are sums over all ranks' samples, so that the number of
+  ranks changes nothing but rounding. One collective an iteration, one a minibatch.
+- A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl takes the one before the step.
+- Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
+- Every epoch draws a new permutation (rsl-rl draws one and repeats the same minibatches in all epochs).
+- The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device.
+- Action noise depends on (seed, iteration, step, global world index) alone: not on the number of ranks, nor on a restart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from rsl_rl.algorithms.ppo import PPO as RslPPO
+from rsl_rl.storage.rollout_storage import RolloutStorage
+
+from worker.distributed import Gang
+from worker.learning.models import GROUP, build_models, example_observations
+from worker.learning.randomness import mix_seed
+
+if TYPE_CHECKING:
+    from worker.tasks.task import PPOConfig
+
+LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
+"""What :meth:`PPO.update` returns, in order; all are means over the samples of all ranks."""
+
+RATE_LIMITS = (1e-5, 1e-2)
+RATE_STEP = 1.5
+"""rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within these limits."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which worlds a rank holds: ``[first, first + count)`` of ``total``, by global index."""
+
+    first: int
+    count: int
+    total: int
+
+    @classmethod
+    def of(cls, rank: int, ranks: int, total: int) -> Share:
+        """Rank r of R holds worlds ``[r·T // R, (r + 1)·T // R)`` of T."""
+        first = rank * total // ranks
+        return cls(first, (rank + 1) * total // ranks - first, total)
+
+
+class PPO(RslPPO):
+    """Collects with :meth:`act` and :meth:`process_env_step`, then :meth:`compute_returns`, then :meth:`update`."""
+
+    def __init__(
+        self,
+        config: PPOConfig,
+        share: Share,
+        observation_size: int,
+        action_size: int,
+        gang: Gang,
+        *,
+        seed: int = 0,
+        extras: int = 0,
+    ) -> None:
+        """Allocate everything once.
+
+        Args:
+            config: Hyperparameters.
+            share: The worlds of this rank.
+            observation_size: Length of one observation.
+            action_size: Length of one action.
+            gang: The ranks that learn together.
+            seed: Of action noise and minibatch order; weights come from torch's own generator.
+            extras: Length of :attr:`extra`.
+
+        Raises:
+            ValueError: Fewer samples an iteration than minibatches on some rank.
+        """
+        device, worlds, steps = gang.device, share.count, config.steps
+        smallest = min(Share.of(r, gang.size, share.total).count for r in range(gang.size)) * steps
+        if smallest < config.minibatches:
+            raise ValueError(
+                f"ppo.minibatches: {config.minibatches} minibatches need as many samples, a rank collects {smallest}"
+            )
+        self._rate = torch.tensor(config.learning_rate, device=device)
+        storage = RolloutStorage(
+            "rl", worlds, steps, example_observations(worlds, observation_size, device), [action_size], device
+        )
+        super().__init__(
+            *build_models(config, observation_size, action_size),
+            storage,
+            num_learning_epochs=config.epochs,
+            num_mini_batches=config.minibatches,
+            clip_param=config.clip,
+            gamma=config.gamma,
+            lam=config.lam,
+            value_loss_coef=config.value_loss_coef,
+            entropy_coef=config.entropy_coef,
+            learning_rate=config.learning_rate,
+            max_grad_norm=config.max_grad_norm,
+            schedule=config.schedule,
+            desired_kl=config.desired_kl,
+            device=device,
+        )
+        self.gang, self.share, self.seed = gang, share, seed
+        self._allocate_rollout(worlds, steps, observation_size, action_size, extras)
+        self._allocate_gradients()
+        counts = [Share.of(r, gang.size, share.total).count * steps // config.minibatches for r in range(gang.size)]
+        self._batch = counts[gang.rank]
+        self._weight = self._batch / sum(counts)
+
+    def _allocate_rollout(self, worlds: int, steps: int, observations: int, actions: int, extras: int) -> None:
+        def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(shape, device=self.device, dtype=dtype)
+
+        self._observations = self.storage.observations[GROUP]
+        self._latents = empty(steps, worlds, observations)
+        self._terminal = empty(steps, worlds, observations)
+        self._time_outs = empty(steps, worlds, 1)
+        self._std = empty(actions)
+        mean = empty(steps, worlds, actions)
+        self.storage.distribution_params = (mean, self._std.expand_as(mean))
+        self._noise = empty(self.share.total, actions)
+        self._noise_source = torch.Generator(self.device)
+        self._order_source = torch.Generator(self.device)
+        self._columns = [observations, actions, actions, 1, 1, 1, 1]
+        self._samples = empty(steps * worlds, sum(self._columns))
+        self._sums = empty(3 + 2 * observations + extras, dtype=torch.float64)
+        self.extra = self._sums[3 + 2 * observations :]
+        """The caller's own numbers, shape (extras,), float64: :meth:`compute_returns` sums them over the ranks."""
+
+    def _allocate_gradients(self) -> None:
+        """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it."""
+        actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
+        sizes = [sum(p.numel() for p in part) for part in (actor, critic)]
+        self._shared = torch.zeros(sum(sizes) + len(LOSSES), device=self.device)
+        offset = 0
+        for parameter in actor + critic:
+            parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
+            offset += parameter.numel()
+        self._gradients = self._shared[: sizes[0]], self._shared[sizes[0] : sum(sizes)]
+        self._losses = self._shared[sum(sizes) :]
+        self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
+        cuda = self.device.startswith("cuda")
+        self.optimizer = torch.optim.Adam(
+            actor + critic, lr=self._rate, fused=True, **({"capturable": True} if cuda else {})
+        )
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate now. Reading it waits for the device."""
+        return float(self._rate)
+
+    @learning_rate.setter
+    def learning_rate(self, value: float | torch.Tensor) -> None:
+        self._rate.fill_(value)
+
+    @property
+    def learning_rate_tensor(self) -> torch.Tensor:
+        """The learning rate, shape (), on the device."""
+        return self._rate
+
+    @property
+    def action_std(self) -> torch.Tensor:
+        """Mean over the action's components of the deviation of the last rollout, shape (), on the device."""
+        return self._std.mean()
+
+    # -- collecting ---------------------------------------------------------------------------------------------------
+
+    def begin_iteration(self, iteration: int) -> None:
+        """Seed this iteration's noise (the same on all ranks) and minibatch order (a rank's own)."""
+        self._noise_source.manual_seed(mix_seed(self.seed, iteration, 0))
+        self._order_source.manual_seed(mix_seed(self.seed, iteration, 1, self.gang.rank))
+        distribution = self.actor.distribution
+        with torch.no_grad():
+            distribution.update(self.storage.distribution_params[0][0])
+            self._std.copy_(distribution.std[0])
+
+    @torch.no_grad()
+    def act(self, observations: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (worlds, actions), for ``observations``, shape (worlds, observations); both are recorded."""
+        step = self.storage.step
+        self._observations[step].copy_(observations)
+        latent = self._latents[step].copy_(self.actor.get_latent({GROUP: observations}))
+        mean = self.storage.distribution_params[0][step].copy_(self.actor.mlp(latent))
+        torch.randn(self._noise.shape, generator=self._noise_source, out=self._noise)
+        noise = self._noise[self.share.first : self.share.first + self.share.count]
+        return torch.addcmul(mean, self._std, noise, out=self.storage.actions[step])
+
+    @torch.no_grad()
+    def act_mean(self, observations: torch.Tensor) -> torch.Tensor:
+        """The policy without noise, as it is exported; nothing is recorded."""
+        return self.actor.mlp(self.actor.get_latent({GROUP: observations}))
+
+    def process_env_step(
+        self, terminal_observations: torch.Tensor, rewards: torch.Tensor, dones: torch.Tensor, time_outs: torch.Tensor
+    ) -> None:
+        """Record what the step did.
+
+        Args:
+            terminal_observations: The observation before the reset, shape (worlds, observations), where ``dones``.
+            rewards: Shape (worlds,).
+            dones: The episode ended, for any reason, shape (worlds,).
+            time_outs: It ended by the clock alone, shape (worlds,).
+        """
+        step = self.storage.step
+        self._terminal[step].copy_(terminal_observations)
+        self.storage.rewards[step, :, 0].copy_(rewards)
+        self.storage.dones[step, :, 0].copy_(dones)
+        self._time_outs[step, :, 0].copy_(time_outs)
+        self.storage.step += 1
+
+    # -- learning -----------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def compute_returns(self, observations: torch.Tensor) -> None:
+        """Values, GAE (Schulman et al. 2015, arXiv:1506.02438, eq. 16) and advantages normalised over all ranks' samples.
+
+        Args:
+            observations: After the last step, shape (worlds, observations).
+        """
+        st = self.storage
+        st.values.copy_(self.critic.mlp(self._latents))
+        last = self.critic.mlp(self.critic.get_latent({GROUP: observations}))
+        self._bootstrap()
+        self.actor.distribution.update(st.distribution_params[0])
+        st.actions_log_prob[..., 0].copy_(self.actor.distribution.log_prob(st.actions))
+        going_on = 1.0 - st.dones.float()
+        next_values = torch.cat((st.values[1:], last.unsqueeze(0)))
+        delta = st.rewards + self.gamma * going_on * next_values - st.values
+        decay = going_on.mul_(self.gamma * self.lam)
+        st.advantages[-1].copy_(delta[-1])
+        for step in range(st.num_transitions_per_env - 2, -1, -1):
+            torch.addcmul(delta[step], decay[step], st.advantages[step + 1], out=st.advantages[step])
+        torch.add(st.advantages, st.values, out=st.returns)
+        self._share_moments()
+        count, total, squares = self._sums[0], self._sums[1], self._sums[2]
+        mean = total / count
+        deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
+        st.advantages.sub_(mean).div_(deviation + 1e-8)
+
+    def _bootstrap(self) -> None:
+        """Where an episode was cut by the clock, its future is the value of the observation at which it was cut."""
+        if self.device == "cpu":
+            rows = self._time_outs.flatten().nonzero().squeeze(1)
+            if len(rows):
+                values = self.critic.mlp(self.critic.get_latent({GROUP: self._terminal.flatten(0, 1)[rows]}))
+                self.storage.rewards.view(-1, 1).index_add_(0, rows, values, alpha=self.gamma)
+            return
+        values = self.critic.mlp(self.critic.get_latent({GROUP: self._terminal}))
+        future = torch.where(
+            self._time_outs > 0, values, torch.zeros_like(values)
+        )  # the other rows may hold anything, NaN too
+        self.storage.rewards.add_(future, alpha=self.gamma)
+
+    def _share_moments(self) -> None:
+        """Count, sum and sum of squares of advantages and of observations, with the caller's extras: one collective."""
+        advantages, size = self.storage.advantages, self._observations.shape[-1]
+        self._sums[0] = advantages.numel()
+        self._sums[1] = advantages.sum(dtype=torch.float64)
+        self._sums[2] = advantages.double().square().sum()
+        if self.actor.obs_normalization:
+            # around the running mean, which all ranks share: keeps the squares small
+            offsets = (self._observations - self.actor.obs_normalizer._mean).flatten(0, 1)
+            self._sums[3 : 3 + size] = offsets.sum(0, dtype=torch.float64)
+            self._sums[3 + size : 3 + 2 * size] = offsets.square_().sum(0, dtype=torch.float64)
+        self.gang.sum(self._sums)
+
+    def update(self) -> torch.Tensor:
+        """All epochs and minibatches; returns the mean :data:`LOSSES`, shape (4,), on the device."""
+        self._loss_sums.zero_()
+        self._pack_samples()
+        for _ in range(self.num_learning_epochs):
+            order = torch.randperm(len(self._samples), generator=self._order_source, device=self.device)
+            samples = self._samples[order]
+            for i in range(self.num_mini_batches):
+                self._update_minibatch(samples[i * self._batch : (i + 1) * self._batch])
+        self._update_normalizer()
+        self.storage.clear()
+        return self._loss_sums / (self.num_learning_epochs * self.num_mini_batches)
+
+    def _pack_samples(self) -> None:
+        """Rows of everything that a minibatch reads: one gather an epoch, and each minibatch is a slice."""
+        st = self.storage
+        columns = (
+            self._latents,
+            st.actions,
+            st.distribution_params[0],
+            st.actions_log_prob,
+            st.advantages,
+            st.returns,
+            st.values,
+        )
+        torch.cat([column.flatten(0, 1) for column in columns], dim=1, out=self._samples)
+
+    def _update_minibatch(self, samples: torch.Tensor) -> None:
+        """One step of Adam on ``samples``, shape (minibatch, columns), and on the other ranks' samples."""
+        self._shared.zero_()
+        self._compute_gradients(samples)
+        self.gang.sum(self._shared)
+        self._loss_sums.add_(self._losses)
+        self._adapt_learning_rate(self._losses[LOSSES.index("kl")])
+        for gradient in self._gradients:
+            norm = torch.linalg.vector_norm(gradient)
+            gradient.mul_((self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
+        self.optimizer.step()
+
+    def _compute_gradients(self, samples: torch.Tensor) -> None:
+        """The clipped objective (arXiv:1707.06347, eq. 7 and 9), as rsl-rl has it, weighted by this rank's part of the samples."""
+        latents, actions, old_mean, old_log_prob, advantages, returns, old_values = samples.split(self._columns, dim=1)
+        distribution = self.actor.distribution
+        distribution.update(self.actor.mlp(latents))
+        values = self.critic.mlp(latents)
+        ratio = torch.exp(distribution.log_prob(actions) - old_log_prob[:, 0])
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages[:, 0] * ratio, -advantages[:, 0] * clipped).mean()
+        near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+        value = torch.max((values - returns).square(), (near - returns).square()).mean()
+        loss = surrogate + self.value_loss_coef * value
+        with torch.set_grad_enabled(self.entropy_coef != 0.0):
+            entropy = distribution.entropy.mean()
+            loss = loss - self.entropy_coef * entropy if self.entropy_coef else loss
+        (loss * self._weight).backward()
+        with torch.no_grad():
+            kl = distribution.kl_divergence((old_mean, self._std.expand_as(old_mean)), distribution.params).mean()
+            torch.stack((surrogate, value, entropy, kl), out=self._losses).mul_(self._weight)
+
+    @torch.no_grad()
+    def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
+        if self.schedule != "adaptive":
+            return
+        lower = (self._rate / RATE_STEP).clamp(min=RATE_LIMITS[0])
+        higher = (self._rate * RATE_STEP).clamp(max=RATE_LIMITS[1])
+        small = (kl < self.desired_kl / 2.0) & (kl > 0.0)
+        self._rate.copy_(torch.where(kl > self.desired_kl * 2.0, lower, torch.where(small, higher, self._rate)))
+
+    @torch.no_grad()
+    def _update_normalizer(self) -> None:
+        """Merge this iteration's observations of all ranks into the running moments (Chan et al. 1979), as rsl-rl does."""
+        if not self.actor.obs_normalization:
+            return
+        norm, size = self.actor.obs_normalizer, self._observations.shape[-1]
+        added = self._sums[0]
+        offset = self._sums[3 : 3 + size] / added
+        variance = (self._sums[3 + size : 3 + 2 * size] / added - offset.square()).clamp(min=0.0)
+        norm.count.add_(added.long())
+        rate = added / norm.count
+        # with δ the batch mean less the running one: var += rate · (batch var − var + (1 − rate) · δ²)
+        norm._var.add_(rate * (variance - norm._var + (1.0 - rate) * offset.square()))
+        norm._mean.add_(rate * offset)
+        norm._std.copy_(norm._var.sqrt())
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    def broadcast_parameters(self) -> None:
+        """Give every rank the main rank's weights."""
+        for parameter in (*self.actor.parameters(), *self.critic.parameters()):
+            self.gang.broadcast(parameter.data)
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None = None, strict: bool = True) -> bool:
+        """Load what :meth:`save` returned; the optimizer goes on reading the one learning-rate tensor."""
+        result = super().load(loaded_dict, load_cfg, strict)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._rate
+        return result

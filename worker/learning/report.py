@@ -1,0 +1,99 @@
+"""What a run tells people and programs: a line an iteration, the metrics file, TensorBoard events."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+
+from shared_store.metrics import MetricsWriter
+from worker.learning.job import Job
+
+
+class Stopwatch:
+    """Times the parts of an iteration, on CUDA with events so that nothing waits; read it after the device was waited for."""
+
+    def __init__(self, device: str) -> None:
+        self._cuda = device.startswith("cuda")
+        self._marks: list[Any] = []
+
+    def start(self) -> None:
+        self._marks = []
+        self.mark()
+
+    def mark(self) -> None:
+        """The end of one part and the start of the next."""
+        if not self._cuda:
+            self._marks.append(time.perf_counter())
+            return
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        self._marks.append(event)
+
+    def parts(self) -> list[float]:
+        """Duration of each part [s]."""
+        pairs = list(zip(self._marks, self._marks[1:], strict=False))
+        if not self._cuda:
+            return [after - before for before, after in pairs]
+        return [before.elapsed_time(after) / 1000.0 for before, after in pairs]
+
+
+class Report:
+    """Writes the records of one attempt. Main rank only. A volume that refuses a record costs the record, not the run."""
+
+    def __init__(self, job: Job, iterations: int, resumed_from: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._iterations = iterations
+        self._warned = False
+        self._metrics = MetricsWriter(job.run, job.epoch, resumed_from)
+        self._events = SummaryWriter(
+            str(job.run.metrics), purge_step=resumed_from + 1, filename_suffix=f".e{job.epoch}", flush_secs=10
+        )
+
+    def iteration(self, record: dict[str, float | int | None]) -> None:
+        """Print and store one iteration's ``record``."""
+        width = len(str(self._iterations))
+        mishaps = "".join(
+            f"  {name} {record[name]:.0f}" for name in ("nan_worlds", "solver_overflows") if record.get(name)
+        )
+        print(
+            f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
+            f"length {_text(record['episode_length'], '.1f')}  steps/s {record['steps_per_second']:.0f}  "
+            f"lr {record['learning_rate']:.1e}  kl {record['kl']:.3f}{mishaps}",
+            flush=True,
+        )
+        finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
+        try:
+            self._metrics.write({**finite, "time": time.time()})
+            for name, value in finite.items():
+                if name != "iteration" and value is not None:
+                    self._events.add_scalar(_TAGS.get(name, f"train/{name}"), value, record["iteration"])
+        except OSError as error:
+            if not self._warned:
+                print(f"warning: metrics can't be written ({error}); training goes on without them", flush=True)
+            self._warned = True
+
+    def close(self) -> None:
+        """Flush everything."""
+        try:
+            self._metrics.close()
+            self._events.close()
+        except OSError as error:
+            print(f"warning: metrics can't be written ({error})", flush=True)
+
+
+_TAGS = {
+    "reward": "episode/reward",
+    "episode_length": "episode/length",
+    "steps_per_second": "speed/steps_per_second",
+    "collect_seconds": "speed/collect_seconds",
+    "learn_seconds": "speed/learn_seconds",
+    "iteration_seconds": "speed/iteration_seconds",
+}
+
+
+def _text(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,300 @@
+"""The training loop: collect, learn, log, checkpoint, leave when asked, evaluate at the end."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from shared_store.outcomes import EX_TEMPFAIL
+from worker.distributed import Gang, warm_marker
+from worker.errors import TrainingError, UserError
+from worker.learning.beacon import Beacon
+from worker.learning.cadence import Cadence, Fence
+from worker.learning.evaluation import evaluate
+from worker.learning.faults import die, kill_at
+from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
+from worker.learning.ppo import LOSSES, PPO, Share
+from worker.learning.randomness import seed_generators
+from worker.learning.report import Report, Stopwatch
+from worker.learning.state import TrainingState
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task, TaskConfig
+
+
+SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
+"""What the ranks tell each other once an iteration, besides the statistics: how many were asked to stop, how many to save now, how
+many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
+
+
+class Runner:
+    """Trains one task on the worlds of one rank, in step with the other ranks."""
+
+    def __init__(self, job: Job, gang: Gang, task_type: type[Task], stop: StopRequest) -> None:
+        """Build worlds and learner, and go on from the run's newest checkpoint where there is one. All ranks call it.
+
+        Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
+        """
+        self.job, self.gang, self.stop = job, gang, stop
+        self.iterations = job.setting("iterations", 100)
+        self.seed = job.setting("seed", 0, least=0)
+        self._kill_at = kill_at(os.environ, job) if gang.is_main else None
+        checkpoints = job.spec.get("checkpoint") or {}
+        self.cadence = Cadence(checkpoints.get("every", 25))
+        self.config = configure(task_type, job.section)
+        share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
+        seed_generators(self.seed)
+        self.task = build_task(task_type, self.config, share, gang, self.seed)
+        with user_errors():
+            self.ppo = PPO(
+                self.config.ppo,
+                share,
+                self.task.observation_size,
+                self.task.action_size,
+                gang,
+                seed=self.seed,
+                extras=len(self.task.statistic_names) + len(SIGNALS),
+            )
+        self.ppo.broadcast_parameters()
+        seed_generators(self.seed, gang.rank)
+        self.state = TrainingState(
+            job,
+            gang,
+            share,
+            self.task,
+            self.ppo,
+            describe(job, self.task, self.config),
+            int(checkpoints.get("keep", 5)),
+        )
+        self.resumed = self.state.restore()
+        if self.resumed is None:
+            self.task.set_random_episode_length()
+        self.task.clear_statistics()
+        self._stopwatch = Stopwatch(gang.device)
+        self._iteration_seconds = self._stall_seconds = 0.0
+        self.fence = Fence(job.run, job.epoch)
+        self.beacon = Beacon()
+        self.state.saver.start()
+        end_startup()
+
+    def train(self) -> int:
+        """Train to the end; returns the exit code: 0 done, 75 left on request with a checkpoint.
+
+        Raises TrainingError where a loss is not finite; the last checkpoint stands.
+        """
+        progress = self.state.progress
+        report = Report(self.job, self.iterations, progress.iteration) if self.gang.is_main else None
+        self._say(self._beginning())
+        try:
+            while progress.iteration < self.iterations:
+                record, signals = self._iterate()
+                if progress.iteration == self._kill_at:
+                    die()
+                self.fence.check()
+                if report:
+                    report.iteration(record)
+                self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
+                if self._handle(signals):
+                    self._say(f"asked to stop: left after iteration {progress.iteration} of {self.iterations}")
+                    return EX_TEMPFAIL
+        finally:
+            if report:
+                report.close()
+        self._finish()
+        return 0
+
+    def _handle(self, signals: dict[str, float]) -> bool:
+        """Save when it is time, tell of earlier saves; True where the gang is to leave (then everything is saved)."""
+        state, iteration = self.state, self.state.progress.iteration
+        stopping = signals["stopping"] > 0
+        if signals["failed_saves"] > 0:
+            state.saver.abandon()
+        due = self.cadence.due(iteration, signals)
+        if stopping or due or signals["save_now"] > 0 or iteration == self.iterations:
+            state.save()
+            self._stall_seconds = state.saver.stall
+        self._tell_saved(state.saver.poll())
+        if stopping:
+            self._tell_saved(state.finish())
+        return stopping
+
+    def _beginning(self) -> str:
+        ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
+        there = f"{self.ppo.share.total} worlds on {ranks}"
+        if self.resumed is None:
+            return f"starting from new weights: {there}"
+        size = self.resumed.size / 1e6
+        return (
+            f"resumed from checkpoint {self.resumed.name}: {there} ({size:.2f} MB in {self.state.load_seconds:.3f} s)"
+        )
+
+    def _tell_saved(self, lines: list[str]) -> None:
+        for line in filter(None, lines):
+            print(line, flush=True)
+            self.beacon.tell(said=line)
+
+    def _iterate(self) -> tuple[dict[str, Any], dict[str, float]]:
+        """One iteration; the numbers of it (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""
+        progress, ppo = self.state.progress, self.ppo
+        self._stopwatch.start()
+        ppo.begin_iteration(progress.iteration)
+        self._collect()
+        self._stopwatch.mark()
+        ppo.extra[: -len(SIGNALS)].copy_(self.task.statistics)
+        ppo.extra[-len(SIGNALS) :].copy_(self._signals())
+        self.task.clear_statistics()
+        ppo.compute_returns(self.task.observations)
+        losses = ppo.update()
+        self._stopwatch.mark()
+        # the one transfer of the iteration: from here on the host knows
+        numbers = torch.cat(
+            [losses.double(), ppo.learning_rate_tensor.double().view(1), ppo.action_std.double().view(1), ppo.extra]
+        )
+        known = numbers.tolist()
+        values, rate, std = known[: len(LOSSES)], known[len(LOSSES)], known[len(LOSSES) + 1]
+        statistics, signals = known[len(LOSSES) + 2 : -len(SIGNALS)], known[-len(SIGNALS) :]
+        progress.iteration += 1
+        if not all(map(math.isfinite, values)):
+            self._tell_saved(self.state.finish())  # the losses are those of the gang: every rank is here
+            worst = ", ".join(f"{name} {value:g}" for name, value in zip(LOSSES, values, strict=True))
+            last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
+            raise TrainingError(
+                f"iteration {progress.iteration}: the loss is not finite ({worst}); {last}. Try a smaller learning_rate"
+            )
+        record = self._count(statistics)
+        record |= {**dict(zip(LOSSES, values, strict=True)), "learning_rate": rate, "action_std": std}
+        return record, dict(zip(SIGNALS, signals, strict=True))
+
+    def _signals(self) -> torch.Tensor:
+        """This rank's :data:`SIGNALS`, shape (5,), float64."""
+        saver, stop = self.state.saver, self.stop
+        save_now, stop.save_requested = stop.save_requested, False
+        failures, saver.failures = saver.failures, 0
+        own = (float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds)
+        return torch.tensor(own, dtype=torch.float64)
+
+    def _collect(self) -> None:
+        task, ppo = self.task, self.ppo
+        for _ in range(self.config.ppo.steps):
+            task.step(ppo.act(task.observations))
+            ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
+
+    def _count(self, statistics: list[float]) -> dict[str, Any]:
+        """Bring the progress up to date with the ``statistics`` of all ranks; the iteration's record without the losses."""
+        progress = self.state.progress
+        collect, learn = self._stopwatch.parts()
+        steps = self.ppo.share.total * self.config.ppo.steps
+        progress.env_steps += steps
+        self.state.seconds += collect + learn
+        self._iteration_seconds = collect + learn
+        stall, self._stall_seconds = self._stall_seconds, 0.0
+        finished, returns, lengths, *others = statistics
+        if finished:
+            progress.reward, progress.episode_length = returns / finished, lengths / finished
+        return {
+            "iteration": progress.iteration,
+            "env_steps": progress.env_steps,
+            "reward": progress.reward,
+            "episode_length": progress.episode_length,
+            "episodes": int(finished),
+            "steps_per_second": steps / (collect + learn),
+            "collect_seconds": collect,
+            "learn_seconds": learn,
+            "iteration_seconds": collect + learn,
+            "stall_seconds": stall,  # of the save before this iteration, 0 where there was none
+            "total_seconds": self.state.seconds,
+            **{
+                name: _figure(name, value, finished)
+                for name, value in zip(self.task.statistic_names[3:], others, strict=True)
+            },
+        }
+
+    def _finish(self) -> None:
+        """Wait for the last save, evaluate what was learnt, draw the curve, say where everything is."""
+        if self.state.ordered_at != self.state.progress.iteration:
+            self.state.save()
+        self._tell_saved(self.state.finish())
+        name = self.gang.tell(self.state.saved_at) or ""
+        if not name.startswith(f"{self.state.progress.iteration:08d}-"):
+            raise TrainingError(
+                "training is done, but its last checkpoint could not be saved; free space in the store and start again"
+            )
+        self.beacon.tell(done=True)
+        result = evaluate(self.task, self.ppo, self.gang, checkpoint=name)
+        self._say(str(result))
+        if not self.gang.is_main:
+            return
+        try:
+            result.write(self.job.run)
+            from worker.plot import plot_reward
+
+            plot: Path | None = plot_reward(self.job.run)
+        except (OSError, ValueError) as error:
+            print(f"warning: the evaluation or the plot could not be written ({error})", flush=True)
+            plot = None
+        print(f"last checkpoint: {self.job.run.checkpoints / name}", flush=True)
+        if plot:
+            print(f"reward plot: {plot}", flush=True)
+
+    def _say(self, text: str) -> None:
+        if self.gang.is_main:
+            print(text, flush=True)
+
+
+def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
+    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses."""
+    marker = warm_marker(task_type, gang.device)
+    if gang.is_main and marker is not None and not marker.exists():
+        print("compiling kernels: this takes a minute or two, the first time", flush=True)
+    if warp := sys.modules.get("warp"):
+        warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
+    with user_errors(), gang.build_in_turn(marker):
+        return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
+
+
+def total_worlds(job: Job, gang: Gang) -> int:
+    """How many worlds the whole gang has: a run's number, which does not change with the ranks that it has just now.
+
+    ``train.worlds`` is each rank's share of a gang of full size; a run that is resumed has the worlds of its checkpoint.
+    """
+    if given := os.environ.get("MUSTER_WORLDS"):
+        if not given.isdecimal() or int(given) < gang.size:
+            raise UserError(f"MUSTER_WORLDS is {given!r}; expected a number of worlds, at least one for each rank")
+        return int(given)
+    nodes = job.spec.get("nodes")
+    full = nodes["max"] * gang.placement.local_world_size if isinstance(nodes, dict) else gang.size
+    return job.setting("worlds", 256) * max(full, gang.size)
+
+
+def _figure(name: str, total: float, episodes: float) -> float | None:
+    """A reward term is told as its mean over the finished episodes, a count of mishaps as it is."""
+    if not name.startswith("reward_"):
+        return total
+    return total / episodes if episodes else None
+
+
+def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
+    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
+    names = {
+        key: list(value)
+        for key in ("joint_names", "action_names", "observation_names")
+        if (value := getattr(task, key, None)) is not None
+    }
+    return {
+        "task": job.section["task"],
+        "train": job.section,
+        "ppo": dataclasses.asdict(config.ppo),
+        "policy": {
+            "observation_size": task.observation_size,
+            "action_size": task.action_size,
+            "control_hz": config.control_hz,
+            **names,
+        },
+        "torch": torch.__version__,
+    }

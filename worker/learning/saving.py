@@ -1,0 +1,203 @@
+"""Asynchronous saving, seen from the training loop: it stops only while the state is copied to host memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from shared_store.epoch import StaleEpoch
+from shared_store.layout import Run
+from worker.processes import die_with_parent
+
+_BUFFERS = 2
+"""One save is written while the next one is copied; a third waits."""
+
+
+class HostCopies:
+    """Copies of device tensors in pinned host memory that is allocated once: the device is waited for one time a save."""
+
+    def __init__(self) -> None:
+        self._pinned: dict[str, torch.Tensor] = {}
+        self._copied = False
+
+    def take(self, value: Any, key: str = "") -> Any:
+        """``value`` with every CUDA tensor in it replaced by its copy, which is complete after :meth:`wait`."""
+        if isinstance(value, torch.Tensor) and value.is_cuda:
+            host = self._pinned.get(key)
+            if host is None or host.shape != value.shape or host.dtype != value.dtype:
+                host = self._pinned[key] = torch.empty(value.shape, dtype=value.dtype, pin_memory=True)
+            self._copied = True
+            return host.copy_(value.detach(), non_blocking=True)
+        if isinstance(value, dict):
+            return {name: self.take(item, f"{key}/{name}") for name, item in value.items()}
+        if isinstance(value, list | tuple):
+            return type(value)(self.take(item, f"{key}/{index}") for index, item in enumerate(value))
+        return value
+
+    def wait(self) -> None:
+        """Until the copies are complete."""
+        if self._copied:
+            torch.cuda.current_stream().synchronize()
+
+
+class Saver:
+    """Hands snapshots to the writer process of this rank (:mod:`worker.saver`), in order, and tells how they ended."""
+
+    def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None) -> None:
+        self.run, self.epoch, self.rank, self.ranks, self.keep = run, epoch, rank, ranks, keep
+        self.committed: str | None = None
+        """Name of the newest checkpoint that is durable (main rank)."""
+        self.failures = 0
+        """Saves of this rank that failed and that the gang has not been told of."""
+        self.stall = 0.0
+        """How long the last save stopped the loop [s]."""
+        self._copies = HostCopies()
+        self._memory = [os.memfd_create(f"muster-snapshot-{index}") for index in range(_BUFFERS)]
+        self._given = 0
+        self._pending: list[int] = []
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answers = b""
+        self._lines: list[str] = []
+        """What is still to be told of saves that ended."""
+
+    def start(self) -> None:
+        """Start the writer before it is needed: it would otherwise be the first save that waits for its start."""
+        if self._process is None:
+            self._start()
+
+    def save(self, iteration: int, files: Mapping[str, Callable[[], Any]], facts: Mapping[str, Any] | None) -> None:
+        """Copy the state and order its saving; returns before anything is on the volume.
+
+        Args:
+            iteration: Iterations done.
+            files: Name of each file and a function that gives its content: dictionaries of tensors and plain values.
+            facts: What the manifest says besides; the main rank gives it, and commits.
+
+        Raises:
+            StaleEpoch: A newer attempt owns the run.
+        """
+        started = time.perf_counter()
+        while len(self._pending) >= _BUFFERS:
+            self._take_answer(None)
+        memory = self._memory[self._given % _BUFFERS]
+        self._given += 1
+        layout, offset = [], 0
+        snapshots = {name: self._copies.take(content(), name) for name, content in files.items()}
+        self._copies.wait()
+        for name, snapshot in snapshots.items():
+            buffer = io.BytesIO()
+            torch.save(snapshot, buffer)
+            content_bytes = buffer.getbuffer()
+            layout.append((name, offset, len(content_bytes)))
+            while content_bytes:  # one call writes 2 GiB at most
+                written = os.pwrite(memory, content_bytes, offset)
+                content_bytes, offset = content_bytes[written:], offset + written
+        order = {
+            "run": str(self.run.path),
+            "iteration": iteration,
+            "epoch": self.epoch,
+            "rank": self.rank,
+            "ranks": self.ranks,
+        }
+        self._send({**order, "files": layout, "memory": memory, "facts": facts, "keep": self.keep})
+        self._pending.append(iteration)
+        self.stall = time.perf_counter() - started
+
+    def poll(self) -> list[str]:
+        """What has become of earlier saves, a line for each that ended; does not wait. Raises StaleEpoch."""
+        while self._pending and self._take_answer(0.0):
+            pass
+        return self._told()
+
+    def wait(self) -> list[str]:
+        """As :meth:`poll`, for all that are under way. Raises StaleEpoch."""
+        while self._pending:
+            self._take_answer(None)
+        return self._told()
+
+    def abandon(self) -> None:
+        """Another rank's part of a save failed: the main rank's writer must not wait for it."""
+        for iteration in self._pending:
+            self._send({"abandon": iteration})
+
+    def close(self) -> None:
+        """End the writer; what is under way is waited for. Raises StaleEpoch."""
+        self.wait()
+        if self._process and self._process.stdin:
+            self._process.stdin.close()
+            self._process.wait()
+            self._process = None
+
+    def _told(self) -> list[str]:
+        lines, self._lines = self._lines, []
+        return lines
+
+    def _send(self, order: Mapping[str, Any]) -> None:
+        if self._process is not None and self._process.poll() is not None:
+            while self._process is not None:  # it died: what it had answered counts, the rest is lost
+                self._take_answer(None)
+        if self._process is None:
+            self._start()
+        assert self._process is not None and self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(order).encode() + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            pass  # it has just died: the answer that does not come says so
+
+    def _start(self) -> None:
+        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it."""
+        self._answers = b""
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "worker.saver"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=self._memory,
+            start_new_session=True,
+            preexec_fn=die_with_parent(),
+        )
+
+    def _take_answer(self, seconds: float | None) -> bool:
+        """Note the next answer, waiting for it up to ``seconds`` (None: for ever); False where none came. Raises StaleEpoch."""
+        assert self._process is not None and self._process.stdout is not None
+        while b"\n" not in self._answers:
+            if not select.select([self._process.stdout], [], [], seconds)[0]:
+                return False
+            chunk = os.read(self._process.stdout.fileno(), 65536)
+            if not chunk:
+                self._lost()
+                return True
+            self._answers += chunk
+        line, _, self._answers = self._answers.partition(b"\n")
+        iteration = self._pending.pop(0)
+        answer = json.loads(line)
+        if "stale" in answer:
+            raise StaleEpoch(answer["stale"])
+        if "failed" in answer:
+            self._fail(iteration, answer["failed"])
+        elif "committed" in answer:
+            self.committed = answer["committed"]
+            self._lines.append(f"checkpoint {self.committed}")
+        return True
+
+    def _fail(self, iteration: int, why: str) -> None:
+        self.failures += 1
+        self._lines.append(f"warning: iteration {iteration} could not be saved ({why}); training goes on")
+
+    def _lost(self) -> None:
+        """The writer died: all that it had is lost, and the next save starts another."""
+        assert self._process is not None
+        code = self._process.wait()
+        self._process = None
+        lost, self._pending = self._pending, []
+        for iteration in lost:
+            self._fail(iteration, f"its writer died with code {code}")

@@ -1,0 +1,205 @@
+"""The whole state of training, saved in shards and dealt out again.
+
+``learner.pt`` (main rank): weights, optimizer, normalisers, learning rate, progress. ``rank-<k>.pt`` (each rank): every tensor of
+its worlds, and its generators. Worlds have global indices, so that shards can be dealt to any number of ranks.
+Files are written with ``torch.save`` and only ever read with ``weights_only=True``: loading runs no code.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from shared_store.checkpoints import (
+    Checkpoint,
+    DamagedCheckpoint,
+    NewerFormat,
+    newest_checkpoint,
+    set_aside,
+    sweep,
+)
+from shared_store.epoch import check_epoch
+from worker.distributed import Gang
+from worker.errors import UserError
+from worker.learning.job import Job
+from worker.learning.ppo import PPO, Share
+from worker.learning.randomness import generator_state, restore_generators
+from worker.learning.saving import Saver
+from worker.learning.shards import Shards, read_file
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+
+@dataclass
+class Progress:
+    """How far training is."""
+
+    iteration: int = 0
+    """Iterations done."""
+    env_steps: int = 0
+    """Steps of all worlds together."""
+    reward: float | None = None
+    """Mean return of the episodes that ended in the last iteration in which any ended; None before the first."""
+    episode_length: float | None = None
+    """Their mean length [steps]."""
+
+
+class TrainingState:
+    """What is saved and restored: the learner, this rank's worlds, the progress."""
+
+    def __init__(
+        self, job: Job, gang: Gang, share: Share, task: Task, ppo: PPO, facts: dict[str, Any], keep: int
+    ) -> None:
+        """``facts``: what the manifest says besides (task, configuration), for those who read a checkpoint without the job."""
+        self.job, self.gang, self.share, self.task, self.ppo, self.facts = job, gang, share, task, ppo, facts
+        self.progress = Progress()
+        self.seconds = 0.0
+        """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
+        self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep)
+        self.ordered_at: int | None = None
+        """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
+        self.load_seconds = 0.0
+        """How long it took to read and take over the checkpoint that was loaded [s]; its digests not counted."""
+
+    def save(self) -> None:
+        """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
+
+        Raises StaleEpoch where a newer attempt owns the run.
+        """
+        worlds = {"first": self.share.first, "count": self.share.count}
+        files: dict[str, Callable[[], Any]] = {
+            f"rank-{self.gang.rank}.pt": lambda: {
+                "worlds": {**worlds, "state": self.task.state_dict()},
+                "generators": generator_state(),
+            }
+        }
+        if self.gang.is_main:
+            files["learner.pt"] = lambda: {"ppo": self.ppo.save(), "progress": asdict(self.progress)}
+        self.saver.save(self.progress.iteration, files, self._manifest() if self.gang.is_main else None)
+        self.ordered_at = self.progress.iteration
+
+    def finish(self) -> list[str]:
+        """Wait until every save is durable or has failed; every rank calls it. Returns lines for the log.
+
+        Raises StaleEpoch where a newer attempt owns the run.
+        """
+        lines = [] if self.gang.is_main else self.saver.wait()
+        if self.gang.greatest(self.saver.failures):
+            self.saver.abandon()
+        return lines + self.saver.wait()
+
+    @property
+    def saved_at(self) -> str | None:
+        """Name of the newest durable checkpoint that this attempt started from or made (main rank)."""
+        return self.saver.committed
+
+    def _manifest(self) -> dict[str, Any]:
+        shares = [Share.of(rank, self.gang.size, self.share.total) for rank in range(self.gang.size)]
+        return {
+            **self.facts,
+            "world_size": self.gang.size,
+            "worlds": self.share.total,
+            "shards": [[share.first, share.count] for share in shares],
+            "reward": self.progress.reward,
+            "env_steps": self.progress.env_steps,
+            "seconds": self.seconds,
+        }
+
+    def restore(self) -> Checkpoint | None:
+        """Go on from the newest good checkpoint, or from the chosen one; None where there is none. All ranks call it.
+
+        The main rank chooses and verifies; damaged ones are named and set aside.
+
+        Raises:
+            UserError: The checkpoint does not fit this job; the message says in what.
+            DamagedCheckpoint: The chosen one can't be used, or the newest one has a newer format.
+        """
+        checkpoint, problem = None, ""
+        if self.gang.is_main:
+            try:
+                checkpoint = self._choose()
+            except DamagedCheckpoint as error:
+                problem = str(error)
+        if problem := self.gang.tell(problem) or "":
+            raise DamagedCheckpoint(problem)
+        name = self.gang.tell(checkpoint.name if checkpoint else None)
+        if name is None:
+            return None
+        iteration, epoch = name.split("-e")
+        checkpoint = Checkpoint(self.job.run.checkpoints / name, int(iteration), int(epoch))
+        self.load(checkpoint)
+        return checkpoint
+
+    def _choose(self) -> Checkpoint | None:
+        def damaged(checkpoint: Checkpoint, error: DamagedCheckpoint) -> None:
+            if isinstance(error, NewerFormat):  # the run's history goes on there, where this program can't follow
+                raise error
+            place = set_aside(checkpoint)
+            print(f"warning: {error}; it was set aside as {place.name} and the one before it is used", flush=True)
+
+        check_epoch(
+            self.job.run, self.job.epoch
+        )  # a rank that was frozen here must not clear away its successor's work
+        sweep(self.job.run)
+        return newest_checkpoint(
+            self.job.run, chosen=self.job.checkpoint, chosen_since=self.job.job_epoch, damaged=damaged
+        )
+
+    def load(self, checkpoint: Checkpoint) -> None:
+        """Take over the state of ``checkpoint``. Raises UserError where it does not fit."""
+        started = time.perf_counter()
+        self._check_fit(checkpoint)
+        learner = read_file(checkpoint, "learner.pt", self.gang.device)
+        try:
+            self.ppo.load(learner["ppo"])
+            self.progress = Progress(**learner["progress"])
+        except (RuntimeError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"checkpoint {checkpoint.name} does not fit this job's task and networks: {error}"
+            ) from error
+        self.seconds = float(checkpoint.manifest.get("seconds", 0.0))
+        self._load_worlds(checkpoint)
+        self.saver.committed, self.ordered_at = checkpoint.name, checkpoint.iteration
+        self.load_seconds = time.perf_counter() - started
+
+    def _check_fit(self, checkpoint: Checkpoint) -> None:
+        """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
+        there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
+        keys = [("task",), *(("train", key) for key in ("seed", "config")), *(("ppo", key) for key in _SHAPE)]
+        for path in keys:
+            old, new = _at(there, path), _at(here, path)
+            if old != new:
+                raise UserError(
+                    f"checkpoint {checkpoint.name} does not fit this job's task and networks: {'.'.join(path)} is "
+                    f"{old!r} there and {new!r} here; start a new run for that"
+                )
+
+    def _load_worlds(self, checkpoint: Checkpoint) -> None:
+        total, bounds = checkpoint.manifest["worlds"], checkpoint.manifest["shards"]
+        if total != self.share.total:
+            raise UserError(
+                f"checkpoint {checkpoint.name} holds {total} worlds ({len(bounds)} ranks of {bounds[0][1]}), this job has "
+                f"{self.share.total} ({self.gang.size} ranks of {self.share.count}): set `worlds` and `nodes` so that their product "
+                f"is {total}"
+            )
+        shards = Shards(checkpoint)
+        try:
+            self.task.load_state_dict(shards.worlds(self.share.first, self.share.count))
+            if len(bounds) == self.gang.size:  # dealt out anew, a rank's own generators have no counterpart
+                restore_generators(shards.rank(self.gang.rank)["generators"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
+
+
+_SHAPE = ("hidden_sizes", "activation", "normalize_observations")
+"""Settings of PPO that shape the network."""
+
+
+def _at(facts: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        facts = facts.get(key) if isinstance(facts, dict) else None
+    return facts or None  # no overrides are none, whether they are said or not

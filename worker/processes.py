@@ -1,0 +1,75 @@
+"""What a node does to processes: tie a child's life to its parent's, adopt orphans, end everything it ever started.
+
+Linux only: it uses ``prctl(2)`` and ``/proc``. Imports no torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+_PR_SET_PTRACER = 0x59616D61
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def die_with_parent() -> Callable[[], None]:
+    """A ``preexec_fn`` that has the child killed by the kernel when this process dies, however it dies.
+
+    The signal is tied to the *thread* that forks (``prctl(2)``), so it must be started from one that lives as long as the
+    process: the main thread.
+    """
+    parent = os.getpid()
+
+    def tie() -> None:
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        _libc.prctl(_PR_SET_PTRACER, parent, 0, 0, 0)  # its stacks may be read by us, also under Yama's ptrace_scope 1
+        if os.getppid() != parent:  # the parent died between fork and prctl
+            os._exit(1)
+
+    return tie
+
+
+def adopt_orphans() -> None:
+    """Have descendants whose parent dies re-parented to this process instead of to init, so that they can be found."""
+    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def children() -> list[int]:
+    """Pids of the processes whose parent is this process, zombies left out."""
+    me = os.getpid()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            # field 2 is the command in brackets, which may hold spaces: split after the last bracket
+            state, parent = (entry / "stat").read_text().rpartition(")")[2].split()[:2]
+        except OSError:
+            continue
+        if int(parent) == me and state != "Z":
+            found.append(int(entry.name))
+    return found
+
+
+def kill_group(pid: int, number: int) -> None:
+    """Send signal ``number`` to the process group that ``pid`` leads, where it still exists."""
+    try:
+        os.killpg(pid, number)
+    except (ProcessLookupError, PermissionError):
+        pass
+
+
+def reap_orphans() -> None:
+    """Kill and reap every child that is left, and theirs, until there is none."""
+    while pids := children():
+        for pid in pids:
+            try:
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+            except (ProcessLookupError, ChildProcessError):
+                pass

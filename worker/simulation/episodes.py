@@ -1,0 +1,144 @@
+"""Episodes of many worlds: ages, sums, termination, statistics and random streams, as functions that kernels call.
+
+A task's ``observe`` kernel runs one thread a world and calls, in this order, :func:`add_reward` for every term,
+:func:`end_step`, and, where that says so, :func:`begin_episode` and its own code that places the world afresh.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+STEP = wp.constant(0)
+"""Mode of an ``observe`` kernel: reward, termination and reset of the worlds that ended."""
+RESET = wp.constant(1)
+"""Mode of an ``observe`` kernel: begin a new episode in every world, without reward or statistics."""
+
+RETURN = wp.constant(0)
+STEPS = wp.constant(1)
+TERMS = wp.constant(2)
+"""Columns of ``EpisodeArrays.sums``: return, steps lived, then one column a reward term."""
+
+
+@wp.struct
+class EpisodeArrays:
+    """The buffers of a task, one row a world.
+
+    Attributes:
+        actions: What the policy asked for, shape ``(worlds, actions)``.
+        observations: What the policy sees next, shape ``(worlds, observations)``.
+        terminal_observations: The observation before the reset where ``dones``, else stale; same shape.
+        rewards: Sum of the reward terms of the last step, shape ``(worlds,)``.
+        dones: Whether the episode ended in the last step, shape ``(worlds,)``.
+        time_outs: Whether it ended by the clock alone, shape ``(worlds,)``.
+        ages: Steps on the clock of the running episode, shape ``(worlds,)``.
+        sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
+        random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
+        statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
+            a reward term, worlds reset because of NaN, control steps with a solver overflow; shape ``(5 + terms,)``.
+    """
+
+    actions: wp.array2d(dtype=wp.float32)
+    observations: wp.array2d(dtype=wp.float32)
+    terminal_observations: wp.array2d(dtype=wp.float32)
+    rewards: wp.array(dtype=wp.float32)
+    dones: wp.array(dtype=wp.bool)
+    time_outs: wp.array(dtype=wp.bool)
+    ages: wp.array(dtype=wp.int32)
+    sums: wp.array2d(dtype=wp.float32)
+    random: wp.array2d(dtype=wp.int32)
+    statistics: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def is_finite(rows: wp.array2d(dtype=wp.float32), world: int) -> bool:
+    """Whether every value in a world's row is a finite number."""
+    for column in range(rows.shape[1]):  # noqa: SIM110 (Warp has no all())
+        if not wp.isfinite(rows[world, column]):
+            return False
+    return True
+
+
+@wp.func
+def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
+    """Set a world's row to zero."""
+    for column in range(rows.shape[1]):
+        rows[world, column] = 0.0
+
+
+@wp.func
+def random_stream(episodes: EpisodeArrays, world: int) -> wp.uint32:
+    """A fresh generator for one world, a function of (seed, global world index, streams drawn before) alone."""
+    drawn = episodes.random[world, 2]
+    episodes.random[world, 2] = drawn + 1
+    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
+    return wp.rand_init(int(key), drawn)
+
+
+@wp.func
+def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
+    """Add one reward term to the step's reward and to the episode's sums (``rewards`` was set to zero before)."""
+    episodes.rewards[world] = episodes.rewards[world] + value
+    episodes.sums[world, TERMS + term] = episodes.sums[world, TERMS + term] + value
+
+
+@wp.func
+def begin_episode(episodes: EpisodeArrays, world: int):
+    """Clear a world's clock and sums."""
+    episodes.ages[world] = 0
+    clear_row(episodes.sums, world)
+
+
+@wp.func
+def end_step(
+    episodes: EpisodeArrays,
+    overflow: wp.array(dtype=wp.int32),
+    world: int,
+    terminated: bool,
+    valid: bool,
+    max_age: int,
+) -> bool:
+    """Close one control step of one world: clock, flags, sums, statistics.
+
+    Args:
+        episodes: The task's buffers; ``rewards`` holds this step's reward.
+        overflow: Solver overflow bits since the last call, cleared here, shape ``(worlds,)``.
+        world: Row.
+        terminated: Whether the task ended the episode.
+        valid: Whether the physics is finite. An invalid world is reset and counted, and not as a finished episode.
+        max_age: Steps after which the clock ends an episode.
+
+    Returns:
+        Whether the episode ended, so that the world must be placed afresh.
+    """
+    terms = episodes.sums.shape[1] - TERMS
+    age = episodes.ages[world] + 1
+    episodes.ages[world] = age
+    time_out = valid and not terminated and age >= max_age
+    done = terminated or time_out or not valid
+    episodes.dones[world] = done
+    episodes.time_outs[world] = time_out
+
+    if overflow[world] != 0:
+        overflow[world] = 0
+        wp.atomic_add(episodes.statistics, TERMS + terms + 2, wp.float64(1.0))
+    if not valid:
+        episodes.rewards[world] = 0.0
+        wp.atomic_add(episodes.statistics, TERMS + terms + 1, wp.float64(1.0))
+    else:
+        episodes.sums[world, RETURN] = episodes.sums[world, RETURN] + episodes.rewards[world]
+        episodes.sums[world, STEPS] = episodes.sums[world, STEPS] + 1.0
+        if done:
+            wp.atomic_add(episodes.statistics, 0, wp.float64(1.0))
+            for column in range(episodes.sums.shape[1]):
+                wp.atomic_add(episodes.statistics, 1 + column, wp.float64(episodes.sums[world, column]))
+    return done
+
+
+@wp.kernel
+def randomize_ages(max_age: int, episodes: EpisodeArrays):
+    """Set every clock to a random age in [0, max_age), so that worlds do not all time out in the same step."""
+    world = wp.tid()
+    stream = random_stream(episodes, world)
+    episodes.ages[world] = wp.randi(stream, 0, max_age)

@@ -1,0 +1,132 @@
+"""N copies of one Newton model, one copy a world, stepped by MuJoCo-Warp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco_warp
+import newton
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class WorldArrays:
+    """What a task's kernels read and write of the physics, one row a world.
+
+    Attributes:
+        joint_q: Joint coordinates [m, rad, quaternion xyzw], shape ``(worlds, coordinates)``.
+        joint_qd: Joint velocities [m/s, rad/s], shape ``(worlds, dofs)``. A free joint holds the linear velocity of its
+            body's centre of mass and then the angular velocity, both in the world frame.
+        controls: Actuator inputs in the order of the model file [actuator's own unit], shape ``(worlds, actuators)``.
+        warm_start: Accelerations [m/s^2, rad/s^2] from which the constraint solver starts, shape ``(worlds, dofs)``.
+        overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
+    """
+
+    joint_q: wp.array2d(dtype=wp.float32)
+    joint_qd: wp.array2d(dtype=wp.float32)
+    controls: wp.array2d(dtype=wp.float32)
+    warm_start: wp.array2d(dtype=wp.float32)
+    overflow: wp.array(dtype=wp.int32)
+
+
+# Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
+# constraints were dropped.
+_CAPACITY_BITS = wp.constant(
+    int(mujoco_warp.OverflowType.ALL & ~(mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS))
+)
+
+
+@wp.kernel
+def _gather_overflow(solver_overflow: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
+    """The solver clears its bits at every physics step: keep them for the whole control step."""
+    world = wp.tid()
+    overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)
+
+
+class Worlds:
+    """Identical, independent worlds that step together.
+
+    Args:
+        template: Builder holding one world. ``SolverMuJoCo.register_custom_attributes`` was called on it before import.
+        world_count: Number of copies.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+        timestep: Length of one physics step [s].
+        substeps: Physics steps of one :meth:`simulate`.
+        ground: Whether to add one ground plane (z = 0) that all worlds share.
+        solver_options: Keyword arguments of ``SolverMuJoCo`` (``njmax`` and ``nconmax`` are per world).
+    """
+
+    def __init__(
+        self,
+        template: newton.ModelBuilder,
+        world_count: int,
+        device: str,
+        *,
+        timestep: float,
+        substeps: int,
+        ground: bool = False,
+        solver_options: Mapping[str, Any],
+    ) -> None:
+        scene = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(scene)
+        scene.replicate(template, world_count)
+        if ground:
+            scene.add_ground_plane()
+        self.model = scene.finalize(device=device)
+        self.solver = SolverMuJoCo(
+            self.model,
+            # Neither is used here and both cost time in every step.
+            disable_sensors=True,
+            kinematic_switchable_roots=False,
+            separate_worlds=True,
+            **solver_options,
+        )
+        # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
+        self.solver.mjw_model.opt.warn_overflow = 0
+        self.state = self.model.state()
+        self._other_state = self.model.state()
+        self.control = self.model.control()
+        self.world_count = world_count
+        self.timestep = timestep
+        self.substeps = substeps
+
+        self.arrays = WorldArrays()
+        self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
+        self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
+        self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
+        self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
+        self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
+
+    def simulate(self) -> None:
+        """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured."""
+        current, following = self.state, self._other_state
+        for _ in range(self.substeps):
+            self.solver.step(current, following, self.control, None, self.timestep)
+            wp.launch(
+                _gather_overflow,
+                dim=self.world_count,
+                inputs=[self.solver.mjw_data.overflow],
+                outputs=[self.arrays.overflow],
+                device=self.model.device,
+            )
+            current, following = following, current
+        if current is not self.state:
+            # An odd number of swaps. A graph keeps addresses, so the result has to come back to where it started.
+            self.state.assign(current)
+
+    def restore_defaults(self) -> None:
+        """Put every world in the model's own pose, at rest, with a cold solver."""
+        for state in (self.state, self._other_state):
+            state.joint_q.assign(self.model.joint_q)
+            state.joint_qd.assign(self.model.joint_qd)
+        self.arrays.controls.zero_()
+        self.arrays.warm_start.zero_()
+        self.arrays.overflow.zero_()
+
+    def update_bodies(self) -> None:
+        """Recompute body poses from joint coordinates, for who looks at ``state.body_q`` right after a reset."""
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)

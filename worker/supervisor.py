@@ -1,0 +1,324 @@
+"""The node's supervisor: ``python -m worker.supervisor -- COMMAND…``, the same on every engine.
+
+It reads the node contract, starts the ranks with torchrun's environment, merges their output into the node's log, forwards
+SIGTERM, ends everything it started, and commits ``outcome.json`` before it leaves. It notices a rank that makes no progress, and
+is the node's voice on the bus. One thread, one selector, no torch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import selectors
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from shared_store.contract import ContractError, NodeContract
+from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.layout import Run, Store, StoreError
+from shared_store.logs import format_line
+from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
+from worker.bus import Command, NodeBus
+from worker.network import interface_of
+from worker.processes import adopt_orphans, kill_group, reap_orphans
+from worker.rank import Rank
+from worker.stacks import dump_stacks, state_of
+
+_PEER_GRACE = 5.0
+"""Seconds that the other ranks of a node get after one of them failed: their collectives are broken, there is nothing to save."""
+_FENCE_INTERVAL = 1.0
+"""Seconds between two looks at the run's EPOCH."""
+_WAITING_EXTRA = 3.0
+"""Seconds that a rank which waits gets beyond the stall timeout: the one that it waits for is to be found first."""
+_PATIENCE = 1800.0
+"""Seconds that a training may take to start, and to finish after its last iteration."""
+_STATES = {
+    "R": "it runs",
+    "D": "it waits for a device or the store",
+    "T": "it is stopped by a signal",
+    "t": "it is being traced",
+}
+
+
+class Supervisor:
+    """Runs the ranks of one node from start to outcome."""
+
+    def __init__(self, contract: NodeContract, run: Run, command: list[str]) -> None:
+        self.contract, self.run, self.command = contract, run, command
+        self.ranks: list[Rank] = []
+        self.selector = selectors.DefaultSelector()
+        self.deadline: float | None = None
+        self.stopping: str | None = None
+        self._next_fence = 0.0
+        self._saving: list[tuple[int, Command]] = []
+        self._log_broken = False
+        log = run.log(contract.job, contract.attempt, contract.node_index)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._log = open(log, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115 - lives as long as the supervisor
+
+    # -- life ---------------------------------------------------------------------------------------------------------
+
+    def supervise(self) -> int:
+        """Start the ranks, watch them to the end, commit the outcome; returns the node's exit code."""
+        started = time.time()
+        adopt_orphans()
+        self._wakeup, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._catch_signals(write_end)
+        self.bus = NodeBus(self.contract, write_end)
+        with tempfile.TemporaryDirectory(prefix="muster-node-") as scratch:
+            try:
+                self._start_ranks(Path(scratch))
+            except OSError as error:
+                reason = f"can't start {self.command[0]!r}: {error.strerror}; is it installed, and is the path right?"
+                self.write(None, "e", reason)
+                return self._commit(
+                    Outcome(
+                        self.contract.node_index, self.contract.epoch, 127, None, reason, None, started, time.time()
+                    )
+                )
+            if self.stopping:  # asked while the ranks were being started: they have not heard it
+                for rank in self.ranks:
+                    kill_group(rank.pid, signal.SIGTERM)
+            while any(rank.running for rank in self.ranks):
+                self._read(timeout=0.1)
+                self._watch()
+                self._serve_bus()
+            reap_orphans()
+            self._drain()
+            outcome = self._outcome(started)
+        self.write(None, "o", f"node {self.contract.node_index} ended: {outcome.reason}")
+        code = self._commit(outcome)
+        self.bus.close()
+        return code
+
+    def abandon(self) -> None:
+        """Kill everything at once and write nothing more: the run belongs to a newer attempt."""
+        for rank in self.ranks:
+            kill_group(rank.pid, signal.SIGKILL)
+        reap_orphans()
+
+    def stop(self, why: str, grace: float) -> None:
+        """Ask every rank to leave; those that are still here ``grace`` seconds later are killed."""
+        if self.deadline is None:
+            self.stopping = why
+            self.deadline = time.monotonic() + grace
+            for rank in self.ranks:
+                if rank.running:
+                    kill_group(rank.pid, signal.SIGTERM)
+
+    # -- ranks --------------------------------------------------------------------------------------------------------
+
+    def _start_ranks(self, scratch: Path) -> None:
+        contract = self.contract
+        threads = max(1, int(contract.cpus / contract.ranks_per_node))
+        shared = {
+            "OMP_NUM_THREADS": str(threads),
+            "PYTHONUNBUFFERED": "1",
+            "TORCH_NCCL_ASYNC_ERROR_HANDLING": "1",  # as torchrun does
+        }
+        if interface := interface_of(contract.address, contract.master_address):
+            shared |= {"NCCL_SOCKET_IFNAME": interface, "GLOO_SOCKET_IFNAME": interface}
+        for local in range(contract.ranks_per_node):
+            rank = Rank(contract, local, scratch / f"error-{local}.json")
+            # what the user set in the job's environment stands
+            env = {**shared, **os.environ, **rank.environment()}
+            rank.start(self.command, env)
+            self.ranks.append(rank)
+            for stream in ("o", "e"):
+                self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))
+            self.selector.register(rank.beacon, selectors.EVENT_READ, (rank, "beacon"))
+
+    def _watch(self) -> None:
+        """Notice ends; a failure of one rank ends the others, a passed deadline kills."""
+        for rank in self.ranks:
+            if rank.poll() and rank.exit_code not in (0, EX_TEMPFAIL):
+                self.stop(f"rank {rank.number} failed", _PEER_GRACE)
+            elif rank.running and self.deadline is None and self._stalls(rank):
+                self.stop(f"rank {rank.number} stalls", 0.0)
+        if self.deadline is not None and time.monotonic() >= self.deadline:
+            for rank in self.ranks:
+                if rank.running:
+                    rank.overdue = True
+                    kill_group(rank.pid, signal.SIGKILL)
+
+    def _stalls(self, rank: Rank) -> bool:
+        """Whether the rank has told of no iteration for too long; then its stacks are in the log."""
+        timeout = self.contract.stall_timeout
+        if timeout is None:
+            return False
+        # before the first iteration (kernels are compiled) and after the last (evaluation) there is no measure but patience
+        since, limit = (rank.heard, timeout) if rank.heard is not None else (rank.spoke, max(timeout, _PATIENCE))
+        if (silence := time.monotonic() - since) < limit:
+            return False
+        timeout = limit
+        state = state_of(rank.pid)
+        if state not in _STATES and silence < timeout + _WAITING_EXTRA:
+            return False
+        doing = _STATES.get(state, "it waits, perhaps for another rank")
+        rank.stalled = (
+            f"made no progress for {silence:.0f} s after iteration {rank.progress.get('iteration', 0)}: {doing}"
+        )
+        self.write(rank.number, "e", f"stall: rank {rank.number} {rank.stalled}; its stacks:")
+        for line in dump_stacks(rank.pid, speaks=True):
+            self.write(rank.number, "e", line)
+        return True
+
+    # -- bus ----------------------------------------------------------------------------------------------------------
+
+    def _serve_bus(self) -> None:
+        """Carry out the commands that came, and tell how the node is."""
+        self.bus.tend(self.ranks[0].progress)
+        while not self.bus.commands.empty():
+            command = self.bus.commands.get()
+            if command.name == "checkpoint":
+                self._order_save(command)
+            elif command.name == "stacks":
+                command.reply("\n".join(line for rank in self.ranks for line in self._stacks(rank)))
+            elif command.name == "stop":
+                command.reply("stopping")
+                self.stop("asked to leave over the bus", self.contract.grace)
+            else:
+                command.reply(f"unknown command {command.name}")
+
+    def _order_save(self, command: Command) -> None:
+        """Ask the ranks to save now (SIGUSR2); the answer follows when the first save after that is durable."""
+        rank = self.ranks[0]
+        if not rank.running or rank.heard is None:
+            command.reply("not training: there is nothing to save now")
+            return
+        self._saving.append((rank.progress["iteration"], command))
+        os.kill(rank.pid, signal.SIGUSR2)
+
+    def _stacks(self, rank: Rank) -> list[str]:
+        lines = dump_stacks(rank.pid, speaks=rank.heard is not None) if rank.running else ["ended"]
+        for line in (f"stacks of rank {rank.number}, asked for:", *lines):
+            self.write(rank.number, "e", line)
+        return [f"rank {rank.number}:", *lines]
+
+    def _catch_signals(self, write_end: int) -> None:
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda _number, _frame: self.stop("asked to leave", self.contract.grace))
+        signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
+        self.selector.register(self._wakeup, selectors.EVENT_READ, None)
+
+    # -- output -------------------------------------------------------------------------------------------------------
+
+    def write(self, rank: int | None, stream: str, text: str) -> None:
+        """Append one line to the node's log. A full or lost volume is said once on stderr; the ranks go on."""
+        try:
+            self._log.write(format_line(time.time(), rank, stream, text))
+            self._log.flush()
+            self._log_broken = False
+        except OSError as error:
+            if not self._log_broken:
+                print(
+                    f"log of node {self.contract.node_index} can't be written: {error.strerror}",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            self._log_broken = True
+
+    def _read(self, timeout: float) -> bool:
+        """Move what the ranks printed into the log; False where there was nothing. Raises StaleEpoch."""
+        moved = False
+        ready = self.selector.select(timeout)
+        if time.monotonic() >= self._next_fence:  # before anything is written: a node that was frozen must not log
+            with contextlib.suppress(OSError, ValueError):  # a volume that is away: a commit reads it again
+                check_epoch(self.run, self.contract.epoch)
+            self._next_fence = time.monotonic() + _FENCE_INTERVAL
+        for key, _ in ready:
+            if key.data is None:
+                with contextlib.suppress(BlockingIOError):
+                    os.read(key.fd, 4096)
+                continue
+            rank, stream = key.data
+            if stream == "beacon":
+                if (said := rank.listen()) is None:
+                    self.selector.unregister(key.fd)
+                self._answer_saves(said or [])
+                continue
+            lines = rank.read(stream)
+            if lines is None:
+                self.selector.unregister(key.fileobj)
+                continue
+            moved = True
+            for line in lines:
+                self.write(rank.number, stream, line)
+        return moved
+
+    def _answer_saves(self, said: list[str]) -> None:
+        """Answer those who asked for a save with what became of one that is not older than their wish."""
+        for text in said:
+            saved = int(match[0]) if (match := re.search(r"\d+", text)) else 0
+            for wish in [wish for wish in self._saving if saved >= wish[0]]:
+                wish[1].reply(text)
+                self._saving.remove(wish)
+
+    def _drain(self) -> None:
+        while self._read(timeout=0):
+            pass
+        for rank in self.ranks:
+            for stream in ("o", "e"):
+                if rest := rank.rest(stream):
+                    self.write(rank.number, stream, rest)
+
+    # -- end ----------------------------------------------------------------------------------------------------------
+
+    def _outcome(self, started: float) -> Outcome:
+        failed = [rank for rank in self.ranks if rank.exit_code not in (0, EX_TEMPFAIL)]
+        first = min(failed, key=lambda rank: (rank.stalled is None, rank.ended), default=None)
+        if first:
+            code, reason, error = first.exit_code, first.reason(self.contract.grace), first.first_error()
+        elif any(rank.exit_code == EX_TEMPFAIL for rank in self.ranks):
+            code, reason, error = EX_TEMPFAIL, "checkpointed and left on request", None
+        else:
+            code, reason, error = 0, "done", None
+        name = first.signal_name if first else None
+        return Outcome(self.contract.node_index, self.contract.epoch, code, name, reason, error, started, time.time())
+
+    def _commit(self, outcome: Outcome) -> int:
+        with contextlib.suppress(OSError):
+            os.fsync(self._log.fileno())
+        if not self.run.path.exists():
+            return outcome.exit_code  # somebody deleted the run: it must not come back in part
+        try:
+            write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
+        except OSError as error:
+            print(f"outcome of node {outcome.node} can't be written: {error.strerror}", file=sys.stderr, flush=True)
+        return outcome.exit_code
+
+
+def main(argv: list[str]) -> int:
+    """Entry point; exit codes: the node's (0, 75, 128 + n, the program's), 2 for a wrong call, 3 where fenced off."""
+    if len(argv) < 2 or argv[0] != "--":
+        print("usage: python -m worker.supervisor -- COMMAND [ARG …]", file=sys.stderr)
+        return 2
+    try:
+        contract = NodeContract.from_env(os.environ)
+        run = Store(contract.store).run(contract.run)
+        check_epoch(run, contract.epoch)
+        supervisor = Supervisor(contract, run, argv[1:])
+    except (ContractError, StoreError, ValueError) as error:
+        print(f"muster supervisor: {error}", file=sys.stderr)
+        return 2
+    except StaleEpoch as error:
+        print(f"muster supervisor: {error}; leaving", file=sys.stderr)
+        return 3
+    except OSError as error:
+        print(f"muster supervisor: store: {error.strerror}: {error.filename}", file=sys.stderr)
+        return 2
+    try:
+        return supervisor.supervise()
+    except StaleEpoch as error:
+        supervisor.abandon()
+        print(f"muster supervisor: {error}; leaving", file=sys.stderr)
+        return 3
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,161 @@
+"""Balance a pole on a cart that a motor pushes along a rail."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import newton
+import warp as wp
+
+from worker.simulation.episodes import (
+    STEP,
+    EpisodeArrays,
+    add_reward,
+    begin_episode,
+    clear_row,
+    end_step,
+    is_finite,
+    random_stream,
+)
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.task import PPOConfig, Task, TaskConfig
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True)
+class CartpoleConfig(TaskConfig):
+    """The cart may not leave the rail and the pole may not fall past ``angle_limit``."""
+
+    control_hz: float = 60.0
+    """Control steps per simulated second [Hz]."""
+    substeps: int = 1
+    """Physics steps of one control step: without contacts one step of 1/60 s is accurate enough."""
+    episode_seconds: float = 5.0
+    """Simulated time after which the clock ends an episode [s]."""
+    cart_limit: float = 2.4
+    """Distance of the cart from the middle of the rail at which the episode ends [m]."""
+    angle_limit: float = 0.4
+    """Tilt of the pole at which the episode ends [rad]."""
+    start_position: float = 0.5
+    """A start is uniform in +- this distance from the middle [m]."""
+    start_angle: float = 0.15
+    """A start is uniform in +- this tilt [rad]."""
+    start_velocity: float = 0.3
+    """A start is uniform in +- this velocity of the cart [m/s] and of the pole [rad/s]."""
+    alive_reward: float = 0.1
+    """Reward of each step that does not end in a fall."""
+    angle_cost: float = 0.1
+    """Cost of the squared tilt [1/rad^2]."""
+    position_cost: float = 0.05
+    """Cost of the squared distance from the middle [1/m^2]."""
+    velocity_cost: float = 0.05
+    """Cost of the cart's squared velocity [s^2/m^2]: a cart that drifts meets the end of the rail too late to learn why."""
+    effort_cost: float = 0.001
+    """Cost of the squared action."""
+    fall_cost: float = 2.0
+    """Cost of leaving the rail or dropping the pole, once."""
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01
+        )
+    )
+    """How the task is trained: small, since the task is easy and often run on a processor."""
+
+
+@wp.struct
+class CartpoleParameters:
+    """The fields of :class:`CartpoleConfig` that the kernels use."""
+
+    cart_limit: float
+    angle_limit: float
+    start_position: float
+    start_angle: float
+    start_velocity: float
+    alive_reward: float
+    angle_cost: float
+    position_cost: float
+    velocity_cost: float
+    effort_cost: float
+    fall_cost: float
+
+
+@wp.kernel
+def act(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays):
+    """The action is the motor's share of its full force, clipped to [-1, 1]."""
+    world = wp.tid()
+    worlds.controls[world, 0] = wp.clamp(episodes.actions[world, 0], -1.0, 1.0)
+
+
+@wp.func
+def write_observation(observations: wp.array2d(dtype=wp.float32), worlds: WorldArrays, world: int):
+    """Cart position [m], pole angle [rad], their velocities [m/s, rad/s]."""
+    observations[world, 0] = worlds.joint_q[world, 0]
+    observations[world, 1] = worlds.joint_q[world, 1]
+    observations[world, 2] = worlds.joint_qd[world, 0]
+    observations[world, 3] = worlds.joint_qd[world, 1]
+
+
+@wp.func
+def place(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
+    """Put a world at a random start, with a cold solver."""
+    stream = random_stream(episodes, world)
+    worlds.joint_q[world, 0] = parameters.start_position * wp.randf(stream, -1.0, 1.0)
+    worlds.joint_q[world, 1] = parameters.start_angle * wp.randf(stream, -1.0, 1.0)
+    worlds.joint_qd[world, 0] = parameters.start_velocity * wp.randf(stream, -1.0, 1.0)
+    worlds.joint_qd[world, 1] = parameters.start_velocity * wp.randf(stream, -1.0, 1.0)
+    clear_row(worlds.warm_start, world)
+
+
+@wp.kernel
+def observe(mode: int, max_age: int, parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays):
+    """Reward, termination, statistics, masked reset and observation of one world a thread."""
+    world = wp.tid()
+    restart = mode != STEP
+    if mode == STEP:
+        valid = is_finite(worlds.joint_q, world) and is_finite(worlds.joint_qd, world)
+        position = worlds.joint_q[world, 0]
+        angle = worlds.joint_q[world, 1]
+        velocity = worlds.joint_qd[world, 0]
+        effort = wp.clamp(episodes.actions[world, 0], -1.0, 1.0)
+        fallen = valid and (wp.abs(position) > parameters.cart_limit or wp.abs(angle) > parameters.angle_limit)
+
+        episodes.rewards[world] = 0.0
+        if fallen:
+            add_reward(episodes, world, 5, -parameters.fall_cost)
+        else:
+            add_reward(episodes, world, 0, parameters.alive_reward)
+        add_reward(episodes, world, 1, -parameters.angle_cost * angle * angle)
+        add_reward(episodes, world, 2, -parameters.position_cost * position * position)
+        add_reward(episodes, world, 3, -parameters.velocity_cost * velocity * velocity)
+        add_reward(episodes, world, 4, -parameters.effort_cost * effort * effort)
+
+        restart = end_step(episodes, worlds.overflow, world, fallen, valid, max_age)
+        if restart:
+            if valid:
+                write_observation(episodes.terminal_observations, worlds, world)
+            else:
+                clear_row(episodes.terminal_observations, world)
+    if restart:
+        begin_episode(episodes, world)
+        place(parameters, worlds, episodes, world)
+    write_observation(episodes.observations, worlds, world)
+
+
+class Cartpole(Task):
+    """Cart and pole: 4 observations, 1 action, 60 control steps a second, episodes of 5 s."""
+
+    config_type = CartpoleConfig
+    parameters_type = CartpoleParameters
+    reward_terms = ("alive", "angle", "position", "velocity", "effort", "fall")
+    observation_names = ("slider_position", "hinge_position", "slider_velocity", "hinge_velocity")
+    action_names = ("slider",)
+    act: ClassVar[wp.Kernel] = act
+    observe: ClassVar[wp.Kernel] = observe
+    solver_options: ClassVar[dict[str, object]] = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
+
+    def build(self, builder: newton.ModelBuilder) -> None:
+        """Cart on a slide joint, pole on a free hinge, motor on the slide; nothing collides."""
+        builder.add_mjcf(str(Path(__file__).with_name("cartpole.xml")))

@@ -1,0 +1,131 @@
+"""Tasks as Gymnasium vector environments: ``gymnasium.make_vec("worker.tasks.gym:Muster/Cartpole-v0", num_envs=64)``.
+
+Gymnasium 1.4 loads no plugins by itself: importing this module registers the built-in tasks, and the ``module:`` prefix
+of the id does that import. After it, ``"Muster/Cartpole-v0"`` alone is enough.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from worker.tasks import BUILT_IN, find_task
+
+
+class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """One task as a vector environment, with numpy at its edge.
+
+    A world whose episode ends is reset in the same step: the step returns the first observation of the next episode, and
+    ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask).
+
+    Args:
+        task: Name or ``module:Class``, as :func:`worker.tasks.find_task` takes it.
+        num_envs: Number of worlds.
+        seed: Seed until :meth:`reset` gives another.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+        **overrides: Fields of the task's configuration, by name.
+
+    Raises:
+        ValueError: No such task, no such field of its configuration, or a value out of range.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+
+    def __init__(self, task: str, num_envs: int = 1, *, seed: int = 0, device: str = "cpu", **overrides: Any) -> None:
+        task_type = find_task(task)
+        known = {item.name for item in dataclasses.fields(task_type.config_type)}
+        if unknown := sorted(overrides.keys() - known):
+            raise ValueError(
+                f"task {task} has no setting {', '.join(unknown)}; its settings are {', '.join(sorted(known))}"
+            )
+        config = task_type.config_type(**overrides)
+        self.task = task_type(config, num_envs, seed=seed, device=device)
+        self.num_envs = num_envs
+        self.metadata = {**self.metadata, "render_fps": config.control_hz}
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.task.observation_size,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin a new episode in every world.
+
+        Args:
+            seed: Makes what follows a function of the seed and the actions alone; None goes on with the random streams.
+            options: Not used by any task.
+
+        Returns:
+            Observations, shape ``(num_envs, observations)``, float32, and an empty info.
+
+        Raises:
+            ValueError: ``seed`` is negative, or ``options`` asks for a partial reset, which worlds do by themselves.
+        """
+        if options is not None and "reset_mask" in options:
+            raise ValueError("reset_mask is for environments that do not reset themselves; these do, in the same step")
+        if seed is not None:
+            self.task.seed(seed)
+            super().reset(seed=seed)
+        self.task.reset()
+        return self._numpy(self.task.observations), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance every world by one control step.
+
+        Args:
+            actions: Shape ``(num_envs, actions)``; clipped to [-1, 1].
+
+        Returns:
+            Observations (float32), rewards (float32), terminations, truncations (bool) and info.
+
+        Raises:
+            ValueError: ``actions`` has another shape.
+        """
+        actions = np.asarray(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(
+                f"actions have shape {actions.shape}; {self.num_envs} worlds take {self.action_space.shape}"
+            )
+        self.task.step(torch.from_numpy(actions))
+        dones = self._numpy(self.task.dones)
+        truncations = self._numpy(self.task.time_outs)
+        info: dict[str, Any] = {}
+        if dones.any():
+            terminal = self._numpy(self.task.terminal_observations)
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for world in np.flatnonzero(dones):
+                final_obs[world] = terminal[world]
+            info = {"final_obs": final_obs, "_final_obs": dones.copy(), "final_info": {}, "_final_info": dones.copy()}
+        return (
+            self._numpy(self.task.observations),
+            self._numpy(self.task.rewards),
+            dones & ~truncations,
+            truncations,
+            info,
+        )
+
+    @staticmethod
+    def _numpy(tensor: torch.Tensor) -> np.ndarray:
+        """A copy, since the task's buffers change with the next step."""
+        return tensor.cpu().numpy().copy()
+
+
+def register() -> None:
+    """Register ``Muster/<Task>-v0`` for every built-in task (once; a second call does nothing)."""
+    for name in BUILT_IN:
+        if f"Muster/{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                id=f"Muster/{name}-v0",
+                vector_entry_point="worker.tasks.gym:TaskVectorEnv",
+                kwargs={"task": name},
+            )
+
+
+register()

@@ -1,0 +1,339 @@
+"""A task: many worlds of one robot, its actions, observations, reward terms and resets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+import newton
+import torch
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation.capture import CapturedStep, on_torch_stream
+from worker.simulation.episodes import RESET, STEP, EpisodeArrays, randomize_ages
+from worker.simulation.worlds import Worlds
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation for one task."""
+
+    steps: int = 32
+    """Control steps of every world in one iteration."""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actor and critic."""
+    activation: str = "elu"
+    """Activation between layers, by torch's lower-case name (``"elu"``, ``"relu"``, ``"tanh"``)."""
+    epochs: int = 5
+    """Passes over the collected batch in one iteration."""
+    minibatches: int = 4
+    """Parts into which each pass splits the batch."""
+    learning_rate: float = 1.0e-3
+    """Step size of Adam (the first one, where the schedule adapts it)."""
+    schedule: str = "adaptive"
+    """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays."""
+    desired_kl: float = 0.01
+    """KL divergence between old and new policy that the adaptive schedule aims at [nat]."""
+    gamma: float = 0.99
+    """Discount of the reward per control step."""
+    lam: float = 0.95
+    """Decay of generalised advantage estimation per control step."""
+    clip: float = 0.2
+    """Clip range of the probability ratio and of the value's change."""
+    entropy_coef: float = 0.0
+    """Weight of the entropy bonus in the loss."""
+    value_loss_coef: float = 1.0
+    """Weight of the value loss in the loss."""
+    max_grad_norm: float = 1.0
+    """Norm to which gradients are clipped."""
+    init_std: float = 1.0
+    """Initial standard deviation of the actions [unit of the action]."""
+    normalize_observations: bool = True
+    """Whether observations are normalised by their running mean and variance."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """What every task has; a task adds its own fields."""
+
+    control_hz: float = 60.0
+    """Control steps per simulated second [Hz]."""
+    substeps: int = 2
+    """Physics steps of one control step."""
+    episode_seconds: float = 10.0
+    """Simulated time after which the clock ends an episode [s]."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """How the task is trained."""
+
+
+class Task:
+    """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
+
+    A subclass names its configuration, terms and kernels and builds one world; everything else is here. Every tensor
+    below is a fixed buffer (the same address for ever), shared with Warp, on ``device``.
+
+    Args:
+        config: The task's configuration, of type ``config_type``.
+        world_count: Number of worlds.
+        seed: Seed of all random numbers (any integer >= 0; 64 bits count).
+        first_world: Global index of world 0. Random numbers are keyed by (seed, global index, draws so far), so N ranks
+            with W / N worlds each see the worlds of one rank with W.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+
+    Raises:
+        ValueError: An argument or a field of the configuration is out of range.
+
+    Attributes:
+        world_count: Number of worlds.
+        max_episode_length: Control steps after which the clock ends an episode.
+        device: As given.
+        actions: What to do next, shape ``(worlds, action_size)``, float32.
+        observations: What the policy sees, shape ``(worlds, observation_size)``, float32.
+        terminal_observations: The observation before the reset, valid where ``dones``; same shape, float32.
+        rewards: Shape ``(worlds,)``, float32.
+        dones: Whether the episode ended, shape ``(worlds,)``, bool.
+        time_outs: Whether it ended by the clock alone, shape ``(worlds,)``, bool.
+        episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
+        statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
+            float64. They are not part of the state: read and clear them before it is saved.
+        captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
+    """
+
+    config_type: ClassVar[type[TaskConfig]]
+    """Type of the configuration."""
+    parameters_type: ClassVar[Any]
+    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels."""
+    reward_terms: ClassVar[tuple[str, ...]]
+    """Names of the reward terms, in the order of the kernel's indices."""
+    observation_names: ClassVar[tuple[str, ...]]
+    """Name of each observation, in order."""
+    action_names: ClassVar[tuple[str, ...]]
+    """Name of each action, in order (the joint that it drives)."""
+    act: ClassVar[wp.Kernel]
+    """Kernel ``(parameters, worlds, episodes)`` over worlds: from ``episodes.actions`` to ``worlds.controls``."""
+    observe: ClassVar[wp.Kernel]
+    """Kernel ``(mode, max_age, parameters, worlds, episodes)`` over worlds; see :mod:`worker.simulation.episodes`."""
+    ground: ClassVar[bool] = False
+    """Whether the worlds stand on a ground plane."""
+    solver_options: ClassVar[Mapping[str, Any]] = {}
+    """Options of ``newton.solvers.SolverMuJoCo``."""
+
+    def __init__(
+        self, config: TaskConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
+    ) -> None:
+        self._check(config, world_count, seed, first_world)
+        self.config = config
+        self.world_count = world_count
+        self.device = "cuda:0" if device == "cuda" else device
+        self.action_size = len(self.action_names)
+        self.observation_size = len(self.observation_names)
+        self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
+        self.statistic_names: tuple[str, ...] = (
+            "episodes",
+            "episode_return",
+            "episode_length",
+            *(f"reward_{name}" for name in self.reward_terms),
+            "nan_worlds",
+            "solver_overflows",
+        )
+        self.first_world = first_world
+        template = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(template)
+        self.build(template)
+        self.worlds = Worlds(
+            template,
+            world_count,
+            self.device,
+            timestep=1.0 / (config.control_hz * config.substeps),
+            substeps=config.substeps,
+            ground=self.ground,
+            solver_options=self.solver_options,
+        )
+        self._allocate()
+        self._parameters = self.parameters_type()
+        for item in fields(config):
+            if hasattr(self._parameters, item.name):
+                setattr(self._parameters, item.name, getattr(config, item.name))
+        wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
+
+        with on_torch_stream(self.device):
+            self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
+        self._graph = CapturedStep(self._launch_step, self.device)
+        self._assert_captured()
+        with on_torch_stream(self.device):
+            self.worlds.restore_defaults()
+        self.clear_statistics()
+        self.seed(seed)
+        self.reset()
+
+    def build(self, builder: newton.ModelBuilder) -> None:
+        """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
+        raise NotImplementedError
+
+    def step(self, actions: torch.Tensor) -> None:
+        """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
+
+        Args:
+            actions: Shape ``(worlds, action_size)``, float32, on ``device``; copied into :attr:`actions`.
+        """
+        self.actions.copy_(actions)
+        self._graph.launch()
+
+    def reset(self) -> None:
+        """Begin a new episode, from fresh random numbers, in every world."""
+        with on_torch_stream(self.device):
+            self._launch_observe(RESET)
+
+    def seed(self, seed: int) -> None:
+        """Start all random streams afresh from another seed; the worlds change at their next reset.
+
+        Args:
+            seed: Any integer >= 0.
+
+        Raises:
+            ValueError: ``seed`` is negative.
+        """
+        if seed < 0:
+            raise ValueError(f"seed is {seed}; use an integer >= 0")
+        folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
+        self._random[:, 0] = folded - (1 << 32) if folded >= 1 << 31 else folded
+        self._random[:, 1] = torch.arange(self.first_world, self.first_world + self.world_count, dtype=torch.int32)
+        self._random[:, 2] = 0
+
+    def set_random_episode_length(self) -> None:
+        """Give every world's clock a random age, so that their time-outs do not fall in the same step."""
+        with on_torch_stream(self.device):
+            wp.launch(
+                randomize_ages,
+                dim=self.world_count,
+                inputs=[self.max_episode_length, self._episodes],
+                device=self.device,
+            )
+
+    def clear_statistics(self) -> None:
+        """Set all running totals to zero."""
+        self.statistics.zero_()
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Everything that :meth:`load_state_dict` needs to go on bit for bit (on the CPU), copied to host memory.
+
+        Returns:
+            Tensors by name, each with leading dimension ``world_count``, so that worlds can be dealt out again.
+        """
+        return {name: tensor.detach().cpu().clone() for name, tensor in self._state_tensors().items()}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Continue from :meth:`state_dict`, in place. Worlds keep the seed and the global index that they had.
+
+        Args:
+            state: As returned by :meth:`state_dict` of the same task with as many worlds.
+
+        Raises:
+            ValueError: A tensor is missing, unknown, or of another shape or type; nothing was changed.
+        """
+        tensors = self._state_tensors()
+        task = type(self).__name__
+        if missing := sorted(tensors.keys() - state.keys()):
+            raise ValueError(f"the saved state of task {task} lacks {', '.join(missing)}")
+        if unknown := sorted(state.keys() - tensors.keys()):
+            raise ValueError(f"the saved state of task {task} holds {', '.join(unknown)}, which the task does not have")
+        for name, tensor in tensors.items():
+            saved = state[name]
+            if saved.shape != tensor.shape or saved.dtype != tensor.dtype:
+                raise ValueError(
+                    f"the saved state of task {task} does not fit: {name} is {tuple(saved.shape)} {saved.dtype}, "
+                    f"expected {tuple(tensor.shape)} {tensor.dtype}"
+                )
+        for name, tensor in tensors.items():
+            tensor.copy_(state[name])
+
+    def _check(self, config: TaskConfig, world_count: int, seed: int, first_world: int) -> None:
+        """Refuse impossible arguments, each with one sentence."""
+        task = type(self).__name__
+        if not isinstance(config, self.config_type):
+            raise ValueError(
+                f"task {task} takes a {self.config_type.__name__}, not a {type(config).__name__}; "
+                f"make one with {self.config_type.__name__}(...)"
+            )
+        if world_count < 1:
+            raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
+        if first_world < 0:
+            raise ValueError(f"task {task}: first_world is {first_world}; use an index >= 0")
+        if seed < 0:
+            raise ValueError(f"task {task}: seed is {seed}; use an integer >= 0")
+        if config.substeps < 1:
+            raise ValueError(f"task {task}: substeps is {config.substeps}; use at least 1")
+        if config.control_hz <= 0.0:
+            raise ValueError(f"task {task}: control_hz is {config.control_hz}; use a positive frequency in Hz")
+        if config.episode_seconds <= 0.0:
+            raise ValueError(
+                f"task {task}: episode_seconds is {config.episode_seconds}; use a positive time in seconds"
+            )
+
+    def _allocate(self) -> None:
+        """Allocate every buffer once and let torch see it."""
+        count, device = self.world_count, self.device
+
+        def buffer(name: str, shape: tuple[int, ...], dtype: Any) -> torch.Tensor:
+            array = wp.zeros(shape, dtype=dtype, device=device)
+            setattr(self._episodes, name, array)
+            return wp.to_torch(array)
+
+        self._episodes = EpisodeArrays()
+        self.actions = buffer("actions", (count, self.action_size), wp.float32)
+        self.observations = buffer("observations", (count, self.observation_size), wp.float32)
+        self.terminal_observations = buffer("terminal_observations", (count, self.observation_size), wp.float32)
+        self.rewards = buffer("rewards", (count,), wp.float32)
+        self.dones = buffer("dones", (count,), wp.bool)
+        self.time_outs = buffer("time_outs", (count,), wp.bool)
+        self.episode_length = buffer("ages", (count,), wp.int32)
+        self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
+        self._random = buffer("random", (count, 3), wp.int32)
+        self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
+
+    def _state_tensors(self) -> dict[str, torch.Tensor]:
+        """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
+        arrays = self.worlds.arrays
+        return {
+            "joint_q": wp.to_torch(arrays.joint_q),
+            "joint_qd": wp.to_torch(arrays.joint_qd),
+            "solver_warm_start": wp.to_torch(arrays.warm_start),
+            "observations": self.observations,
+            "episode_length": self.episode_length,
+            "episode_sums": self._sums,
+            "random": self._random,
+        }
+
+    def _assert_captured(self) -> None:
+        """Replay once and see that it rewards: a graph that recorded nothing would step for ever without a sound.
+
+        Raises:
+            RuntimeError: The replay left a reward as it was.
+        """
+        self.captured = False
+        self.rewards.fill_(float("nan"))
+        self._graph.launch()
+        if self.rewards.isnan().any():
+            raise RuntimeError(f"the captured step of task {type(self).__name__} does not replay on {self.device}")
+        self.captured = True
+
+    def _launch_step(self) -> None:
+        """The whole control step, as launches: what the graph holds."""
+        wp.launch(
+            self.act,
+            dim=self.world_count,
+            inputs=[self._parameters, self.worlds.arrays, self._episodes],
+            device=self.device,
+        )
+        self.worlds.simulate()
+        self._launch_observe(STEP)
+
+    def _launch_observe(self, mode: int) -> None:
+        wp.launch(
+            self.observe,
+            dim=self.world_count,
+            inputs=[int(mode), self.max_episode_length, self._parameters, self.worlds.arrays, self._episodes],
+            device=self.device,
+        )

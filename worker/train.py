@@ -1,0 +1,35 @@
+"""``python -m worker.train``: one rank of a training job, started by the supervisor (or by torchrun) with the job in its environment."""
+
+from __future__ import annotations
+
+import os
+
+from worker.errors import UserError
+from worker.learning.job import Job, StopRequest, run_command, user_errors
+
+
+def main() -> int:
+    """Train; returns the exit code."""
+    stop = StopRequest().listen()  # before the imports, which take seconds
+    job = Job.from_env(os.environ, "train")
+    from worker.distributed import REPORT_SECONDS, Placement, connect, use_cpu_threads
+
+    use_cpu_threads(os.environ)
+    with user_errors():
+        placement = Placement.from_env(os.environ)
+    gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    if not isinstance(job.section.get("task"), str):
+        raise UserError("train.task: the name of a task is missing")
+    from worker.tasks import find_task
+
+    with user_errors("train.task"):
+        task_type = find_task(job.section["task"])
+    from worker.learning.runner import Runner
+
+    code = Runner(job, gang, task_type, stop).train()
+    gang.close()
+    return code
+
+
+if __name__ == "__main__":
+    run_command(main)
