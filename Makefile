@@ -13,6 +13,7 @@ run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
 
 test: lint
+	$(BIN)/python -m tests.kernels
 	$(BIN)/pytest -q -n 2 --dist loadfile --durations=10
 
 lint: $(READY)

@@ -21,6 +21,9 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
 os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
 
+PATIENCE = 3
+"""Every limit of a wait is this many times what an idle machine could need: a limit is there to end a test that hangs."""
+
 
 def run_muster(*arguments: str, home: Path, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
     """The real command in a subprocess."""
@@ -30,7 +33,7 @@ def run_muster(*arguments: str, home: Path, timeout: float = 120, **env: str) ->
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
-        timeout=timeout,
+        timeout=timeout * PATIENCE,
     )
 
 
@@ -50,12 +53,12 @@ def processes_of(home: Path) -> list[int]:
 
 def wait_for(condition: Callable[[], Any], timeout: float = 60, what: str = "condition") -> Any:
     """Poll until ``condition`` gives something true; that is returned."""
-    deadline = time.monotonic() + timeout
+    deadline = time.monotonic() + timeout * PATIENCE
     while time.monotonic() < deadline:
         if value := condition():
             return value
         time.sleep(0.05)
-    raise AssertionError(f"{what}: not within {timeout} s")
+    raise AssertionError(f"{what}: not within {timeout * PATIENCE} s")
 
 
 class Serving:

@@ -14,6 +14,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.database import Job
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.jobs import Status
 from orchestrator.scheduler import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
@@ -77,7 +78,7 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
 
 def spec_of(session: Session, run: Run) -> dict[str, Any] | None:
     """The spec with which a run goes on: that of its newest job, else the one that it was created with."""
-    newest = session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)).first()
+    newest = _newest_job(session, run)
     if newest:
         return gang_needs(newest.node_properties).spec
     return (run.description() or {}).get("spec")
@@ -121,7 +122,7 @@ def resume(
         environment = {"MUSTER_RUN": run.name}
         if spec.train:
             if chosen:
-                _check_progress(run, spec, chosen)
+                _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
         if impossible := never_fits(gang_needs(definition["nodeProperties"]), controller.engine.capacity()):
@@ -181,8 +182,11 @@ def _choose(run: Run, iteration: int | None) -> Checkpoint | None:
     return matching[-1]
 
 
-def _check_progress(run: Run, after: Spec, chosen: Checkpoint) -> None:
-    """Refuse a run that is complete, and one that a newer Muster wrote."""
+def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint) -> None:
+    """Refuse a run that is complete, and one that a newer Muster wrote.
+
+    A job that was struck down after its last save still owes its evaluation: such a run may be resumed.
+    """
     assert after.train is not None
     try:
         _ = chosen.manifest
@@ -190,7 +194,9 @@ def _check_progress(run: Run, after: Spec, chosen: Checkpoint) -> None:
         raise ClientError(f"run {run.name}: {error}", CONFLICT) from None
     except DamagedCheckpoint:
         pass  # the worker names it, sets it aside and uses the one before
-    if chosen.iteration >= after.train.iterations:
+    newest = _newest_job(session, run)
+    owing = chosen.iteration == after.train.iterations and newest is not None and newest.status == Status.FAILED
+    if chosen.iteration >= after.train.iterations and not owing:
         raise ClientError(
             f"run {run.name} is complete at iteration {chosen.iteration} of {after.train.iterations}; "
             f"to go on: --set train.iterations={chosen.iteration * 2}",
@@ -227,12 +233,15 @@ def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | No
             return told
     except DamagedCheckpoint:
         pass
-    query = select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)
-    if newest := session.scalars(query).first():
+    if newest := _newest_job(session, run):
         given = gang_needs(newest.node_properties).setting("MUSTER_WORLDS")
         if given.isdecimal():
             return int(given)
     return before.train.worlds * before.ranks_per_node * before.nodes.max
+
+
+def _newest_job(session: Session, run: Run) -> Job | None:
+    return session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)).first()
 
 
 def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:

@@ -301,11 +301,6 @@ class Fire:
             self._thaw_controller_at = None
         self._restart_at = None
         resumed, said = self.home.command("resume", self.run.name)
-        if resumed is None and f"is complete at iteration {self.iterations} " in said:
-            # the last attempt was struck after its last checkpoint: a person asks for its evaluation, or for more iterations
-            self.say("complete, though the last attempt failed")
-            self._over = self.result.verdict.complete = True
-            return
         if resumed is None:
             raise Broken(f"the run could not be resumed after its attempts were spent: {said}")
         self.say(f"resumed from iteration {resumed['iteration']} by another job")

@@ -28,9 +28,6 @@ def table(results: Sequence[Result], seconds: float) -> str:
         "gang starts after the first of each run": sum(max(0, verdict.attempts - 1) for verdict in verdicts),
         "controller starts": sum(result.controller_starts for result in results),
         "jobs that resumed a run whose attempts were spent": sum(max(0, verdict.jobs - 1) for verdict in verdicts),
-        "jobs that failed after their run was complete (struck in the evaluation, no attempt left)": sum(
-            verdict.complete for verdict in verdicts
-        ),
         "iterations repeated (lost work)": sum(verdict.repeated for verdict in verdicts),
         "epochs skipped (controller killed before it had recorded the attempt)": sum(
             verdict.skipped_epochs for verdict in verdicts

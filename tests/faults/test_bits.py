@@ -38,7 +38,7 @@ def verify(home: Path, at: int, iterations: int, *spec: str) -> subprocess.Popen
 
 def proven(process: subprocess.Popen[str], iterations: int) -> tuple[str, str, int]:
     """Both runs, and the iteration at which the killed one went on, of a verification that found equal bits."""
-    output, errors = process.communicate(timeout=300)
+    output, errors = process.communicate(timeout=900)
     assert process.returncode == 0, output + errors
     tensors = re.search(rf"^equal: (\d+) tensors, {iterations} iterations$", output, re.MULTILINE)
     assert tensors and int(tensors[1]) > 30, output
@@ -58,7 +58,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def verifying(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """Two verifications of one rank at the same time, since the machine has two cores."""
     started = {
-        "Cartpole": verify(home, 9, 51, *CARTPOLE),
+        "Cartpole": verify(home, 9, 191, *CARTPOLE),
         "Ant": verify(tmp_path_factory.mktemp("ant"), 3, 2, *ANT),
     }
     yield started
@@ -68,13 +68,13 @@ def verifying(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def straight(home: Path, verifying: dict[str, subprocess.Popen[str]]) -> str:
-    """A straight run of 60 iterations, after its killed twin was found to have the same bits."""
-    one, two, resumed_from = proven(verifying["Cartpole"], 60)
+    """A straight run of 200 iterations, after its killed twin was found to have the same bits."""
+    one, two, resumed_from = proven(verifying["Cartpole"], 200)
     assert resumed_from in (0, 4, 8), "what it goes on from is the newest checkpoint that was durable"
     run = Store(home / "store").run(two)
     epochs = [json.loads(line) for line in (run.metrics / "metrics-e1.jsonl").read_text().splitlines()]
     assert epochs[-1]["iteration"] == 8, "it died before anything of iteration 9 was written"
-    assert [record["iteration"] for record in read_metrics(run)] == list(range(1, 61))
+    assert [record["iteration"] for record in read_metrics(run)] == list(range(1, 201))
     return one
 
 
@@ -86,23 +86,24 @@ def test_ants_killed_end_with_the_same_bits(verifying: dict[str, subprocess.Pope
     proven(verifying["Ant"], 5)
 
 
-def test_a_gang_of_three_killed_ends_with_the_same_bits(tmp_path: Path) -> None:
-    spec = (*CARTPOLE[:-1], "nodes=3", "train.worlds=5")
-    _, killed, _ = proven(verify(tmp_path, 6, 3, *spec), 9)
-    (newest,) = (Store(tmp_path / "store").run(killed).checkpoints).glob("00000009-e2")
+@pytest.mark.parametrize("spec", [CARTPOLE, ANT])
+def test_a_gang_of_three_killed_ends_with_the_same_bits(tmp_path: Path, spec: tuple[str, ...]) -> None:
+    _, killed, _ = proven(verify(tmp_path, 5, 2, *spec, "nodes=3", "train.worlds=5"), 7)
+    (newest,) = (Store(tmp_path / "store").run(killed).checkpoints).glob("00000007-e2")
     assert json.loads((newest / "manifest.json").read_text())["shards"] == [[0, 5], [5, 5], [10, 5]]
 
 
 def test_stopped_and_resumed_ends_with_the_same_bits(home: Path, straight: str) -> None:
     server = Serving(home, "--cpus", "4")
     try:
-        submitted = server.muster("submit", *options(*CARTPOLE, "train.iterations=60"), "--json")
+        submitted = server.muster("submit", *options(*CARTPOLE, "train.iterations=200"), "--json")
         job = server.detail(json.loads(submitted.stdout)["jobId"])
         run = Store(home / "store").run(job["run"])
         wait_for(lambda: len(read_metrics(run)) >= 2, 100, "the second iteration")
-        assert server.muster("stop", job["id"]).returncode == 0
+        server.client.batch("TerminateJob", jobId=job["id"], reason="enough")
+        server.wait(job["id"], timeout=100)
         reached = len(read_metrics(run))
-        assert 2 <= reached < 60, "it was stopped on the way"
+        assert 2 <= reached < 200, "it was stopped on the way"
         resumed = json.loads(server.muster("resume", run.name, "--json").stdout)
         assert resumed["iteration"] == reached
         assert server.wait(resumed["jobId"], timeout=120)["status"] == "SUCCEEDED"
@@ -113,9 +114,9 @@ def test_stopped_and_resumed_ends_with_the_same_bits(home: Path, straight: str) 
         env={**os.environ, "MUSTER_STORE": str(home / "store")},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=180,
     )
-    assert same.returncode == 0 and re.fullmatch(r"equal: \d+ tensors, 60 iterations\n", same.stdout), same
+    assert same.returncode == 0 and re.fullmatch(r"equal: \d+ tensors, 200 iterations\n", same.stdout), same
 
 
 @pytest.mark.parametrize(
