@@ -1,7 +1,6 @@
 """The reconcile loop: database × scheduler × engine.
 
-Everything that must survive a crash is in the database before it is done: an attempt is recorded before its gang is launched,
-its ending before the gang is stopped. A controller that starts on the database of a dead one goes on from there.
+A controller that starts on the database of a dead one goes on from there: what it decides is recorded before it is done.
 """
 
 from __future__ import annotations
@@ -9,35 +8,32 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from orchestrator.accounting import forget_before
+from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.bus import Bus
-from orchestrator.database import Attempt, Database, Job, now
-from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus, Placement
-from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge
-from orchestrator.scheduler import Start, Waiting, decide
-from shared_store import __version__
-from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
-from shared_store.layout import Run, Store, StoreError
-from shared_store.outcomes import read_outcome
+from orchestrator.database import Database
+from orchestrator.engines.base import Engine
+from orchestrator.gangs import Gangs
+from orchestrator.jobs import Ending, Status
+from orchestrator.roster import Roster
+from orchestrator.scheduling import Board, Decisions, decide
+from orchestrator.tables import Job, JobQueue, now
+from shared_store.layout import Store
 
-GRACE = 30.0
-"""Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
-_FAILED_GRACE = 5.0
-"""The same for a gang whose collectives are broken: there is nothing left to save."""
-LOST = 20.0
-"""Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
-_FINISHING = 10.0
-"""Seconds that children of a native job get to end by themselves after the main node is done."""
-_SHORTEST_REQUEUE = 10_000
-"""An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+_SETTLED_AT_ONCE = 200
+"""Jobs a commit, of those that only change their state."""
+_PASS_INTERVAL = 1.0
+"""Seconds between scheduling passes while nothing changes: shares decay and limits run out by themselves."""
+_PASS_SHARE = 0.2
+"""Share of one CPU that passes may take."""
+_SWEEP_INTERVAL = 2.0
+"""Seconds between two looks for queues that are gone and history that may be forgotten."""
 
 log = logging.getLogger("muster.controller")
 
@@ -45,19 +41,32 @@ log = logging.getLogger("muster.controller")
 class Controller:
     """Drives every job of a database to its end on one engine."""
 
-    def __init__(self, database: Database, engine: Engine, store: Store, bus: Bus, interval: float = 0.2) -> None:
-        """``interval``: seconds between two looks at the engine."""
-        self.database, self.engine, self.store, self.bus, self.interval = database, engine, store, bus, interval
-        bus.changed = self.wake
-        self._wake = threading.Event()
-        self._ending = threading.Event()
-        self._stops: dict[tuple[str, int], Future[None]] = {}
+    def __init__(
+        self,
+        database: Database,
+        engine: Engine,
+        store: Store,
+        bus: Bus,
+        interval: float = 0.2,
+        retention: float | None = None,
+    ) -> None:
+        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept."""
+        self.database, self.engine, self.store, self.bus = database, engine, store, bus
+        self.interval, self.retention = interval, retention
+        self.roster = Roster()
+        self.gangs = Gangs(engine, store, bus, self.wake)
         self.writing = threading.Lock()
-        """Held by whoever registers or submits: what is checked must still hold when it is written."""
+        """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
+        bus.changed = self.wake
+        database.committed = self.roster.note
+        self._board: Board | None = None
+        self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
+        self._swept = 0.0
+        self._wake, self._ending = threading.Event(), threading.Event()
         self._troubles: dict[str, str] = {}
-        self._finished: dict[tuple[str, int], float] = {}
-        self._stoppers = ThreadPoolExecutor(max_workers=16, thread_name_prefix="stop")
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
+        with database.session() as session:
+            self.roster.load(session)
 
     def start(self) -> None:
         self._thread.start()
@@ -71,7 +80,7 @@ class Controller:
         self._ending.set()
         self._wake.set()
         self._thread.join()
-        self._stoppers.shutdown(wait=False, cancel_futures=True)
+        self.gangs.close()
 
     def _loop(self) -> None:
         while not self._ending.is_set():
@@ -83,257 +92,166 @@ class Controller:
             self._wake.clear()
 
     def tick(self) -> None:
-        """One pass over every job that is not over; a job that can't be handled now does not hold up the others."""
+        """One pass over every job that needs a look; one that can't be handled now does not hold up the others."""
         with self.database.session() as session:
-            ids = [job.id for job in _unfinished(session)]
-        for job_id in ids:
-            try:
-                with self.database.session() as session:
-                    self._reconcile(session, session.get_one(Job, job_id))
-                self._troubles.pop(job_id, None)
-            except OSError as error:
-                if self._troubles.get(job_id) != str(error):  # said once, not at every look
-                    log.error("job %s: the store can't be read (%s); trying again", job_id, error)
-                self._troubles[job_id] = str(error)
-            except Exception:
-                log.exception("job %s: reconciling failed; trying again", job_id)
-        with self.database.session() as session:
-            self._admit(session, _unfinished(session))
+            self.roster.take_dependents(session)
+        due = self.roster.take_due()
+        for start in range(0, len(due), _SETTLED_AT_ONCE):
+            some = due[start : start + _SETTLED_AT_ONCE]
+            self._guarded(",".join(some[:1]), some, lambda session, job: self._settle(session, job))
+        for job_id in self.roster.active():
+            self._guarded(job_id, [job_id], self._advance)
+        self._admit()
+        self._sweep()
 
-    def _reconcile(self, session: Session, job: Job) -> None:
-        if job.status == Status.SUBMITTED:
-            job.move(Status.RUNNABLE, "waiting for the scheduler")
+    def _guarded(self, name: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
+        try:
+            with self.database.session() as session:
+                for job_id in ids:
+                    if (job := session.get(Job, job_id)) is not None:
+                        body(session, job)
+            self._troubles.pop(name, None)
+        except OSError as error:
+            if self._troubles.get(name) != str(error):  # said once, not at every look
+                log.error("job %s: the store can't be read (%s); trying again", name, error)
+            self._troubles[name] = str(error)
+            self.roster.look_again(ids)
+        except Exception:
+            log.exception("job %s: reconciling failed; trying again", name)
+            self.roster.look_again(ids)
+
+    def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:
-            self._advance(session, job, attempt)
+            self.gangs.advance(session, job, attempt)
+
+    # -- jobs without a gang ------------------------------------------------------------------------------------------
+
+    def _settle(self, session: Session, job: Job) -> None:
+        """A job that has no gang: ended on request, held back by others, an array by its children, or ready to run."""
+        if job.is_over or job.open_attempt is not None:
+            return
+        if job.kind == "array":
+            self._settle_array(session, job)
         elif job.stop_reason is not None:
-            self._finish(job, Status.FAILED, job.stop_reason)
+            job.move(Status.FAILED, job.stop_reason)
+        elif job.status in (Status.SUBMITTED, Status.PENDING):
+            states = {each.on_id: self._state(session, each.on_id) for each in job.dependencies}
+            failed = [on for on, status in states.items() if status == Status.FAILED]
+            pending = [on for on, status in states.items() if status != Status.SUCCEEDED]
+            if failed:
+                job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
+            elif pending:
+                others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
+                job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
+            else:
+                job.move(Status.RUNNABLE, "waiting for the scheduler")
+
+    def _settle_array(self, session: Session, job: Job) -> None:
+        """An array is over when its last child is; one failed child makes it FAILED."""
+        query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
+        counts: dict[str, int] = {status: count for status, count in session.execute(query)}
+        left = sum(count for status, count in counts.items() if not Status(status).is_terminal)
+        if job.status == Status.SUBMITTED:
+            job.move(Status.PENDING, f"an array of {job.array_size}")
+        if left:
+            return
+        failed = counts.get(Status.FAILED, 0)
+        if failed:
+            job.move(Status.FAILED, job.stop_reason or f"{failed} of {job.array_size} array jobs failed")
+        else:
+            job.move(Status.SUCCEEDED, "all array jobs succeeded")
+
+    @staticmethod
+    def _state(session: Session, job_id: str) -> str:
+        job = session.get(Job, job_id)
+        return job.status if job is not None else Status.FAILED
 
     # -- admission ----------------------------------------------------------------------------------------------------
 
-    def _admit(self, session: Session, jobs: Sequence[Job]) -> None:
-        waiting = [
-            Waiting(job.id, job.name, gang_needs(job.node_properties)) for job in jobs if job.status == Status.RUNNABLE
-        ]
+    def _admit(self) -> None:
+        """A scheduling pass, where something changed or time has passed."""
+        version, at, took = self._passed
+        pause = took / _PASS_SHARE
+        idle = time.monotonic() - at
+        if idle < pause or (version == self.roster.version and idle < _PASS_INTERVAL):
+            return
+        started, version = time.monotonic(), self.roster.version
+        waiting = self.roster.waiting()
         if not waiting:
+            self._board, self._passed = None, (version, started, 0.0)
             return
-        running = [(job.name, _placements(attempt)) for job in jobs if (attempt := job.open_attempt)]
-        by_id = {job.id: job for job in jobs}
-        for decision in decide(waiting, self.engine.capacity(), running):
-            job = by_id[decision.job]
-            if isinstance(decision, Start):
-                self._begin(session, job, decision.placements)
-            else:
-                job.status_reason = decision.reason
+        with self.database.session() as session:
+            snapshot = take_snapshot(session, self.engine.capacity(), waiting, self.roster.active())
+        decisions = decide(snapshot)
+        self._board = decisions.board
+        self._passed = (version, started, time.monotonic() - started)
+        self._carry_out(decisions)
 
-    def _begin(self, session: Session, job: Job, placements: tuple[Placement, ...]) -> None:
-        """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
-        run = self.store.run(job.run)
+    def _carry_out(self, decisions: Decisions) -> None:
+        for cancel in decisions.cancels:
+            with self.database.session() as session:
+                job = session.get_one(Job, cancel.job)
+                job.cancelled, job.stop_reason = True, cancel.reason
+        for preempt in decisions.preempts:
+            with self.database.session() as session:
+                job, by = session.get_one(Job, preempt.job), session.get_one(Job, preempt.by)
+                attempt = job.open_attempt
+                if attempt is not None and attempt.ending is None:
+                    attempt.ending = Ending.PREEMPTED
+                    attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+        for start in decisions.starts:
+            with self.database.session() as session:
+                job = session.get_one(Job, start.job)
+                # a request may have ended the job since the snapshot was taken
+                if job.status == Status.RUNNABLE and job.stop_reason is None:
+                    self.gangs.begin(session, job, start)
+
+    # -- what the API asks --------------------------------------------------------------------------------------------
+
+    def reason(self, job: str) -> str | None:
+        """Why a job waits just now; None where it is not known to wait."""
+        board = self._board
+        if board is None or self.roster.since(job) is None:
+            return None
         try:
-            # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
-            known = [attempt.epoch for attempt in session.scalars(select(Attempt).join(Job).where(Job.run == job.run))]
-            epoch = max([read_epoch(run), *known]) + 1
-            if job.first_epoch is not None and run.description() is None:
-                raise StoreError("it was deleted from the store while the job ran")
-            self._describe(run, job)
-            raise_epoch(run, epoch)
-        except OSError as error:  # a volume that is full or away may come back
-            job.status_reason = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
+            return board.reason(job)
+        except KeyError:
+            return None  # submitted since the last pass
+
+    def front(self, queue: str, count: int) -> tuple[Sequence[str], Mapping[str, int]]:
+        """The first waiting jobs of a queue in the order in which they will start, and since when each waits [ms]."""
+        board = self._board
+        order = [job for job in (board.order(queue)[:count] if board else []) if self.roster.since(job) is not None]
+        return order, {job: since for job in order if (since := self.roster.since(job)) is not None}
+
+    def utilization(self, queue: str) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
+        """What the gangs of a queue hold just now, by unit (``VCPU``, ``GPU``): in all, and by share."""
+        total: dict[str, float] = defaultdict(float)
+        shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        with self.database.session() as session:
+            for job, attempt in open_attempts(session, self.roster.active()):
+                for node in attempt.nodes if job.queue == queue else []:
+                    for unit, amount in (("VCPU", node["cpus"]), ("GPU", len(node["gpus"]))):
+                        total[unit] += amount
+                        shares[job.share or ""][unit] += amount
+        return total, shares
+
+    def drain(self, session: Session, queue: JobQueue) -> None:
+        """Ask all jobs of a queue to end."""
+        over = [Status.SUCCEEDED, Status.FAILED]
+        for job in session.scalars(select(Job).where(Job.queue == queue.name, Job.status.not_in(over))):
+            job.stop_reason = job.stop_reason or f"job queue {queue.name} was deleted"
+
+    def _sweep(self) -> None:
+        """Remove deleted queues that are empty, and history that is older than it is kept."""
+        if time.monotonic() - self._swept < _SWEEP_INTERVAL:
             return
-        except (StoreError, StaleEpoch, ValueError) as error:
-            self._finish(job, Status.FAILED, f"store {self.store.path}: can't prepare run {job.run}: {error}")
-            return
-        if job.first_epoch is None:
-            job.first_epoch = epoch
-        nodes = [
-            {"index": i, "host": p.host, "gpus": list(p.gpus), "cpus": p.cpus, "memory": p.memory}
-            for i, p in enumerate(placements)
-        ]
-        attempt = Attempt(job_id=job.id, number=len(job.attempts) + 1, epoch=epoch, nodes=nodes, created_at=now())
-        job.attempts.append(attempt)
-        job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
-        session.commit()
-        self._launch(session, job, attempt)
-
-    def _describe(self, run: Run, job: Job) -> None:
-        needs = gang_needs(job.node_properties)
-        run.create(
-            {
-                "run": run.name,
-                "job": job.id,
-                "created": now(),
-                "version": __version__,
-                "spec": needs.spec,
-                "name": job.name,
-            }
-        )
-
-    def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
-        needs = gang_needs(job.node_properties)
-        try:
-            attempt.handle = self.engine.launch(self.engine.plan(self._gang(job, attempt, needs)))
-        except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
-            self._close(job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
-        session.commit()
-
-    def _gang(self, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
-        nodes = needs.nodes[: len(attempt.nodes)]
-        return Gang(
-            job=job.id,
-            attempt=attempt.number,
-            epoch=attempt.epoch,
-            job_epoch=job.first_epoch or attempt.epoch,
-            run=job.run,
-            store=str(self.store.path),
-            queue=job.queue,
-            main=needs.main,
-            commands=[node.command for node in nodes],
-            environments=[node.environment for node in nodes],
-            placements=_placements(attempt),
-            grace=GRACE,
-            directory=needs.setting("MUSTER_DIRECTORY") or None,
-            stall_timeout=float(stall) if (stall := needs.setting("MUSTER_STALL_TIMEOUT")) else None,
-            bus=self.bus.endpoint,
-            bus_token=self.bus.token,
-        )
-
-    # -- running attempts ---------------------------------------------------------------------------------------------
-
-    def _advance(self, session: Session, job: Job, attempt: Attempt) -> None:
-        if attempt.handle is None:
-            self._launch(session, job, attempt)
-            return
-        status = self.engine.observe(attempt.handle)
-        ends = self._ends(job, attempt, status)
-        main = gang_needs(job.node_properties).main
-        if job.status == Status.STARTING and (status[main].running or ends[main]):
-            job.started_at = attempt.started_at = now()
-            job.move(Status.RUNNING, f"attempt {attempt.number} runs on {_size(job, len(status))}")
-        if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
-            attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
-            session.commit()
-        if attempt.ending is not None and not self._finishing(job, attempt, status) and self._stopped(job, attempt):
-            ends = self._ends(job, attempt, self.engine.observe(attempt.handle))
-            self._close(
-                job, attempt, Verdict(Ending(attempt.ending), attempt.status_reason or "", attempt.exit_code), ends
-            )
-
-    def _finishing(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
-        """Whether the children of a native job whose main node is done are still given time to end by themselves.
-
-        On AWS the main node's end cuts them off; a rank that prints its last line or closes a file deserves better.
-        """
-        if attempt.ending != Ending.SUCCEEDED or gang_needs(job.node_properties).on_child_failure == "ignore":
-            return False
-        since = self._finished.setdefault((job.id, attempt.number), time.monotonic())
-        return any(node.running for node in status) and time.monotonic() - since < _FINISHING
-
-    def _verdict(self, job: Job, attempt: Attempt, ends: list[NodeEnd | None], main: int) -> Verdict | None:
-        verdict = judge(gang_needs(job.node_properties).on_child_failure, main, ends)
-        if verdict:
-            return verdict
-        if job.stop_reason is not None:
-            return Verdict(Ending.STOPPED, job.stop_reason)
-        for index, end in enumerate(ends):
-            silence = self.bus.silence(job.id, attempt.number, index, bool(attempt.nodes[index].get("met")))
-            if end is None and silence is not None and silence > LOST:
-                reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
-                return Verdict(Ending.FAILED, reason)
-        if job.timeout and attempt.started_at and now() - attempt.started_at > job.timeout * 1000:
-            return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
-        return None
-
-    def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
-        """How each node ended: by the outcome in the store, else by what the engine saw; noted in the attempt's record."""
-        run = self.store.run(job.run)
-        ends: list[NodeEnd | None] = []
-        records = []
-        for record, node in zip(attempt.nodes, status, strict=True):
-            end = None
-            if not node.running:
-                outcome = read_outcome(run, job.id, attempt.number, record["index"])
-                if outcome:
-                    message = outcome.error.message if outcome.error else None
-                    end = NodeEnd(
-                        outcome.exit_code,
-                        outcome.reason,
-                        outcome.error.time if outcome.error else outcome.ended,
-                        message,
-                    )
-                else:
-                    code = 137 if node.exit_code in (None, 0) else node.exit_code
-                    end = NodeEnd(code or 137, node.detail or "the supervisor died without an outcome", now() / 1000)
-            ends.append(end)
-            seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
-            if self.bus.met(job.id, attempt.number, record["index"]):
-                seen["met"] = True  # the next controller must miss it, too, if it does not come back
-            records.append({**record, "address": node.address, **seen})
-        if records != attempt.nodes:
-            attempt.nodes = records
-        return ends
-
-    def _stopped(self, job: Job, attempt: Attempt) -> bool:
-        """Stop the gang in the background; True once no process of it is left."""
-        key = (job.id, attempt.number)
-        if key not in self._stops:
-            grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
-            assert attempt.handle is not None
-            self._stops[key] = self._stoppers.submit(self.engine.stop, attempt.handle, grace)
-            self._stops[key].add_done_callback(lambda _: self.wake())
-        if not self._stops[key].done():
-            return False
-        self._finished.pop(key, None)
-        self.bus.forget(*key)
-        self._stops.pop(key).result()
-        return True
-
-    # -- ends ---------------------------------------------------------------------------------------------------------
-
-    def _close(self, job: Job, attempt: Attempt, verdict: Verdict, ends: list[NodeEnd | None]) -> None:
-        """The gang is gone: close its attempt and decide what becomes of the job."""
-        ended = now()
-        requeued = verdict.ending == Ending.REQUEUE
-        attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
-        attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended
-        attempt.spent = not (requeued and ended - attempt.started_at >= _SHORTEST_REQUEUE)
-        spent = sum(1 for each in job.attempts if each.spent)
-        if job.stop_reason is not None and verdict.ending in (Ending.REQUEUE, Ending.STOPPED, Ending.FAILED):
-            self._finish(job, Status.FAILED, f"{job.stop_reason}{self._progress(job)}")
-        elif verdict.ending == Ending.SUCCEEDED:
-            self._finish(job, Status.SUCCEEDED, verdict.reason)
-        elif requeued and (not attempt.spent or spent < job.attempts_allowed):
-            job.move(Status.RUNNABLE, f"attempt {attempt.number} left on request{self._progress(job)}; starting again")
-        elif verdict.ending == Ending.FAILED and spent < job.attempts_allowed:
-            job.move(
-                Status.RUNNABLE,
-                f"attempt {attempt.number} failed ({verdict.reason}){self._progress(job)}; trying again",
-            )
-        else:
-            of = f" (attempt {spent} of {job.attempts_allowed})" if verdict.ending == Ending.FAILED else ""
-            self._finish(job, Status.FAILED, f"{verdict.reason}{of}")
-
-    def _progress(self, job: Job) -> str:
-        checkpoints = list_checkpoints(self.store.run(job.run))
-        return f"; last checkpoint: iteration {checkpoints[-1].iteration}" if checkpoints else ""
-
-    @staticmethod
-    def _finish(job: Job, status: Status, reason: str) -> None:
-        job.move(status, reason)
-        job.stopped_at = now()
-
-
-def _unfinished(session: Session) -> Sequence[Job]:
-    """Jobs that are not over, oldest first."""
-    over = [Status.SUCCEEDED, Status.FAILED]
-    return session.scalars(select(Job).where(Job.status.not_in(over)).order_by(Job.created_at, Job.id)).all()
-
-
-def _size(job: Job, nodes: int) -> str:
-    """How many nodes an attempt has, and of how many, where there was no room for all."""
-    most = int(job.node_properties["numNodes"])
-    if nodes < most:
-        return f"{nodes} of {most} nodes: there is no room for more"
-    return f"{nodes} node{'s' if nodes != 1 else ''}"
-
-
-def _placements(attempt: Attempt) -> list[Placement]:
-    return [Placement(node["host"], tuple(node["gpus"]), node["cpus"], node["memory"]) for node in attempt.nodes]
+        self._swept = time.monotonic()
+        over = [Status.SUCCEEDED, Status.FAILED]
+        with self.writing, self.database.session() as session:
+            for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
+                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(over)).limit(1)
+                if session.scalars(busy).first() is None:
+                    session.delete(queue)
+            if self.retention is not None:
+                forget_before(session, now() - int(self.retention * 1000))

@@ -1,114 +1,53 @@
-"""The truth about jobs: tables and sessions (SQLAlchemy; SQLite by default)."""
+"""The truth about jobs: sessions on a database (SQLAlchemy; SQLite by default, PostgreSQL by URL), and its migrations."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, ForeignKey, create_engine, event, select
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, create_engine, event, inspect, select, text
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
-from orchestrator.jobs import Status, check_transition
+from orchestrator.tables import Attempt, Base, Job, now
 
+__all__ = ["Attempt", "Base", "Database", "DatabaseError", "Job", "find_job", "now"]
 
-def now() -> int:
-    """Unix time [ms], the unit of every time in the database and in the Batch API."""
-    return int(time.time() * 1000)
-
-
-class Base(DeclarativeBase):
-    type_annotation_map = {dict[str, Any]: JSON, list[dict[str, Any]]: JSON, int: BigInteger}
-
-
-class JobDefinition(Base):
-    """A registered job definition; a revision is never changed."""
-
-    __tablename__ = "job_definitions"
-    name: Mapped[str] = mapped_column(primary_key=True)
-    revision: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    document: Mapped[dict[str, Any]]
-    """The request as registered."""
-    status: Mapped[str] = mapped_column(default="ACTIVE")
-    created_at: Mapped[int] = mapped_column(default=now)
+MIGRATIONS = Path(__file__).parent / "migrations"
+_CONTROLLER_LOCK = 0x6D7573746572
+"""Key of PostgreSQL's advisory lock: one controller a database."""
 
 
-class Job(Base):
-    """A submitted job."""
-
-    __tablename__ = "jobs"
-    id: Mapped[str] = mapped_column(primary_key=True)
-    name: Mapped[str] = mapped_column(index=True)
-    queue: Mapped[str] = mapped_column(index=True)
-    definition: Mapped[str]
-    """ARN with revision."""
-    request: Mapped[dict[str, Any]]
-    """SubmitJob as it came."""
-    node_properties: Mapped[dict[str, Any]]
-    """Of the definition, with the submission's overrides applied."""
-    run: Mapped[str] = mapped_column(index=True)
-    status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
-    status_reason: Mapped[str | None] = mapped_column(default=None)
-    created_at: Mapped[int] = mapped_column(default=now, index=True)
-    started_at: Mapped[int | None] = mapped_column(default=None)
-    stopped_at: Mapped[int | None] = mapped_column(default=None)
-    attempts_allowed: Mapped[int] = mapped_column(default=1)
-    timeout: Mapped[int | None] = mapped_column(default=None)
-    """Seconds of each attempt."""
-    stop_reason: Mapped[str | None] = mapped_column(default=None)
-    """Set when somebody asked the job to end."""
-    first_epoch: Mapped[int | None] = mapped_column(default=None)
-    attempts: Mapped[list[Attempt]] = relationship(
-        back_populates="job", order_by="Attempt.number", cascade="all, delete-orphan"
-    )
-
-    @property
-    def open_attempt(self) -> Attempt | None:
-        """The attempt whose gang exists or may exist."""
-        return next((attempt for attempt in self.attempts if attempt.stopped_at is None), None)
-
-    def move(self, status: Status, reason: str | None = None) -> None:
-        """Change the state; the reason stands until it is replaced. Raises ValueError for an illegal transition."""
-        check_transition(Status(self.status), status)
-        self.status = status
-        if reason is not None:
-            self.status_reason = reason[:1024]
-
-
-class Attempt(Base):
-    """One launch of a job's gang."""
-
-    __tablename__ = "attempts"
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
-    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    epoch: Mapped[int]
-    handle: Mapped[str | None] = mapped_column(default=None)
-    """The engine's name for the gang; None until it was launched."""
-    ending: Mapped[str | None] = mapped_column(default=None)
-    """An :class:`orchestrator.jobs.Ending`, from the moment that the end was decided."""
-    spent: Mapped[bool] = mapped_column(default=True)
-    """Whether it counts against the job's attempts."""
-    created_at: Mapped[int] = mapped_column(default=now)
-    started_at: Mapped[int | None] = mapped_column(default=None)
-    stopped_at: Mapped[int | None] = mapped_column(default=None)
-    status_reason: Mapped[str | None] = mapped_column(default=None)
-    exit_code: Mapped[int | None] = mapped_column(default=None)
-    nodes: Mapped[list[dict[str, Any]]]
-    """By index: index, host, gpus, and, as they become known, address, exitCode, reason, error, and whether the bus met it."""
-    job: Mapped[Job] = relationship(back_populates="attempts")
+class DatabaseError(Exception):
+    """The database can't be used; the message says why and what to do."""
 
 
 class Database:
-    """Sessions on one database."""
+    """Sessions on one database; ``committed``, where set, is called with the jobs that a commit has changed."""
 
     def __init__(self, url: str) -> None:
-        """Open ``url`` (``sqlite:///path`` or any SQLAlchemy URL) and create the tables that are missing."""
-        self.engine = create_engine(url)
-        if self.engine.dialect.name == "sqlite":
-            event.listen(self.engine, "connect", _tune_sqlite)
-        Base.metadata.create_all(self.engine)
+        """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
+
+        Raises:
+            DatabaseError: It can't be reached, is of a newer Muster, or another controller has it (PostgreSQL).
+        """
+        self.committed: Callable[[Sequence[Job]], None] | None = None
+        self._lock: Connection | None = None
+        try:
+            self.engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
+            if self.engine.dialect.name == "sqlite":
+                event.listen(self.engine, "connect", _tune_sqlite)
+            else:
+                self._lock = self._take_lock()
+            self._migrate()
+        except (SQLAlchemyError, ModuleNotFoundError) as error:
+            raise DatabaseError(f"database {_shown(url)}: {str(error).splitlines()[0]}") from None
 
     @classmethod
     def at(cls, home: Path) -> Database:
@@ -119,11 +58,63 @@ class Database:
     def session(self) -> Iterator[Session]:
         """A session: committed at the end of the block (and wherever the block commits), rolled back on an exception."""
         with Session(self.engine, expire_on_commit=False) as session:
+            event.listen(session, "after_flush", _note_jobs)
+            event.listen(session, "after_commit", self._tell)
+            event.listen(session, "after_rollback", lambda session: session.info.pop("jobs", None))
             yield session
             session.commit()
 
     def close(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
         self.engine.dispose()
+
+    def _tell(self, session: Session) -> None:
+        jobs = session.info.pop("jobs", None)
+        if jobs and self.committed:
+            self.committed(list(jobs.values()))
+
+    def _take_lock(self) -> Connection:
+        """PostgreSQL drops it when the connection ends, however its process ends."""
+        connection = self.engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        if not connection.scalar(text(f"SELECT pg_try_advisory_lock({_CONTROLLER_LOCK})")):
+            connection.close()
+            raise DatabaseError(
+                f"database {_shown(str(self.engine.url))}: another controller has it; use that one, or stop it first"
+            )
+        return connection
+
+    def _migrate(self) -> None:
+        config = Config()
+        config.set_main_option("script_location", str(MIGRATIONS))
+        with self.engine.begin() as connection:
+            config.attributes["connection"] = connection
+            present = MigrationContext.configure(connection).get_current_revision()
+            known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+            if present is not None and present not in known:
+                raise DatabaseError(
+                    f"database {_shown(str(self.engine.url))} was written by a newer Muster (schema {present}); "
+                    "install that version, or use another database"
+                )
+            if present is None and inspect(connection).has_table("jobs"):
+                command.stamp(config, "0001")  # of the versions before there were migrations
+            command.upgrade(config, "head")
+
+
+def _shown(url: str) -> str:
+    """The URL without its password."""
+    scheme, sign, rest = url.partition("://")
+    return f"{scheme}{sign}{rest.rpartition('@')[2]}"
+
+
+def _note_jobs(session: Session, _context: object) -> None:
+    jobs = session.info.setdefault("jobs", {})
+    for changed in (session.new, session.dirty):
+        for each in changed:
+            if isinstance(each, Job):
+                jobs[each.id] = each
+            elif isinstance(each, Attempt) and each.job is not None:
+                jobs[each.job.id] = each.job
 
 
 def _tune_sqlite(connection: Any, _record: object) -> None:
@@ -139,10 +130,13 @@ def find_job(session: Session, reference: str) -> Job | None:
     job = session.get(Job, reference)
     if job:
         return job
-    named = session.scalars(select(Job).where(Job.name == reference).order_by(Job.created_at.desc())).first()
+    named = session.scalars(
+        select(Job).where(Job.name == reference, Job.parent.is_(None)).order_by(Job.created_at.desc())
+    ).first()
     if named:
         return named
     if len(reference) < 4:
         return None
-    prefixed = session.scalars(select(Job).where(Job.id.startswith(reference, autoescape=True)).limit(2)).all()
+    own = select(Job).where(Job.id.startswith(reference, autoescape=True), Job.parent.is_(None))
+    prefixed = session.scalars(own.limit(2)).all()
     return prefixed[0] if len(prefixed) == 1 else None

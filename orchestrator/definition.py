@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+from orchestrator.scheduling.snapshot import NodeShape, Shape
 from orchestrator.spec import Spec
 
 _MODULES = {"train": "worker.train", "evaluate": "worker.evaluate", "export": "worker.export"}
@@ -30,6 +33,8 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
     }
     if spec.train:
         ours["MUSTER_STALL_TIMEOUT"] = f"{spec.stall_timeout:g}"
+    if spec.preemptible:
+        ours["MUSTER_PREEMPTIBLE"] = "1"
     resources = {"VCPU": f"{spec.resources.cpus:g}", "MEMORY": str(spec.resources.memory)}
     if spec.resources.gpus:
         resources["GPU"] = str(spec.resources.gpus)
@@ -49,6 +54,10 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
         },
         "retryStrategy": {"attempts": spec.retry.attempts},
     }
+    if module:  # its exit code 2 is a user's error, which another attempt would only repeat
+        request["retryStrategy"]["evaluateOnExit"] = [{"onExitCode": "2", "action": "EXIT"}]
+    if spec.priority:
+        request["schedulingPriority"] = spec.priority
     if spec.timeout is not None:
         request["timeout"] = {"attemptDurationSeconds": int(spec.timeout)}
     return request
@@ -60,6 +69,8 @@ def compile_submission(spec: Spec, definition: str, environment: Mapping[str, st
     ``environment`` is added on every node: the run that is continued, the checkpoint to start from.
     """
     request: dict[str, Any] = {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition}
+    if spec.share:
+        request["shareIdentifier"] = spec.share
     if environment:
         pairs = [{"name": name, "value": value} for name, value in environment.items()]
         request["nodeOverrides"] = {
@@ -90,6 +101,12 @@ class GangNeeds:
     minimum: int
     """With how few nodes it may start; native jobs only."""
 
+    @cached_property
+    def shape(self) -> Shape:
+        """What the scheduler looks at."""
+        nodes = tuple(NodeShape(node.cpus, node.gpus, node.memory) for node in self.nodes)
+        return Shape(nodes, self.minimum, self.main)
+
     def setting(self, name: str, default: str = "") -> str:
         """A ``MUSTER_*`` variable of the main node."""
         return self.nodes[self.main].environment.get(name, default)
@@ -98,7 +115,15 @@ class GangNeeds:
     def spec(self) -> dict[str, Any] | None:
         """The spec that the job was compiled from; None for a job that came through the Batch API."""
         text = self.setting("MUSTER_SPEC")
-        return json.loads(text) if text else None
+        spec = json.loads(text) if text else None
+        if spec is not None and not isinstance(spec, dict):
+            raise ValueError("MUSTER_SPEC is not a mapping")
+        return spec
+
+    @property
+    def is_native(self) -> bool:
+        """Whether it came from our YAML, and gets the better defaults; else it behaves as on AWS."""
+        return bool(self.setting("MUSTER_ON_CHILD_FAILURE"))
 
     @property
     def on_child_failure(self) -> str:
@@ -108,8 +133,8 @@ class GangNeeds:
 def target_nodes(text: str, count: int) -> range:
     """Node indices of ``a:b``, ``:b``, ``a:`` or ``n``, of ``count`` nodes. Raises ValueError."""
     first, colon, last = text.partition(":")
-    if not all(part.isdigit() or (colon and part == "") for part in (first, last if colon else first)):
-        raise ValueError(f"targetNodes {text!r}: expected n, a:b, a: or :b")
+    if not re.fullmatch(r"[0-9]{1,6}|[0-9]{0,6}:[0-9]{0,6}", text):
+        raise ValueError(f"targetNodes {text[:20]!r}: expected n, a:b, a: or :b")
     start = int(first or 0)
     stop = (int(last) if last else count - 1) if colon else start
     return range(start, stop + 1)

@@ -52,6 +52,8 @@ class Ending(StrEnum):
     """A failure that a retry may mend."""
     FATAL = "fatal"
     """A failure after which the job is not tried again."""
+    PREEMPTED = "preempted"
+    """Stopped in favour of another job: started again without spending an attempt, whatever it exited with."""
     REQUEUE = "requeue"
     """Checkpointed and left on request (exit 75): started again without spending an attempt."""
     STOPPED = "stopped"
@@ -68,6 +70,8 @@ class NodeEnd:
     ended: float
     error: str | None = None
     """Message of the node's first error."""
+    lost: bool = False
+    """Nobody saw the end: the node vanished, with its host as far as anyone knows."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,26 @@ class Verdict:
     ending: Ending
     reason: str
     exit_code: int | None = None
+
+
+AWS_EXITED = "Essential container in task exited"
+"""What AWS Batch says of an attempt whose main container ended, well or not; clients match it."""
+
+
+def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:
+    """The same for a job of the Batch API: the main node's end ends the job and decides, in AWS's own words.
+
+    Args:
+        main: Index of the main node.
+        ends: By node index; None for a node that runs or has not started.
+        host: Name of the main node's host.
+    """
+    head = ends[main]
+    if head is None:
+        return None
+    if head.lost:
+        return Verdict(Ending.FAILED, f"Host EC2 (instance {host}) terminated.", None)
+    return Verdict(Ending.SUCCEEDED if head.exit_code == 0 else Ending.FAILED, AWS_EXITED, head.exit_code)
 
 
 def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | None:
@@ -95,7 +119,7 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
     ]
     head = ends[main]
     if head is not None and head.exit_code == 0:
-        return Verdict(Ending.SUCCEEDED, "Essential container in task exited", 0)
+        return Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
     if head is not None and head.exit_code == EX_TEMPFAIL:
         return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
     if head is not None and (policy == "ignore" or len(failures) == 1):

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import ipaddress
 import socket
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 
 import uvicorn
-from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrator.api.app import create_app
+from orchestrator.api.auth import Access, is_loopback
+from orchestrator.api.limits import RATE, RateLimit
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
-from orchestrator.database import Database
+from orchestrator.database import Database, DatabaseError
 from orchestrator.engines.local import LocalEngine
 from orchestrator.home import HomeLock, ServerError
+from orchestrator.keys import KeyStore
 from shared_store.layout import Store
 
 
@@ -33,13 +34,22 @@ class Server:
         token: str | None = None,
         cpus: float | None = None,
         gpus: Sequence[str] | None = None,
+        rate_limit: int = RATE,
+        submit_rate_limit: int = 0,
+        database: str | None = None,
+        retention: float | None = None,
     ) -> None:
         """Take the lock, the port, the store and the database, in this order; nothing runs until :meth:`start`.
+
+        ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
+        ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
+        jobs is kept; None: for ever.
 
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
-        _check_exposure(host, token)
+        self.access = Access(KeyStore(home), token, exposed=not is_loopback(host))
+        _check_exposure(host, self.access)
         try:
             self._lock = HomeLock(home)
         except OSError as error:
@@ -50,15 +60,15 @@ class Server:
             self._socket = _listen(host, port)
             self.store = Store(store or home / "store").open()
             try:
-                database = Database.at(home)
-            except SQLAlchemyError as error:
-                raise ServerError(f"database {home / 'muster.db'}: {str(error).splitlines()[0]}") from None
+                found = Database(database) if database else Database.at(home)
+            except DatabaseError as error:
+                raise ServerError(str(error)) from None
         except BaseException:
             self._lock.release()
             raise
         self.bus = Bus(home)
-        self.controller = Controller(database, LocalEngine(home, cpus, gpus), self.store, self.bus)
-        self.app = create_app(self.controller, token)
+        self.controller = Controller(found, LocalEngine(home, cpus, gpus), self.store, self.bus, retention=retention)
+        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]
         self.url = (
             f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
@@ -89,14 +99,13 @@ class Server:
         self._lock.release()
 
 
-def _check_exposure(host: str, token: str | None) -> None:
-    try:
-        local = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        local = False
-    if not local and not token:
+def _check_exposure(host: str, access: Access) -> None:
+    """Raises ServerError where others could come in unasked, or the keys can't be read."""
+    keys = access.keys.load() if access.keys else {}
+    if access.exposed and not access.token and not keys:
         raise ServerError(
-            f"--host {host} is reachable from other machines: set MUSTER_TOKEN to a secret first, here and for the clients"
+            f"--host {host} is reachable from other machines: first create a key with `muster keys create NAME`, or set "
+            "MUSTER_TOKEN to a secret, here and for the clients"
         )
 
 

@@ -37,6 +37,16 @@ def _duration(value: object) -> object:
     return value
 
 
+def seconds_of(option: str, text: str | None) -> float | None:
+    """Seconds of an option such as ``--retention 90d``. Raises SpecError."""
+    if text is None:
+        return None
+    try:
+        return float(str(_duration(text)))
+    except ValueError as error:
+        raise SpecError(f"{option} {text}: {error}") from None
+
+
 def _mebibytes(value: object) -> object:
     """``512MiB``, ``4GiB`` or a number of MiB → whole MiB."""
     if isinstance(value, str):
@@ -195,6 +205,13 @@ class Spec(_Section):
 
     name: Annotated[str, AfterValidator(_job_name)]
     queue: str = "default"
+    share: Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")] | None = Field(
+        default=None, description="share identifier, in a queue with a fair-share policy"
+    )
+    priority: int = Field(default=0, ge=0, le=9999, description="within the share; greater is served first")
+    preemptible: bool = Field(
+        default=False, description="a job of higher priority may have its place: it checkpoints, leaves and waits again"
+    )
     nodes: NodeRange = Field(default_factory=lambda: NodeRange(min=1, max=1))
     resources: Resources = Field(default_factory=Resources)
     train: Train | None = None

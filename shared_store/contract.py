@@ -43,6 +43,10 @@ class NodeContract:
     """The node's share of CPUs, divided among its ranks."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck; None where nobody asked."""
+    is_gang: bool = True
+    """False for a single-node job: AWS gives it no node variables."""
+    array: tuple[int, int] | None = None
+    """Index and size, of an array's child."""
     address: str | None = None
     """The node's own address, where the engine gives it one."""
     bus: str | None = None
@@ -66,13 +70,9 @@ class NodeContract:
 
     def to_env(self) -> dict[str, str]:
         """The variables, as an engine sets them on this node."""
-        main = self.node_index == self.main_index
         env = {
-            "AWS_BATCH_JOB_ID": f"{self.job}#{self.node_index}",
+            **self._batch_env(),
             "AWS_BATCH_JOB_ATTEMPT": str(self.attempt),
-            "AWS_BATCH_JOB_NODE_INDEX": str(self.node_index),
-            "AWS_BATCH_JOB_NUM_NODES": str(self.node_count),
-            "AWS_BATCH_JOB_MAIN_NODE_INDEX": str(self.main_index),
             "AWS_BATCH_CE_NAME": self.compute_environment,
             "AWS_BATCH_JQ_NAME": self.queue,
             "AWS_EXECUTION_ENV": "MUSTER",
@@ -90,8 +90,6 @@ class NodeContract:
             "MUSTER_GRACE_SECONDS": f"{self.grace:g}",
             "MUSTER_CPUS": f"{self.cpus:g}",
         }
-        if not main:
-            env["AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"] = self.master_address
         stall = None if self.stall_timeout is None else f"{self.stall_timeout:g}"
         optional = {
             "MUSTER_STALL_TIMEOUT": stall,
@@ -100,6 +98,23 @@ class NodeContract:
             "MUSTER_BUS_TOKEN": self.bus_token,
         }
         return env | {name: value for name, value in optional.items() if value}
+
+    def _batch_env(self) -> dict[str, str]:
+        """What depends on the kind of job; the main node's address is told to the children only."""
+        if not self.is_gang:
+            env = {"AWS_BATCH_JOB_ID": self.job}
+            if self.array is not None:
+                env |= {"AWS_BATCH_JOB_ARRAY_INDEX": str(self.array[0]), "AWS_BATCH_JOB_ARRAY_SIZE": str(self.array[1])}
+            return env
+        env = {
+            "AWS_BATCH_JOB_ID": f"{self.job}#{self.node_index}",
+            "AWS_BATCH_JOB_NODE_INDEX": str(self.node_index),
+            "AWS_BATCH_JOB_NUM_NODES": str(self.node_count),
+            "AWS_BATCH_JOB_MAIN_NODE_INDEX": str(self.main_index),
+        }
+        if self.node_index != self.main_index:
+            env["AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"] = self.master_address
+        return env
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> NodeContract:
@@ -125,6 +140,7 @@ class NodeContract:
 
         index, main = integer("AWS_BATCH_JOB_NODE_INDEX", 0), integer("AWS_BATCH_JOB_MAIN_NODE_INDEX", 0)
         epoch = integer("MUSTER_EPOCH")
+        array = (integer("AWS_BATCH_JOB_ARRAY_INDEX", 0), integer("AWS_BATCH_JOB_ARRAY_SIZE", 0))
         return cls(
             job=text("MUSTER_JOB_ID"),
             attempt=integer("AWS_BATCH_JOB_ATTEMPT", 1),
@@ -143,6 +159,8 @@ class NodeContract:
             compute_environment=env.get("AWS_BATCH_CE_NAME", "local"),
             cpus=number("MUSTER_CPUS", 1.0),
             stall_timeout=float(env["MUSTER_STALL_TIMEOUT"]) if env.get("MUSTER_STALL_TIMEOUT") else None,
+            is_gang="AWS_BATCH_JOB_NODE_INDEX" in env,
+            array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
             address=env.get("MUSTER_ADDRESS"),
             bus=env.get("MUSTER_BUS"),
             bus_token=env.get("MUSTER_BUS_TOKEN"),

@@ -1,89 +1,83 @@
-"""How a job looks in AWS Batch's shapes (JobDetail, JobSummary), and ARNs."""
+"""How a job looks in AWS Batch's shapes (JobDetail, JobSummary)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from orchestrator.database import Attempt, Job, JobDefinition
+from orchestrator.api.arns import environment_arn, job_arn, queue_arn
 from orchestrator.definition import target_nodes
 from orchestrator.jobs import Status, main_container
-
-REGION, ACCOUNT = "us-east-1", "000000000000"
-_PREFIX = f"arn:aws:batch:{REGION}:{ACCOUNT}:"
+from orchestrator.tables import Attempt, Job, JobDefinition
 
 
-def job_arn(job_id: str) -> str:
-    return f"{_PREFIX}job/{job_id}"
+def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: str | None) -> dict[str, Any]:
+    """JobDetail. The parent of a multi-node job has no ``container``; a node (``id#N``) has one, and ``nodeDetails``.
 
-
-def definition_arn(name: str, revision: int) -> str:
-    return f"{_PREFIX}job-definition/{name}:{revision}"
-
-
-def queue_arn(name: str) -> str:
-    return f"{_PREFIX}job-queue/{name}"
-
-
-def split_reference(reference: str) -> tuple[str, int | None]:
-    """Job id and node index of ``id``, ``arn``, ``id#N`` or ``arn#N``."""
-    base, sign, node = reference.rpartition("/")[2].partition("#")
-    return (base, int(node)) if sign and node.isdigit() else (base, None)
-
-
-def describe_job(job: Job, definition: JobDefinition, node: int | None) -> dict[str, Any]:
-    """JobDetail. The parent of a multi-node job has no ``container``; a node (``id#N``) has one, and ``nodeDetails``."""
+    Args:
+        job: The job.
+        definition: Its definition.
+        node: Index of one node of a multi-node job; None for the whole.
+        reason: Why the job waits just now; None where it does not wait.
+    """
     document = definition.document
     detail: dict[str, Any] = {
-        "jobArn": job_arn(job.id),
-        "jobId": job.id,
-        "jobName": job.name,
+        **_common(job, reason),
         "jobQueue": queue_arn(job.queue),
-        "jobDefinition": job.definition,
-        "status": job.status,
-        "statusReason": job.status_reason,
-        "createdAt": job.created_at,
-        "startedAt": job.started_at,
-        "stoppedAt": job.stopped_at,
-        "retryStrategy": {"attempts": job.attempts_allowed, "evaluateOnExit": []},
+        "retryStrategy": {"attempts": job.attempts_allowed, "evaluateOnExit": job.evaluate_on_exit},
         "timeout": {"attemptDurationSeconds": job.timeout} if job.timeout else None,
-        "parameters": {},
-        "dependsOn": [],
-        "tags": {**(document.get("tags") or {}), **(job.request.get("tags") or {})},
-        "isCancelled": False,
-        "isTerminated": job.stop_reason is not None,
+        "parameters": job.parameters,
+        "dependsOn": [_dependency(each.on_id, each.kind) for each in job.dependencies],
+        "tags": {**(document.get("tags") or {} if document.get("propagateTags") else {}), **job.tags},
+        "propagateTags": bool(job.request.get("propagateTags", document.get("propagateTags", False))),
+        "platformCapabilities": document.get("platformCapabilities", ["EC2"]),
+        "shareIdentifier": job.share,
+        "schedulingPriority": job.priority if job.share else None,
+        "isCancelled": job.cancelled,
+        "isTerminated": job.stop_reason is not None and not job.cancelled,
     }
     index = int(job.node_properties["mainNode"]) if node is None else node
     detail["attempts"] = [_attempt(job, attempt, index) for attempt in job.attempts if attempt.stopped_at]
-    if node is None:
+    last = job.attempts[-1] if job.attempts else None
+    if job.kind != "multinode":
+        detail["container"] = {**_container_of(job, 0), **(_container(job, last, 0) if last else {})}
+    elif node is None:
         detail["nodeProperties"] = job.node_properties
     else:
-        detail["jobId"], detail["jobArn"] = f"{job.id}#{node}", f"{job_arn(job.id)}#{node}"
+        detail |= _node_identity(job, node)
         detail["nodeDetails"] = {"nodeIndex": node, "isMainNode": node == job.node_properties["mainNode"]}
-        last = job.attempts[-1] if job.attempts else None
         detail["container"] = {**_container_of(job, node), **(_container(job, last, node) if last else {})}
-        detail["status"] = node_status(job, node)
     return {key: value for key, value in detail.items() if value is not None}
 
 
-def summarize(job: Job, node: int | None = None) -> dict[str, Any]:
+def array_properties(job: Job, counts: Mapping[str, int]) -> dict[str, Any] | None:
+    """``arrayProperties`` of an array (with the number of its children by state) or of a child of one."""
+    if job.kind == "array":
+        summary = {str(status): counts.get(status, 0) for status in Status}
+        return {"size": job.array_size, "statusSummary": summary}
+    if job.parent is not None:
+        return {"index": job.array_index, "size": job.array_size}
+    return None
+
+
+def summarize(job: Job, reason: str | None = None, node: int | None = None) -> dict[str, Any]:
     """JobSummary of a job, or of one of its nodes."""
-    main = job.node_properties["mainNode"]
-    summary: dict[str, Any] = {
-        "jobArn": job_arn(job.id),
-        "jobId": job.id,
-        "jobName": job.name,
-        "jobDefinition": job.definition,
-        "status": job.status,
-        "statusReason": job.status_reason,
-        "createdAt": job.created_at,
-        "startedAt": job.started_at,
-        "stoppedAt": job.stopped_at,
-        "nodeProperties": {"numNodes": job.node_properties["numNodes"]},
-    }
-    if node is not None:
-        summary["jobId"], summary["jobArn"] = f"{job.id}#{node}", f"{job_arn(job.id)}#{node}"
-        summary["nodeProperties"] = {**summary["nodeProperties"], "nodeIndex": node, "isMainNode": node == main}
-        summary["status"] = node_status(job, node)
+    summary = _common(job, reason)
+    if job.kind == "multinode":
+        main = job.node_properties["mainNode"]
+        summary["nodeProperties"] = {"numNodes": job.node_properties["numNodes"]}
+        if node is not None:
+            summary |= _node_identity(job, node)
+            summary["nodeProperties"] |= {"nodeIndex": node, "isMainNode": node == main}
+    elif job.array_size is not None:
+        summary["arrayProperties"] = {"size": job.array_size}
+        if job.array_index is not None:
+            summary["arrayProperties"]["index"] = job.array_index
+    record = main_container(job.attempts[-1].nodes, node or 0) if job.attempts else {}
+    if "exitCode" in record:
+        summary["container"] = {"exitCode": record["exitCode"], "reason": str(record.get("reason") or "")[:255]}
+    if job.share:
+        summary["shareIdentifier"] = job.share
     return {key: value for key, value in summary.items() if value is not None}
 
 
@@ -98,6 +92,28 @@ def node_status(job: Job, node: int) -> str:
 def stream_name(job: Job, attempt: int, node: int) -> str:
     """Name of the log stream of one node and attempt."""
     return f"{job.name}/{job.id}/{attempt}/node-{node}"
+
+
+def _common(job: Job, reason: str | None) -> dict[str, Any]:
+    return {
+        "jobArn": job_arn(job.id),
+        "jobId": job.id,
+        "jobName": job.name,
+        "jobDefinition": job.definition,
+        "status": job.status,
+        "statusReason": reason or job.status_reason,
+        "createdAt": job.created_at,
+        "startedAt": job.started_at,
+        "stoppedAt": job.stopped_at,
+    }
+
+
+def _node_identity(job: Job, node: int) -> dict[str, Any]:
+    return {"jobId": f"{job.id}#{node}", "jobArn": f"{job_arn(job.id)}#{node}", "status": node_status(job, node)}
+
+
+def _dependency(on: str, kind: str | None) -> dict[str, str]:
+    return {"jobId": on, **({"type": kind} if kind else {})}
 
 
 def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
@@ -116,6 +132,8 @@ def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
         "exitCode": record.get("exitCode"),
         "reason": str(record["reason"])[:255] if record.get("reason") else None,
         "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
+        "containerInstanceArn": f"{environment_arn(attempt.pool or 'local')}/{record['host']}" if record else None,
+        "taskArn": f"{job_arn(job.id)}/{attempt.number}/{node}",
         "networkInterfaces": [{"privateIpv4Address": record["address"]}] if record.get("address") else [],
     }
     return {key: value for key, value in detail.items() if value is not None}
@@ -125,4 +143,5 @@ def _container_of(job: Job, node: int) -> dict[str, Any]:
     count = job.node_properties["numNodes"]
     ranges = [e for e in job.node_properties["nodeRangeProperties"] if node in target_nodes(e["targetNodes"], count)]
     innermost = min(ranges, key=lambda entry: len(target_nodes(entry["targetNodes"], count)))
-    return dict(innermost["container"])
+    defaults: dict[str, Any] = {"volumes": [], "environment": [], "mountPoints": [], "ulimits": []}
+    return {**defaults, **innermost["container"]}

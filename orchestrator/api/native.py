@@ -9,24 +9,28 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Header, Request
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import runs
-from orchestrator.api.batch import QUEUES
+from orchestrator.api import auth, runs
 from orchestrator.api.errors import ClientError
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
-from orchestrator.database import Job, find_job
+from orchestrator.database import find_job
 from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
+from orchestrator.tables import Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
 
 router = APIRouter(prefix="/api")
+
+IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
+"""Makes a submission safe to repeat after a lost answer."""
 
 _POLL = 0.05
 """Seconds between two looks at a log that is followed."""
@@ -60,11 +64,15 @@ def capacity(request: Request) -> dict[str, Any]:
     """The engine, its hosts with all that they have, and the store."""
     controller = _controller(request)
     hosts = [asdict(host) for host in controller.engine.capacity()]
+    with controller.database.session() as session:
+        queues = list(
+            session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
+        )
     return {
         "engine": controller.engine.name,
         "hosts": hosts,
         "store": str(controller.store.path),
-        "queues": list(QUEUES),
+        "queues": queues,
     }
 
 
@@ -86,7 +94,9 @@ def job_detail(request: Request, reference: str) -> dict[str, Any]:
                 (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
             ),
             "status": job.status,
-            "statusReason": job.status_reason,
+            "statusReason": controller.reason(job.id) or job.status_reason,
+            "queue": job.queue,
+            "share": job.share,
             "createdAt": job.created_at,
             "startedAt": job.started_at,
             "stoppedAt": job.stopped_at,
@@ -124,6 +134,7 @@ def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
     controller = _controller(request)
     job, attempt, nodes = _running(controller, reference)
+    _check_queue(controller, job)
     return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
 
 
@@ -148,6 +159,12 @@ def _running(controller: Controller, reference: str) -> tuple[str, int, list[int
             attempt.number,
             sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main),
         )
+
+
+def _check_queue(controller: Controller, job_id: str) -> None:
+    """Raises ClientError where the caller may not use the job's queue."""
+    with controller.database.session() as session:
+        auth.current_identity.get().check_queue(session.get_one(Job, job_id).queue)
 
 
 def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
@@ -187,11 +204,17 @@ def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, A
 
 
 @router.post("/runs/{name}/resume")
-def resume_run(request: Request, name: str, body: ResumeRequest) -> dict[str, Any]:
-    """Submit a job that continues the run."""
+def resume_run(
+    request: Request,
+    name: str,
+    body: ResumeRequest,
+    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+) -> dict[str, Any]:
+    """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
     controller = _controller(request)
+    run = runs.find_run(controller, name)
     return runs.resume(
-        controller, runs.find_run(controller, name), body.checkpoint, body.set, body.directory, body.nodes
+        controller, run, body.checkpoint, body.set, body.directory, body.nodes, idempotency_key=idempotency_key
     )
 
 
@@ -216,6 +239,11 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
         "spent": attempt.spent,
+        "pool": attempt.pool,
+        "gpuSeconds": attempt.gpu_seconds,
+        "cpuSeconds": attempt.cpu_seconds,
+        "wastedGpuSeconds": attempt.wasted_gpu_seconds,
+        "wastedCpuSeconds": attempt.wasted_cpu_seconds,
         "nodes": nodes,
     }
 

@@ -9,14 +9,15 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import batch
+from orchestrator.api import batch, definitions, submission
+from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
-from orchestrator.database import Job
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.jobs import Status
-from orchestrator.scheduler import never_fits
+from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
+from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import read_json
 from shared_store.layout import Run, StoreError
@@ -91,6 +92,7 @@ def resume(
     assignments: Sequence[str],
     directory: str,
     nodes: int | None = None,
+    idempotency_key: str | None = None,
 ) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
@@ -101,11 +103,15 @@ def resume(
         assignments: ``key.path=value`` changes of the spec.
         directory: Working directory of the job.
         nodes: Another number of nodes; the run's worlds stay the same and are dealt out anew.
+        idempotency_key: A second call with it answers what the first one did.
 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
     with controller.writing, controller.database.session() as session:
+        context = Context(session, controller, idempotency_key)
+        if (earlier := submission.answered(context)) is not None:
+            return {**submission.answer(earlier), "run": run.name, "iteration": 0, "kind": "train"}
         document = spec_of(session, run)
         if document is None:
             raise ClientError(
@@ -125,13 +131,13 @@ def resume(
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
-        if impossible := never_fits(gang_needs(definition["nodeProperties"]), controller.engine.capacity()):
+        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, controller.engine.capacity()):
             raise ClientError(f"run {run.name}: {impossible}")
-        registered = batch.register_job_definition(session, batch.validate("RegisterJobDefinition", definition))
+        registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
         if chosen and checkpoint is not None:
             environment["MUSTER_CHECKPOINT"] = chosen.name
-        submission = compile_submission(spec, registered["jobDefinitionArn"], environment)
-        submitted = batch.submit_job(session, batch.validate("SubmitJob", submission))
+        request = compile_submission(spec, registered["jobDefinitionArn"], environment)
+        submitted = submission.submit_job(context, batch.validate("SubmitJob", request))
     controller.wake()
     return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
 

@@ -17,7 +17,7 @@ from orchestrator.cli.progress import follow
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.base import Host
-from orchestrator.scheduler import never_fits
+from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, schema
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -52,7 +52,7 @@ def submit_spec(
     definition = compile_definition(spec, os.getcwd())
     capacity = client.get("/api/capacity")
     hosts = [Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"]) for host in capacity["hosts"]]
-    if impossible := never_fits(gang_needs(definition["nodeProperties"]), hosts):
+    if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
         raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
     if spec.queue not in capacity["queues"]:
         raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")

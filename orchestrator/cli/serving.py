@@ -17,6 +17,7 @@ from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
 from orchestrator.cli.progress import follow
 from orchestrator.client import Client, Unreachable
 from orchestrator.home import ServerError, local_url, muster_home
+from orchestrator.spec import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 CpusOption = Annotated[
@@ -56,16 +57,44 @@ def see_through(client: Client, job: str) -> int:
 
 def serve(
     host: Annotated[
-        str, typer.Option(help="Address to listen on; off loopback MUSTER_TOKEN must be set.")
+        str, typer.Option(help="Address to listen on; off loopback a key (muster keys) or MUSTER_TOKEN is needed.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free port.")] = 8080,
     store: StoreOption = None,
     cpus: CpusOption = None,
+    database: Annotated[
+        str | None,
+        typer.Option(
+            envvar="MUSTER_DATABASE", help="postgresql+psycopg://USER@HOST/NAME; $MUSTER_HOME/muster.db by default."
+        ),
+    ] = None,
+    retention: Annotated[
+        str | None,
+        typer.Option(help="How long the history of finished jobs is kept, such as 90d; for ever by default."),
+    ] = None,
+    rate_limit: Annotated[
+        int,
+        typer.Option(min=0, help="Requests per second that each key may send, twice as many at once; 0: any number."),
+    ] = 1000,
+    submit_rate_limit: Annotated[
+        int, typer.Option(min=0, help="SubmitJob requests per second that each key may send (AWS: 50); 0: any number.")
+    ] = 0,
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next one finds them."""
     from orchestrator.server import Server  # imports what only a controller needs
 
-    server = Server(muster_home(), host=host, port=port, store=store, token=os.environ.get("MUSTER_TOKEN"), cpus=cpus)
+    server = Server(
+        muster_home(),
+        host=host,
+        port=port,
+        store=store,
+        token=os.environ.get("MUSTER_TOKEN"),
+        cpus=cpus,
+        rate_limit=rate_limit,
+        submit_rate_limit=submit_rate_limit,
+        database=database,
+        retention=seconds_of("--retention", retention),
+    )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda _number, _frame: ended.set())
@@ -114,7 +143,7 @@ def _controller(store: str | None, cpus: float | None) -> Iterator[Client]:
     server = Server(muster_home(), store=store, cpus=cpus)
     server.start()
     try:
-        with Client.connect(server.url) as client:
+        with Client(server.url, server.access.own_token) as client:  # it may have keys, and this command none of them
             yield client
     finally:
         server.close()

@@ -47,6 +47,8 @@ class Gang:
     run: str
     store: str
     queue: str
+    pool: str
+    """Name of the compute environment."""
     main: int
     commands: Sequence[Sequence[str]]
     environments: Sequence[Mapping[str, str]]
@@ -58,6 +60,10 @@ class Gang:
     """Working directory of the commands."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
+    is_gang: bool = True
+    """False for a single-node job, whose environment has no node variables on AWS."""
+    array: tuple[int, int] | None = None
+    """Index and size, of an array's child."""
     bus: str | None = None
     bus_token: str | None = None
     """Where the controller's bus router listens, and its password."""

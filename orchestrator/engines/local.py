@@ -67,7 +67,9 @@ class LocalEngine:
                 ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
                 grace=gang.grace,
                 queue=gang.queue,
-                compute_environment=self.name,
+                compute_environment=gang.pool,
+                is_gang=gang.is_gang,
+                array=gang.array,
                 cpus=placement.cpus,
                 stall_timeout=gang.stall_timeout,
                 address=addresses[index],
@@ -202,7 +204,7 @@ def _supervisors(gang: str) -> list[tuple[int, int, int]]:
             command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"")
+        index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0")  # a single-node job has none
         if b"worker.supervisor" in command[:4] and index.isdigit():
             found.append((pid, int(index), int(environment[b"MASTER_PORT"])))
     return found

@@ -116,7 +116,8 @@ def test_off_loopback_a_token_is_demanded_and_then_checked(tmp_path: Path) -> No
     finally:
         del os.environ["MUSTER_TOKEN"]
     try:
-        refused(["list"], server.home, 1, "a token is needed", MUSTER_TOKEN="wrong")
+        refused(["list"], server.home, 1, "this token is not known here", MUSTER_TOKEN="wrong")
+        refused(["list"], server.home, 1, "a token is needed")
         assert run_muster("list", home=server.home, MUSTER_TOKEN="secret").returncode == 0
     finally:
         server.close()

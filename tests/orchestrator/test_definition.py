@@ -43,7 +43,7 @@ def test_a_training_spec_becomes_a_multinode_definition() -> None:
         "jobDefinitionName": "ant",
         "type": "multinode",
         "nodeProperties": {"numNodes": 3, "mainNode": 0},
-        "retryStrategy": {"attempts": 3},
+        "retryStrategy": {"attempts": 3, "evaluateOnExit": [{"onExitCode": "2", "action": "EXIT"}]},
         "timeout": {"attemptDurationSeconds": 7200},
     }
     assert entry == {

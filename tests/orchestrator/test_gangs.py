@@ -79,7 +79,10 @@ def test_attempts_are_spent_and_then_the_job_fails(shared_server: Serving) -> No
     job = shared_server.gang("raise SystemExit(9)", nodes=1, attempts=2)
     detail = shared_server.wait(job)
     assert detail["status"] == "FAILED" and len(detail["attempts"]) == 2
-    assert "exited with code 9" in detail["statusReason"] and "attempt 2 of 2" in detail["statusReason"]
+    assert detail["statusReason"] == "Essential container in task exited", "AWS's own words"
+    assert "exited with code 9" in detail["attempts"][1]["nodes"][0]["reason"]
+    native = shared_server.wait(shared_server.gang("raise SystemExit(9)", nodes=1, attempts=2, env=NATIVE))
+    assert "exited with code 9" in native["statusReason"] and "attempt 2 of 2" in native["statusReason"]
 
 
 def test_on_child_failure_fail_ends_the_job_at_once(shared_server: Serving) -> None:
@@ -114,8 +117,11 @@ def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
     server.wait(first, "RUNNING")
     second = server.gang("print('ran')", nodes=2, cpus="1", name="small")
     reason = wait_for(lambda: (r := server.detail(second)["statusReason"]) and "needs" in r and r, what="a reason")
-    assert reason == "needs 2 nodes with 2 CPUs, 0 GPUs, 32 MiB in all; 1 CPU, 0 GPUs, " + reason.split("GPUs, ")[2]
-    assert reason.endswith("free until big ends")
+    wanted = (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 2 nodes with 2 CPUs, 0 GPUs, 32 MiB in all; 1 CPU, 0 GPUs, "
+    )
+    assert reason == wanted + reason.split("GPUs, ")[2]
+    assert reason.endswith(f"free until big ({first[:8]}) ends")
     impossible = server.gang("pass", nodes=1, cpus="64", name="impossible")
     reason = wait_for(
         lambda: (r := server.detail(impossible)["statusReason"]) and "MISCONF" in r and r, what="a reason"
@@ -144,7 +150,8 @@ def test_a_program_that_can_not_start_fails_with_the_reason(shared_server: Servi
         "SubmitJob", jobName="nothing", jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
     )
     detail = shared_server.wait(job["jobId"])
-    assert detail["status"] == "FAILED" and "can't start 'no-such-program'" in detail["statusReason"]
+    assert detail["status"] == "FAILED"
+    assert "can't start 'no-such-program'" in detail["attempts"][0]["nodes"][0]["reason"]
 
 
 @pytest.mark.parametrize("victim", ["rank", "supervisor"])
@@ -197,7 +204,7 @@ def test_a_gang_that_ends_while_no_controller_runs_is_judged_by_its_outcomes(ser
     wait_for(lambda: not processes_of(server.home), what="the gang's end")
     server.start()
     detail = server.wait(failing)
-    assert detail["status"] == "FAILED" and "ValueError: late" in detail["statusReason"]
+    assert detail["status"] == "FAILED" and "ValueError: late" in detail["attempts"][0]["nodes"][0]["reason"]
 
 
 def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving) -> None:

@@ -51,6 +51,7 @@ class Bench:
             "run": "run",
             "store": str(self.store.path),
             "queue": "default",
+            "pool": "local",
             "main": 0,
             "commands": [["sh", "-c", script]] * nodes,
             "environments": [{}] * nodes,

@@ -43,7 +43,7 @@ LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digi
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
 TASKS = "(known: Ant, Cartpole; your own: module:Class)"
 TOP = (
-    "name, queue, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, retry, "
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, retry, "
     "on_child_failure, timeout, stall_timeout"
 )
 

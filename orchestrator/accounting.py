@@ -1,0 +1,94 @@
+"""What attempts have used: GPU-seconds and CPU-seconds, those whose work was lost, and each share's part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from orchestrator.jobs import Ending, Status
+from orchestrator.scheduling import decayed
+from orchestrator.tables import Attempt, Dependency, Job, ShareUsage, now
+from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.layout import Run
+
+
+def charge(attempt: Attempt, run: Run) -> None:
+    """Fill in what a closed attempt has used, and what of it was lost: all since the run's last checkpoint."""
+    assert attempt.stopped_at is not None
+    seconds = max(0, attempt.stopped_at - attempt.created_at) / 1000
+    gpus = sum(len(node["gpus"]) for node in attempt.nodes)
+    cpus = sum(node["cpus"] for node in attempt.nodes)
+    lost = 0.0 if attempt.ending == Ending.SUCCEEDED else min(seconds, _since_checkpoint(attempt, run, seconds))
+    attempt.gpu_seconds, attempt.cpu_seconds = gpus * seconds, cpus * seconds
+    attempt.wasted_gpu_seconds, attempt.wasted_cpu_seconds = gpus * lost, cpus * lost
+
+
+def _since_checkpoint(attempt: Attempt, run: Run, otherwise: float) -> float:
+    """Seconds from the last checkpoint that this attempt made to its end; ``otherwise`` where it made none."""
+    assert attempt.stopped_at is not None
+    for checkpoint in reversed(list_checkpoints(run)):
+        if checkpoint.epoch != attempt.epoch:
+            continue
+        try:
+            return max(0.0, attempt.stopped_at / 1000 - float(checkpoint.manifest["created"]))
+        except (DamagedCheckpoint, KeyError, TypeError, ValueError):
+            continue
+    return otherwise
+
+
+def resource_seconds(attempt: Attempt, until: int) -> float:
+    """What an attempt has used until a time [ms]: GPU-seconds, or CPU-seconds where it has no GPUs."""
+    seconds = max(0, (attempt.stopped_at or until) - attempt.created_at) / 1000
+    gpus = sum(len(node["gpus"]) for node in attempt.nodes)
+    return seconds * (gpus or sum(node["cpus"] for node in attempt.nodes))
+
+
+def add_usage(session: Session, queue: str, share: str, seconds: float, decay: int) -> None:
+    """Add resource-seconds that a share has just used of a queue."""
+    usage = session.get(ShareUsage, (queue, share))
+    if usage is None:
+        usage = ShareUsage(queue=queue, share=share, seconds=0.0, as_of=now())
+        session.add(usage)
+    usage.seconds = decayed(usage.seconds, (now() - usage.as_of) / 1000, decay) + seconds
+    usage.as_of = now()
+
+
+def usage_now(
+    session: Session, decays: Mapping[str, int], running: Sequence[tuple[Job, Attempt]]
+) -> dict[tuple[str, str], float]:
+    """(queue, share) → resource-seconds decayed to now, with what running gangs have used so far.
+
+    Args:
+        session: The session.
+        decays: ``shareDecaySeconds`` by queue, of the queues that have a policy.
+        running: Jobs with their open attempts.
+    """
+    moment = now()
+    found: dict[tuple[str, str], float] = {}
+    if not decays:
+        return found
+    for row in session.scalars(select(ShareUsage).where(ShareUsage.queue.in_(decays))):
+        left = decayed(row.seconds, (moment - row.as_of) / 1000, decays[row.queue])
+        if left > 1e-3:  # forgotten in the end: a share with nothing used is not active
+            found[row.queue, row.share] = left
+    for job, attempt in running:
+        if job.queue in decays:
+            key = (job.queue, job.share or "")
+            found[key] = found.get(key, 0.0) + resource_seconds(attempt, moment)
+    return found
+
+
+def forget_before(session: Session, moment: int, most: int = 500) -> int:
+    """Delete the history of jobs that were over before ``moment`` [ms], at most so many; returns how many were.
+
+    What a job that is not over waits for is kept, and an array as long as one of its children is.
+    """
+    open_jobs = select(Job.id).where(Job.status.not_in([Status.SUCCEEDED, Status.FAILED]))
+    needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))
+    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed)).order_by(Job.stopped_at).limit(most)
+    ids = list(session.scalars(query))
+    for table, column in ((Attempt, Attempt.job_id), (Dependency, Dependency.job_id), (Job, Job.id)):
+        session.execute(delete(table).where(column.in_(ids)))
+    return len(ids)

@@ -1,0 +1,101 @@
+"""From the database to a scheduling pass's snapshot, and what is known of the queues after the pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.accounting import usage_now
+from orchestrator.definition import gang_needs
+from orchestrator.engines.base import Host, Placement
+from orchestrator.scheduling import FairShare, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
+from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
+
+HOSTS_TAG = "muster:hosts"
+"""Tag that names the hosts of a compute environment, with commas between; all of the engine's without it."""
+DEFAULT_DECAY = 600
+"""``shareDecaySeconds`` where it is not set, or 0 (AWS's API model)."""
+
+
+def take_snapshot(
+    session: Session, hosts: Sequence[Host], waiting: Sequence[Waiting], active: Sequence[str]
+) -> Snapshot:
+    """Everything that the pass depends on, as it is now.
+
+    Args:
+        session: The session.
+        hosts: All that the engine has.
+        waiting: The jobs that wait for room.
+        active: Ids of the jobs that may hold some.
+    """
+    policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
+    queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
+    pools = {each.name: read_pool(each) for each in session.scalars(select(ComputeEnvironment))}
+    holding = open_attempts(session, active)
+    decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
+    return Snapshot(
+        now=now(),
+        hosts=hosts,
+        pools=pools,
+        queues=queues,
+        waiting=waiting,
+        running=[_running(job, attempt) for job, attempt in holding],
+        usage=usage_now(session, decays, holding),
+    )
+
+
+def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Attempt]]:
+    """The jobs whose gang exists or may exist, with that attempt."""
+    found = []
+    for job_id in jobs:
+        job = session.get(Job, job_id)
+        if job is not None and (attempt := job.open_attempt) is not None:
+            found.append((job, attempt))
+    return found
+
+
+def read_queue(queue: JobQueue, policies: Mapping[str, SchedulingPolicy]) -> Queue:
+    policy = policies.get(queue.policy) if queue.policy else None
+    limits = tuple(TimeLimit(limit["reason"], limit["maxTimeSeconds"]) for limit in queue.limits)
+    return Queue(
+        queue.name, queue.priority, tuple(queue.environments), _fair_share(policy.fairshare) if policy else None, limits
+    )
+
+
+def _fair_share(document: Mapping[str, Any]) -> FairShare:
+    weights = {
+        each["shareIdentifier"]: each.get("weightFactor", 1.0) for each in document.get("shareDistribution") or []
+    }
+    decay = document.get("shareDecaySeconds") or DEFAULT_DECAY
+    return FairShare(decay, document.get("computeReservation", 0), weights)
+
+
+def read_pool(environment: ComputeEnvironment) -> Pool:
+    named = environment.tags.get(HOSTS_TAG)
+    hosts = tuple(name.strip() for name in named.split(",")) if named else None
+    most = (environment.document.get("computeResources") or {}).get("maxvCpus")
+    return Pool(environment.name, environment.state == "ENABLED", hosts, float(most) if most is not None else None)
+
+
+def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
+    return tuple(Placement(node["host"], tuple(node["gpus"]), node["cpus"], node["memory"]) for node in attempt.nodes)
+
+
+def _running(job: Job, attempt: Attempt) -> Running:
+    needs = gang_needs(job.node_properties)
+    return Running(
+        job=job.id,
+        name=job.name,
+        queue=job.queue,
+        share=job.share,
+        priority=job.priority,
+        pool=attempt.pool or "local",
+        placements=placements_of(attempt),
+        started_at=attempt.started_at,
+        timeout=job.timeout,
+        preemptible=needs.setting("MUSTER_PREEMPTIBLE") == "1",
+        ending=attempt.ending is not None or job.stop_reason is not None,
+    )

@@ -1,0 +1,54 @@
+"""What an operation works with, and finding what a request names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.api.arns import plain_name
+from orchestrator.api.errors import ClientError
+from orchestrator.controller import Controller
+from orchestrator.tables import Job, JobDefinition, JobQueue
+
+
+@dataclass(frozen=True)
+class Context:
+    """One call."""
+
+    session: Session
+    controller: Controller
+    idempotency_key: str | None = None
+
+    def queue(self, reference: str) -> JobQueue:
+        """The queue of this name or ARN. Raises ClientError."""
+        queue = self.session.get(JobQueue, plain_name(reference))
+        if queue is None or queue.deleting:
+            there = (
+                ", ".join(self.session.scalars(select(JobQueue.name).order_by(JobQueue.name).limit(5))) or "none yet"
+            )
+            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {there}")
+        return queue
+
+    def definition(self, reference: str) -> JobDefinition:
+        """The active definition of this name (its newest revision), ``name:revision`` or ARN. Raises ClientError."""
+        name, _, revision = plain_name(reference).partition(":")
+        query = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.status == "ACTIVE")
+        if revision:
+            if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
+                raise ClientError(f"Job definition {reference[:300]}: the revision must be a number")
+            query = query.where(JobDefinition.revision == int(revision))
+        found = self.session.scalars(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
+        if found is None:
+            raise ClientError(f"Job definition {reference[:300]} does not exist or is not active")
+        return found
+
+    def definition_of(self, job: Job) -> JobDefinition:
+        """The definition of a job, active or not."""
+        name, _, revision = plain_name(job.definition).partition(":")
+        return self.session.get_one(JobDefinition, (name, int(revision)))
+
+    def reason(self, job: Job) -> str | None:
+        """Why a job waits just now; None where it does not wait for room."""
+        return self.controller.reason(job.id) if job.status == "RUNNABLE" else None

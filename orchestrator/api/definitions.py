@@ -1,0 +1,91 @@
+"""Job definitions: register, describe, deregister."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import func, select
+
+from orchestrator.api import rules
+from orchestrator.api.arns import definition_arn, plain_name
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.paging import page, page_size
+from orchestrator.tables import JobDefinition
+
+
+def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """RegisterJobDefinition; each registration of a name is a new revision."""
+    name, kind = request["jobDefinitionName"], request["type"]
+    rules.check_name("jobDefinitionName", name)
+    rules.check_tries(request)
+    rules.check_tags(request.get("tags") or {})
+    rules.check_priority("schedulingPriority", request.get("schedulingPriority"))
+    if "FARGATE" in (request.get("platformCapabilities") or []):
+        raise ClientError(f"job definition {name}: platformCapabilities FARGATE is not supported; use EC2")
+    wanted = {"multinode": "nodeProperties", "container": "containerProperties"}.get(kind)
+    if wanted is None:
+        raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
+    others = {"nodeProperties", "containerProperties", "eksProperties", "ecsProperties"} - {wanted}
+    if not request.get(wanted) or any(request.get(key) for key in others):
+        raise ClientError(f"job definition {name}: type {kind} needs {wanted}, and only that")
+    if kind == "multinode":
+        rules.check_nodes(request["nodeProperties"])
+    else:
+        rules.check_container(request["containerProperties"], "containerProperties")
+    newest = context.session.scalar(select(func.max(JobDefinition.revision)).where(JobDefinition.name == name))
+    revision = (newest or 0) + 1
+    document = {key: value for key, value in request.items() if key != "tags"}
+    context.session.add(JobDefinition(name=name, revision=revision, document=document, tags=request.get("tags") or {}))
+    return {"jobDefinitionName": name, "jobDefinitionArn": definition_arn(name, revision), "revision": revision}
+
+
+def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeJobDefinitions by names or ARNs, by name and status, or all; the newest revision first."""
+    listed = request.get("jobDefinitions") or []
+    if len(listed) > 100:
+        raise ClientError("DescribeJobDefinitions takes at most 100 job definitions")
+    query = select(JobDefinition).order_by(JobDefinition.name, JobDefinition.revision.desc())
+    if listed:
+        wanted = [plain_name(each).partition(":") for each in listed]
+        found = [
+            each
+            for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in wanted])))
+            if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in wanted)
+            and request.get("status") in (None, each.status)
+        ]
+        return {"jobDefinitions": [_describe(each) for each in found]}
+    if name := request.get("jobDefinitionName"):
+        query = query.where(JobDefinition.name == plain_name(name).partition(":")[0])
+    if status := request.get("status"):
+        query = query.where(JobDefinition.status == status)
+    found_page, token = page(
+        context.session, query, request, page_size(request, 100), (JobDefinition.name, JobDefinition.revision)
+    )
+    return {"jobDefinitions": [_describe(each) for each in found_page], **token}
+
+
+def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DeregisterJobDefinition: INACTIVE; jobs that were submitted with it go on."""
+    name, _, revision = plain_name(request["jobDefinition"]).partition(":")
+    if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
+        raise ClientError(
+            f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"
+        )
+    definition = context.session.get(JobDefinition, (name, int(revision)))
+    if definition is not None:  # AWS answers the same for one that is not there
+        definition.status = "INACTIVE"
+    return {}
+
+
+def _describe(definition: JobDefinition) -> dict[str, Any]:
+    document = definition.document
+    return {
+        "containerOrchestrationType": "ECS",
+        "platformCapabilities": ["EC2"],
+        **document,
+        "jobDefinitionArn": definition_arn(definition.name, definition.revision),
+        "revision": definition.revision,
+        "status": definition.status,
+        "tags": definition.tags,
+    }

@@ -1,0 +1,163 @@
+"""DescribeJobs, ListJobs, TerminateJob, CancelJob."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import func, select
+
+from orchestrator.api import auth
+from orchestrator.api.arns import split_reference
+from orchestrator.api.context import Context
+from orchestrator.api.describe import array_properties, describe_job, summarize
+from orchestrator.api.errors import ClientError
+from orchestrator.api.paging import decode, encode, page, page_size
+from orchestrator.jobs import Status
+from orchestrator.tables import Job
+
+_LONGEST_REASON = 1024
+_EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
+
+
+def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeJobs for jobs, nodes (``id#N``, ``arn#N``) and array children (``id:N``); unknown ids are passed over."""
+    if len(request["jobs"]) > 100:
+        raise ClientError("DescribeJobs takes at most 100 jobs")
+    found = []
+    for reference in request["jobs"]:
+        job_id, node = split_reference(reference)
+        job = context.session.get(Job, job_id)
+        if job is None or not (
+            node is None or (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"])
+        ):
+            continue
+        detail = describe_job(job, context.definition_of(job), node, context.reason(job))
+        if (array := array_properties(job, _count_children(context, job))) is not None:
+            detail["arrayProperties"] = array
+        found.append(detail)
+    return {"jobs": found}
+
+
+def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """ListJobs by queue (RUNNING where no status is given; all statuses with a filter), of an array, or of a gang."""
+    given = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
+    if len(given) != 1:
+        raise ClientError("ListJobs: give exactly one of jobQueue, arrayJobId, multiNodeJobId")
+    if request.get("multiNodeJobId"):
+        return _list_nodes(context, request)
+    if array := request.get("arrayJobId"):
+        job_id, _ = split_reference(array)
+        query = select(Job).where(Job.parent == job_id).order_by(Job.array_index, Job.id)
+        if status := request.get("jobStatus"):
+            query = query.where(Job.status == status)
+        rows, token = page(
+            context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
+        )
+    else:
+        queue = context.queue(request["jobQueue"])
+        conditions = _conditions(request)
+        query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
+        query = query.order_by(Job.created_at.desc(), Job.id.desc())
+        most = 100 if request.get("filters") else 1000
+        keys = (Job.created_at, Job.id)
+        rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))
+    return {"jobSummaryList": [summarize(job, context.reason(job)) for job in rows], **token}
+
+
+def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
+    job = context.session.get(Job, split_reference(request["multiNodeJobId"])[0])
+    if job is None or job.kind != "multinode":
+        return {"jobSummaryList": []}
+    summaries = [summarize(job, context.reason(job), node) for node in range(int(job.node_properties["numNodes"]))]
+    wanted = request.get("jobStatus")
+    summaries = [summary for summary in summaries if not wanted or summary["status"] == wanted]
+    token = request.get("nextToken")
+    start = decode(token, 1)[0] if token else 0
+    if not isinstance(start, int) or start < 0:
+        raise ClientError(f"nextToken {str(token)[:100]!r} is not one that was given out")
+    end = start + page_size(dict(request), 1000)
+    more = {"nextToken": encode([end])} if len(summaries) > end else {}
+    return {"jobSummaryList": summaries[start:end], **more}
+
+
+def _conditions(request: Mapping[str, Any]) -> Sequence[Any]:
+    filters = request.get("filters") or []
+    if len(filters) > 1:
+        raise ClientError("ListJobs takes one filter at a time")
+    if not filters:
+        return [Job.status == request.get("jobStatus", Status.RUNNING)]
+    name, values = filters[0].get("name"), filters[0].get("values") or []
+    if len(values) != 1:
+        raise ClientError(f"ListJobs: filter {name} has {len(values)} values; it takes one")
+    value = values[0]
+    match name:
+        case "JOB_NAME":
+            if value.endswith("*"):
+                return [func.lower(Job.name).startswith(value[:-1].lower(), autoescape=True)]
+            return [func.lower(Job.name) == value.lower()]
+        case "JOB_DEFINITION":
+            return [_by_definition(value)]
+        case "BEFORE_CREATED_AT" | "AFTER_CREATED_AT":
+            if not (value.isascii() and value.isdigit() and len(value) < 16):
+                raise ClientError(f"ListJobs: filter {name} takes a time in milliseconds, not {value[:50]!r}")
+            return [Job.created_at < int(value) if name == "BEFORE_CREATED_AT" else Job.created_at > int(value)]
+        case "SHARE_IDENTIFIER":
+            status = request.get("jobStatus")  # the one filter that goes with a status
+            return [Job.share == value, *([Job.status == status] if status else [])]
+    raise ClientError(
+        f"ListJobs: filter {str(name)[:50]!r} is not known; use JOB_NAME, JOB_DEFINITION, BEFORE_CREATED_AT, "
+        "AFTER_CREATED_AT or SHARE_IDENTIFIER"
+    )
+
+
+def _by_definition(value: str) -> Any:
+    """A definition's name (any revision), name:revision or ARN; only a name may end in ``*``."""
+    if value.startswith("arn:"):
+        return Job.definition == value
+    if value.endswith("*"):
+        return Job.definition.contains(f"job-definition/{value[:-1]}", autoescape=True)
+    name, _, revision = value.partition(":")
+    if revision:
+        return Job.definition.endswith(f"job-definition/{name}:{revision}", autoescape=True)
+    return Job.definition.contains(f"job-definition/{name}:", autoescape=True)
+
+
+def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; one that does not run yet is cancelled; one that is over stays so."""
+    for job in _targets(context, request, "TerminateJob"):
+        if not job.is_over and job.stop_reason is None:
+            job.stop_reason = request["reason"]
+    return {}
+
+
+def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
+    for job in _targets(context, request, "CancelJob"):
+        if job.status in _EARLY and job.stop_reason is None:
+            job.stop_reason, job.cancelled = request["reason"], True
+    return {}
+
+
+def _targets(context: Context, request: Mapping[str, Any], operation: str) -> Sequence[Job]:
+    """The job; an array's children too."""
+    if len(request["reason"]) > _LONGEST_REASON:
+        raise ClientError(f"{operation}: the reason is longer than {_LONGEST_REASON} characters")
+    job_id, node = split_reference(request["jobId"])
+    if node is not None:
+        raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
+    job = context.session.get(Job, job_id)
+    if job is None:
+        raise ClientError(f"Job {request['jobId'][:300]} does not exist")
+    auth.current_identity.get().check_queue(job.queue)
+    if job.kind != "array":
+        return [job]
+    over = [Status.SUCCEEDED, Status.FAILED]
+    return [job, *context.session.scalars(select(Job).where(Job.parent == job.id, Job.status.not_in(over)))]
+
+
+def _count_children(context: Context, job: Job) -> Mapping[str, int]:
+    if job.kind != "array":
+        return {}
+    query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
+    return {status: count for status, count in context.session.execute(query)}

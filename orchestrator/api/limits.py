@@ -1,0 +1,98 @@
+"""How much a client may ask: bytes in a request, requests in a second."""
+
+from __future__ import annotations
+
+import time
+
+from starlette.requests import ClientDisconnect
+from starlette.types import Message, Receive
+
+from orchestrator.api.errors import ClientError
+
+LARGEST_BODY = 1 << 20
+"""Bytes of any request's body."""
+LARGEST = {"submitjob": 30 << 10, "registerjobdefinition": 24 << 10}
+"""Bytes of the body of these operations (lower case), as on AWS."""
+RATE = 1000
+"""Requests per second that one client may send for long, unless the server is told otherwise."""
+_FULL = 2.0
+"""Seconds after which a bucket that nobody took from is full again, and need not be kept."""
+_SWEEP = 10.0
+"""Seconds between two looks for such buckets."""
+
+
+class Body:
+    """The body of an HTTP request: read whole within its limit, then given to the application as if it were just coming."""
+
+    def __init__(self, receive: Receive, declared: str | None, operation: str) -> None:
+        """``declared``: the Content-Length, where there is one. ``operation``: in lower case; some have a limit of their own."""
+        self._receive, self._declared, self._operation = receive, declared, operation
+        self._limit = LARGEST.get(operation, LARGEST_BODY)
+        self._whole: bytes | None = None
+        self._given = False
+
+    async def read(self) -> bytes:
+        """All of it. Raises ClientError where it is too large (and keeps no more than the limit), ClientDisconnect."""
+        if self._whole is None:
+            length = self._declared or ""
+            if length.isascii() and length.isdigit() and (len(length) > 9 or int(length) > self._limit):
+                raise self._too_large()
+            parts: list[bytes] = []
+            size = 0
+            more = True
+            while more:
+                message = await self._receive()
+                if message["type"] == "http.disconnect":
+                    raise ClientDisconnect
+                parts.append(message.get("body", b""))
+                size += len(parts[-1])
+                if size > self._limit:
+                    raise self._too_large()
+                more = message.get("more_body", False)
+            self._whole = b"".join(parts)
+        return self._whole
+
+    async def receive(self) -> Message:
+        """For the application: the body in one message, then what else the client sends (that it left)."""
+        if self._whole is None or self._given:
+            return await self._receive()
+        self._given = True
+        return {"type": "http.request", "body": self._whole, "more_body": False}
+
+    def _too_large(self) -> ClientError:
+        shorten = "; shorten its environment and commands" if self._operation in LARGEST else ""
+        return ClientError(f"{self._operation}: the request has more than {self._limit} bytes{shorten}", 413)
+
+
+class RateLimit:
+    """A token bucket for each client: ``rate`` requests per second for long, twice as many at once. 0 means no limit.
+
+    ``submit_rate`` bounds SubmitJob on top of that (AWS: 50 per second).
+    """
+
+    def __init__(self, rate: int = RATE, submit_rate: int = 0) -> None:
+        self.rate, self.submit_rate = rate, submit_rate
+        self._buckets: dict[tuple[str, str], tuple[float, float]] = {}
+        """(client, "" or operation) → tokens, and when they were counted (monotonic seconds)."""
+        self._swept = 0.0
+
+    def refusal(self, client: str, operation: str) -> str | None:
+        """Count a request; None where it may pass, else why not. ``operation``: lower case."""
+        if not self._take((client, ""), self.rate):
+            return f"Too Many Requests: {client} may send {self.rate} requests per second; wait and try again"
+        if operation == "submitjob" and not self._take((client, operation), self.submit_rate):
+            return f"Too Many Requests: {client} may submit {self.submit_rate} jobs per second; wait and try again"
+        return None
+
+    def _take(self, bucket: tuple[str, str], rate: int) -> bool:
+        if rate <= 0:
+            return True
+        now = time.monotonic()
+        tokens, counted = self._buckets.get(bucket, (2.0 * rate, now))
+        tokens = min(2.0 * rate, tokens + (now - counted) * rate)
+        allowed = tokens >= 1
+        self._buckets[bucket] = (tokens - 1 if allowed else tokens, now)
+        if now - self._swept > _SWEEP:
+            self._swept = now
+            self._buckets = {key: entry for key, entry in self._buckets.items() if now - entry[1] < _FULL}
+        return allowed

@@ -1,0 +1,216 @@
+"""The rules of definitions and submissions that AWS's service model can't say; each is a ClientException on AWS too."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrator.api.errors import ClientError
+from orchestrator.definition import GangNeeds, gang_needs, target_nodes
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
+_REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
+_MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
+_SHORTEST_TIMEOUT = 60
+
+
+def check_name(key: str, name: str) -> None:
+    """A name as AWS takes it: letters, digits, hyphens, underscores, a letter or digit first, at most 128."""
+    if not _NAME.fullmatch(name):
+        raise ClientError(
+            f"{key} {name[:200]!r}: up to 128 letters, digits, hyphens and underscores, a letter or digit first"
+        )
+
+
+def check_tags(tags: Mapping[str, str]) -> None:
+    """At most 50 tags, keys of 1 to 128 characters that do not begin with ``aws:``, values of at most 256."""
+    if len(tags) > _MOST_TAGS:
+        raise ClientError(f"{len(tags)} tags; a resource has at most {_MOST_TAGS}")
+    for key, value in tags.items():
+        if not 1 <= len(key) <= 128 or key.lower().startswith("aws:") or len(value) > 256:
+            raise ClientError(
+                f"tag {key[:130]!r}: keys have 1 to 128 characters and don't begin with aws:, values have at most 256"
+            )
+
+
+def check_priority(key: str, value: int | None) -> None:
+    if value is not None and not 0 <= value <= 9999:
+        raise ClientError(f"{key} is {value}; it must be 0 to 9999")
+
+
+def check_tries(request: Mapping[str, Any]) -> None:
+    """``retryStrategy`` and ``timeout`` of a definition or a submission."""
+    retry, timeout = request.get("retryStrategy") or {}, request.get("timeout") or {}
+    attempts, conditions = retry.get("attempts"), retry.get("evaluateOnExit") or []
+    if attempts is not None and not 1 <= attempts <= 10:
+        raise ClientError(f"retryStrategy attempts is {attempts}; it must be 1 to 10")
+    if conditions and attempts is None:
+        raise ClientError("retryStrategy evaluateOnExit needs attempts too")
+    if len(conditions) > _MOST_CONDITIONS:
+        raise ClientError(f"retryStrategy evaluateOnExit has {len(conditions)} entries; at most {_MOST_CONDITIONS}")
+    for condition in conditions:
+        _check_condition(condition)
+    seconds = timeout.get("attemptDurationSeconds")
+    if seconds is not None and not _SHORTEST_TIMEOUT <= seconds < 2**31:
+        raise ClientError(f"timeout attemptDurationSeconds is {seconds}; it must be at least {_SHORTEST_TIMEOUT}")
+
+
+def _check_condition(condition: Mapping[str, str]) -> None:
+    if condition["action"].upper() not in ("RETRY", "EXIT"):
+        raise ClientError(f"retryStrategy evaluateOnExit action is {condition['action'][:50]!r}; it is RETRY or EXIT")
+    given = {key: condition[key] for key in ("onExitCode", "onReason", "onStatusReason") if condition.get(key)}
+    if not given:
+        raise ClientError("retryStrategy evaluateOnExit: an entry needs onExitCode, onReason or onStatusReason")
+    for key, pattern in given.items():
+        if len(pattern) > 512 or "*" in pattern[:-1]:
+            raise ClientError(f"{key} {pattern[:50]!r}: at most 512 characters, with a * at the end only")
+    if not re.fullmatch(r"[0-9]*\*?", given.get("onExitCode", "*")):
+        raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
+
+
+def check_nodes(properties: Mapping[str, Any]) -> None:
+    """``nodeProperties`` of a definition, or with a submission's overrides applied."""
+    count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
+    if not 1 <= count <= _MOST_NODES:
+        raise ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
+    if not 0 <= main < count:
+        raise ClientError(f"mainNode is {main}; it must be less than numNodes ({count})")
+    if not 1 <= len(ranges) <= _MOST_RANGES:
+        raise ClientError(f"{len(ranges)} node ranges; a multi-node parallel job has 1 to {_MOST_RANGES}")
+    for entry in ranges:
+        target = entry["targetNodes"]
+        if entry.get("container") is None:
+            raise ClientError(f"node range {target[:20]}: only container properties are supported")
+        check_container(entry["container"], f"node range {target[:20]}")
+        _check_target(target, count)
+    try:
+        needs = gang_needs(properties)
+    except ValueError as error:
+        raise ClientError(str(error)) from None
+    _check_settings(needs)
+
+
+def _check_settings(needs: GangNeeds) -> None:
+    """The ``MUSTER_*`` variables that the controller itself reads."""
+    try:
+        needs.spec  # noqa: B018 - parsed here for its errors
+        float(needs.setting("MUSTER_STALL_TIMEOUT", "0"))
+    except ValueError:
+        raise ClientError(
+            "MUSTER_SPEC or MUSTER_STALL_TIMEOUT is malformed; both are written by `muster submit`"
+        ) from None
+    if needs.setting("MUSTER_ON_CHILD_FAILURE", "ignore") not in ("restart", "fail", "ignore"):
+        raise ClientError("MUSTER_ON_CHILD_FAILURE: expected restart, fail or ignore")
+
+
+def _check_target(target: str, count: int) -> None:
+    try:
+        nodes = target_nodes(target, count)
+    except ValueError as error:
+        raise ClientError(str(error)) from None
+    # a range with an open end may be empty in a job that a submission has made smaller
+    if nodes[-1] >= count if nodes else not target.endswith(":"):
+        raise ClientError(f"targetNodes {target[:20]}: the nodes are 0 to {count - 1}")
+
+
+def check_container(container: Mapping[str, Any], where: str) -> None:
+    """``containerProperties``: an image or a command, environment, resources."""
+    for pair in container.get("environment") or []:
+        name = pair.get("name", "")
+        if name.startswith("AWS_BATCH"):
+            raise ClientError(f"environment variable {name[:100]}: names that start with AWS_BATCH are reserved")
+        if "=" in name or "\0" in name + pair.get("value", ""):
+            raise ClientError(
+                f"environment variable {name[:100]!r}: neither '=' in the name nor a zero byte is possible"
+            )
+    if not container.get("command"):
+        raise ClientError(f"{where}: has no command")
+    if any("\0" in part for part in container["command"]):
+        raise ClientError(f"{where}: a zero byte in the command")
+    resources = container.get("resourceRequirements") or []
+    kinds = [entry["type"] for entry in resources]
+    if len(set(kinds)) != len(kinds):
+        raise ClientError(f"{where}: resourceRequirements names {max(kinds, key=kinds.count)} twice")
+    for entry in resources:
+        _check_resource(entry, where)
+    for key, least in (("vcpus", 1), ("memory", 4)):
+        if container.get(key) is not None and container[key] < least:
+            raise ClientError(f"{where}: {key} is {container[key]}; it must be at least {least}")
+    volumes = {volume.get("name") for volume in container.get("volumes") or []}
+    for mount in container.get("mountPoints") or []:
+        if mount.get("sourceVolume") not in volumes:
+            raise ClientError(
+                f"{where}: mountPoints names volume {mount.get('sourceVolume')!r}, which volumes does not have"
+            )
+
+
+def _check_resource(entry: Mapping[str, str], where: str) -> None:
+    kind, value = entry["type"], entry["value"]
+    if kind not in ("VCPU", "MEMORY", "GPU"):
+        raise ClientError(f"{where}: resourceRequirements type {kind[:50]!r}; it is VCPU, MEMORY or GPU")
+    pattern = r"[0-9]{1,7}(\.[0-9]{1,6})?" if kind == "VCPU" else r"[0-9]{1,12}"
+    if not re.fullmatch(pattern, value) or float(value) < {"VCPU": 1e-6, "MEMORY": 4, "GPU": 0}[kind]:
+        least = {"VCPU": "a positive number", "MEMORY": "a whole number of MiB, at least 4", "GPU": "a whole number"}[
+            kind
+        ]
+        raise ClientError(f"{where}: resourceRequirements {kind} is {value[:50]!r}; it must be {least}")
+
+
+def single_node(container: Mapping[str, Any]) -> dict[str, Any]:
+    """A single-node job as the gang of one node that it is here."""
+    entry = {"targetNodes": "0:0", "container": dict(container)}
+    return {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [entry]}
+
+
+def substitute(properties: Mapping[str, Any], parameters: Mapping[str, str]) -> dict[str, Any]:
+    """Replace ``Ref::name`` in every command by its parameter. Raises ClientError for one that is not given."""
+
+    def replace(match: re.Match[str]) -> str:
+        if match[1] not in parameters:
+            raise ClientError(f"Unable to substitute value. No parameter found for reference {match[1]}")
+        return parameters[match[1]]
+
+    result = copy.deepcopy(dict(properties))
+    for entry in result["nodeRangeProperties"]:
+        entry["container"]["command"] = [_REFERENCE.sub(replace, part) for part in entry["container"]["command"]]
+    return result
+
+
+def override_container(container: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """``containerOverrides`` on a container: environment merges by name, the command replaces, resources replace by type."""
+    if changes.get("command"):
+        container["command"] = list(changes["command"])
+    for key, name in (("environment", "name"), ("resourceRequirements", "type")):
+        merged = {pair.get(name): pair for pair in [*(container.get(key) or []), *(changes.get(key) or [])]}
+        container[key] = list(merged.values())
+    for key, kind in (("vcpus", "VCPU"), ("memory", "MEMORY")):  # the deprecated fields replace like the new ones
+        if changes.get(key) is not None:
+            kept = [each for each in container["resourceRequirements"] if each["type"] != kind]
+            container["resourceRequirements"] = [*kept, {"type": kind, "value": str(changes[key])}]
+
+
+def override_nodes(properties: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """``nodeOverrides`` on ``nodeProperties``. Raises ClientError for a range or a size that the definition does not allow."""
+    result = copy.deepcopy(dict(properties))
+    if (count := overrides.get("numNodes")) is not None:
+        open_ends = [
+            entry["targetNodes"] for entry in result["nodeRangeProperties"] if entry["targetNodes"].endswith(":")
+        ]
+        if not open_ends:
+            raise ClientError(
+                "numNodes can be overridden only where a node range of the definition has an open end, such as 0:"
+            )
+        if not any(int(target[:-1] or 0) < count for target in open_ends):
+            raise ClientError(f"numNodes {count}: the open node range {open_ends[0]} begins behind the last node")
+        result["numNodes"] = count
+    ranges = {entry["targetNodes"]: entry for entry in result["nodeRangeProperties"]}
+    for override in overrides.get("nodePropertyOverrides") or []:
+        if override["targetNodes"] not in ranges:
+            raise ClientError(
+                "NodeOverride targets should match job definition. "
+                f"Non matching targets - {override['targetNodes'][:50]}"
+            )
+        override_container(ranges[override["targetNodes"]]["container"], override.get("containerOverrides") or {})
+    return result

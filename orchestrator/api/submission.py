@@ -1,0 +1,211 @@
+"""SubmitJob: multi-node jobs, single-node jobs, arrays of them, and what they wait for."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+
+from orchestrator.api import auth, rules
+from orchestrator.api.arns import definition_arn, job_arn, split_reference
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.definition import gang_needs
+from orchestrator.jobs import Status
+from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue
+from shared_store.layout import NAME
+
+_MOST_DEPENDENCIES = 20
+_ARRAY_SIZES = range(2, 10_001)
+_KEY = re.compile(r"[\x21-\x7e]{1,128}")
+
+
+def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """SubmitJob. With an idempotency key a second call answers what the first one did."""
+    request = {key: value for key, value in request.items() if value not in ({}, [])}  # Luigi sends what it has not set
+    if (job := answered(context)) is not None:
+        if job.request != request:
+            raise ClientError(
+                f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", 409
+            )
+        return answer(job)
+    rules.check_name("jobName", request["jobName"])
+    rules.check_tries(request)
+    rules.check_tags(request.get("tags") or {})
+    queue = _queue(context, request)
+    definition = context.definition(request["jobDefinition"])
+    job = _job(context, request, queue, definition)
+    job.idempotency_key = _scoped(context.idempotency_key)
+    if request.get("arrayProperties"):
+        _add_array(context, job, request)
+    else:
+        for dependency in _dependencies(context, request, None):
+            job.dependencies.append(dependency)
+    context.session.add(job)
+    return answer(job)
+
+
+def answered(context: Context) -> Job | None:
+    """The job that an earlier call with the same idempotency key has submitted."""
+    key = _scoped(context.idempotency_key)
+    return context.session.scalars(select(Job).where(Job.idempotency_key == key)).first() if key else None
+
+
+def answer(job: Job) -> dict[str, Any]:
+    return {"jobArn": job_arn(job.id), "jobName": job.name, "jobId": job.id}
+
+
+def _scoped(key: str | None) -> str | None:
+    """Keys of two callers never meet."""
+    if key is None:
+        return None
+    if not _KEY.fullmatch(key):
+        raise ClientError("the idempotency key: 1 to 128 printable characters without spaces")
+    return f"{auth.current_identity.get().name}/{key}"
+
+
+def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
+    queue = context.queue(request["jobQueue"])
+    auth.current_identity.get().check_queue(queue.name)
+    if queue.state != "ENABLED":
+        raise ClientError(f"Job queue {queue.name} is DISABLED and takes no jobs")
+    share, priority = request.get("shareIdentifier"), request.get("schedulingPriorityOverride")
+    if queue.policy is None and (share is not None or priority is not None):
+        # AWS's own words, with their missing space: clients match them
+        raise ClientError(
+            "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share "
+            "scheduling policy."
+        )
+    if queue.policy is not None and not share:
+        raise ClientError(f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier")
+    if share is not None and not re.fullmatch(r"[A-Za-z0-9]{1,255}", share):
+        raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits")
+    rules.check_priority("schedulingPriorityOverride", priority)
+    return queue
+
+
+def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition: JobDefinition) -> Job:
+    document, name = definition.document, request["jobName"]
+    parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
+    properties = rules.substitute(_properties(document, request), parameters)
+    rules.check_nodes(properties)
+    retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
+    timeout = request.get("timeout") or document.get("timeout") or {}
+    job_id = str(uuid.uuid4())
+    is_array = bool(request.get("arrayProperties"))
+    run = gang_needs(properties).setting("MUSTER_RUN") or f"{name[:110]}-{job_id[:8]}"
+    _check_run(context, run, is_array)
+    return Job(
+        id=job_id,
+        name=name,
+        queue=queue.name,
+        definition=definition_arn(definition.name, definition.revision),
+        kind="array" if is_array else document["type"],
+        request=request,
+        node_properties=properties,
+        run=run,
+        attempts_allowed=int(retry.get("attempts", 1)),
+        evaluate_on_exit=retry.get("evaluateOnExit") or [],
+        timeout=timeout.get("attemptDurationSeconds"),
+        share=request.get("shareIdentifier"),
+        priority=request.get("schedulingPriorityOverride", document.get("schedulingPriority", 0)),
+        parameters=parameters,
+        tags=request.get("tags") or {},
+    )
+
+
+def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:
+    """What the job runs, as node properties, with the overrides that fit its type."""
+    for key in ("ecsPropertiesOverride", "eksPropertiesOverride", "consumableResourcePropertiesOverride"):
+        if request.get(key):
+            raise ClientError(f"{key} is not supported; use containerOverrides or nodeOverrides")
+    if document["type"] == "multinode":
+        if request.get("containerOverrides"):
+            raise ClientError("containerOverrides is not for a multi-node parallel job; use nodeOverrides")
+        if request.get("arrayProperties"):
+            raise ClientError("arrayProperties is not for a multi-node parallel job; submit the jobs one by one")
+        return rules.override_nodes(document["nodeProperties"], request.get("nodeOverrides") or {})
+    if request.get("nodeOverrides"):
+        raise ClientError("nodeOverrides is for multi-node parallel jobs; use containerOverrides")
+    properties = rules.single_node(document["containerProperties"])
+    properties["nodeRangeProperties"][0]["container"] = dict(properties["nodeRangeProperties"][0]["container"])
+    rules.override_container(properties["nodeRangeProperties"][0]["container"], request.get("containerOverrides") or {})
+    return properties
+
+
+def _check_run(context: Context, run: str, is_array: bool) -> None:
+    if not NAME.fullmatch(run):
+        raise ClientError(f"MUSTER_RUN {run[:100]!r}: a run is named with letters, digits, '.', '_' and '-'")
+    over = [Status.SUCCEEDED, Status.FAILED]
+    holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(over)).limit(1)).first()
+    if holder:
+        raise ClientError(
+            f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
+        )
+
+
+def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> None:
+    """The children of an array: jobs of their own, by index."""
+    size = request["arrayProperties"].get("size", 0)
+    if size not in _ARRAY_SIZES:
+        raise ClientError(f"arrayProperties size is {size}; it must be 2 to 10000")
+    if gang_needs(parent.node_properties).setting("MUSTER_RUN"):
+        raise ClientError("MUSTER_RUN is for one job; the children of an array have runs of their own")
+    parent.array_size = size
+    shared = (
+        *("name", "queue", "definition", "node_properties", "attempts_allowed", "evaluate_on_exit"),
+        *("timeout", "share", "priority", "parameters", "tags", "array_size"),
+    )
+    values = {key: getattr(parent, key) for key in shared}
+    waits = _dependencies(context, request, size)
+    for index in range(size):
+        child = Job(
+            id=f"{parent.id}:{index}",
+            kind="container",
+            request={},
+            run=f"{parent.run}-{index}",
+            parent=parent.id,
+            array_index=index,
+            **values,
+        )
+        for each in waits:
+            on = each.on_id
+            if each.kind == "N_TO_N":
+                on = f"{on}:{index}"
+            elif each.kind == "SEQUENTIAL":
+                if index == 0:
+                    continue
+                on = f"{parent.id}:{index - 1}"
+            child.dependencies.append(Dependency(on_id=on, kind=each.kind))
+        context.session.add(child)
+    parent.dependencies.extend(each for each in waits if each.kind != "SEQUENTIAL")
+
+
+def _dependencies(context: Context, request: Mapping[str, Any], size: int | None) -> Sequence[Dependency]:
+    """``dependsOn``, checked; ``size`` of the array that waits, None for another job."""
+    wanted = request.get("dependsOn") or []
+    if len(wanted) > _MOST_DEPENDENCIES:
+        raise ClientError(f"dependsOn has {len(wanted)} entries; at most {_MOST_DEPENDENCIES}")
+    found: dict[str, Dependency] = {}
+    for entry in wanted:
+        kind, reference = entry.get("type"), entry.get("jobId")
+        if kind not in (None, "N_TO_N", "SEQUENTIAL"):
+            raise ClientError(f"dependsOn type is {kind[:50]!r}; it is N_TO_N or SEQUENTIAL")
+        if kind is not None and size is None:
+            raise ClientError(f"dependsOn type {kind} is for array jobs")
+        if kind == "SEQUENTIAL" and not reference:
+            found[""] = Dependency(on_id="", kind=kind)
+            continue
+        if not reference:
+            raise ClientError("dependsOn: an entry needs a jobId")
+        on_id, node = split_reference(reference)
+        job = context.session.get(Job, on_id)
+        if job is None or node is not None:
+            raise ClientError(f"dependsOn: Job {reference[:200]} does not exist")
+        if kind == "N_TO_N" and job.array_size != size:
+            raise ClientError(f"dependsOn N_TO_N: {reference[:200]} is not an array of the same size ({size})")
+        found[on_id] = Dependency(on_id=on_id, kind=kind if kind == "N_TO_N" else None)
+    return list(found.values())

@@ -1,0 +1,98 @@
+"""``muster keys``: who may call the server."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.client import DEFAULT_URL
+from orchestrator.home import local_url, muster_home
+from orchestrator.keys import Key, KeyStore
+
+NameArgument = Annotated[str, typer.Argument(help="The key's name: who or what uses it.")]
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(
+        no_args_is_help=True,
+        help="Access keys of this home directory's server, for AWS clients (as a key pair) and for muster (as MUSTER_TOKEN).",
+    )
+    group.command(epilog="Example:  muster keys create alice --queue robots")(create)
+    group.command("list", epilog="Example:  muster keys list --json | jq '.[].name'")(list_keys)
+    group.command(epilog="Example:  muster keys delete alice")(delete)
+    app.add_typer(group, name="keys")
+
+
+def create(
+    name: NameArgument,
+    queue: Annotated[
+        list[str] | None, typer.Option(help="A job queue that the key may use; repeatable. All queues by default.")
+    ] = None,
+    read_only: Annotated[bool, typer.Option("--read-only", help="The key may look but change nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Create a key and show it, this once. From now on the server lets in only who has a key or MUSTER_TOKEN."""
+    key = KeyStore(muster_home()).create(name, tuple(queue or ()), read_only)
+    if as_json:
+        typer.echo(json.dumps({**_describe(key), "secretAccessKey": key.secret}))
+        return
+    url = local_url() or DEFAULT_URL
+    typer.echo(
+        f"""created key {key.name} ({_may(key)}); its secret is shown only this once
+
+AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
+  aws configure set aws_access_key_id {key.access_key_id} --profile {key.name}
+  aws configure set aws_secret_access_key {key.secret} --profile {key.name}
+  aws configure set region us-east-1 --profile {key.name}
+  aws configure set endpoint_url {url} --profile {key.name}
+
+muster, and 'Authorization: Bearer …' elsewhere:
+  export MUSTER_TOKEN={key.access_key_id}:{key.secret}
+
+The server of {muster_home()} demands a key from now on; it needs no restart."""
+    )
+
+
+def list_keys(as_json: JsonOption = False) -> None:
+    """List the keys, without their secrets."""
+    keys = KeyStore(muster_home()).load().values()
+    if as_json:
+        typer.echo(json.dumps([_describe(key) for key in keys], indent=1))
+        return
+    if not keys:
+        typer.echo("no keys yet; create one with: muster keys create NAME")
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("NAME", "ACCESS KEY ID", "MAY", "CREATED"):
+        table.add_column(column, no_wrap=column != "MAY")
+    for key in keys:
+        created = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(key.created_at / 1000))
+        table.add_row(key.name, key.access_key_id, _may(key), created)
+    Console(soft_wrap=True).print(table)
+
+
+def delete(name: NameArgument) -> None:
+    """Delete a key: a running server refuses it from its next request on."""
+    KeyStore(muster_home()).delete(name)
+    typer.echo(f"deleted key {name}")
+
+
+def _may(key: Key) -> str:
+    queues = "all queues" if key.queues is None else f"queues {', '.join(key.queues)}"
+    return f"{queues}, {'read only' if key.read_only else 'read and write'}"
+
+
+def _describe(key: Key) -> dict[str, Any]:
+    return {
+        "name": key.name,
+        "accessKeyId": key.access_key_id,
+        "queues": None if key.queues is None else list(key.queues),
+        "readOnly": key.read_only,
+        "createdAt": key.created_at,
+    }

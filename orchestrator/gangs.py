@@ -1,0 +1,286 @@
+"""Attempts: launching a job's gang, watching it, judging its end, closing the attempt.
+
+Everything that must survive a crash is in the database before it is done: an attempt is recorded before its gang is launched,
+its ending before the gang is stopped. A controller that starts on the database of a dead one goes on from there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.accounting import add_usage, charge, resource_seconds
+from orchestrator.admission import DEFAULT_DECAY, placements_of
+from orchestrator.bus import Bus
+from orchestrator.definition import GangNeeds, gang_needs
+from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus
+from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.retry import retries
+from orchestrator.scheduling import Start
+from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
+from shared_store import __version__
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
+from shared_store.layout import Run, Store, StoreError
+from shared_store.outcomes import read_outcome
+
+GRACE = 30.0
+"""Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
+_FAILED_GRACE = 5.0
+"""The same for a gang whose collectives are broken: there is nothing left to save."""
+LOST = 20.0
+"""Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
+_FINISHING = 10.0
+"""Seconds that children of a native job get to end by themselves after the main node is done."""
+_SHORTEST_REQUEUE = 10_000
+"""An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+
+
+class Gangs:
+    """Drives attempts on one engine; ``changed`` is called (from any thread) when one of them should be looked at."""
+
+    def __init__(self, engine: Engine, store: Store, bus: Bus, changed: Callable[[], None]) -> None:
+        self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
+        self._stops: dict[tuple[str, int], Future[None]] = {}
+        self._finished: dict[tuple[str, int], float] = {}
+        self._stoppers = ThreadPoolExecutor(max_workers=16, thread_name_prefix="stop")
+
+    def close(self) -> None:
+        """Leave running gangs alone; the next controller finds them."""
+        self._stoppers.shutdown(wait=False, cancel_futures=True)
+
+    def begin(self, session: Session, job: Job, start: Start) -> None:
+        """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
+        run = self.store.run(job.run)
+        try:
+            # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
+            known = [attempt.epoch for attempt in session.scalars(select(Attempt).join(Job).where(Job.run == job.run))]
+            epoch = max([read_epoch(run), *known]) + 1
+            if job.first_epoch is not None and run.description() is None:
+                raise StoreError("it was deleted from the store while the job ran")
+            self._describe(run, job)
+            raise_epoch(run, epoch)
+        except OSError as error:  # a volume that is full or away may come back
+            job.status_reason = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
+            return
+        except (StoreError, StaleEpoch, ValueError) as error:
+            job.move(Status.FAILED, f"store {self.store.path}: can't prepare run {job.run}: {error}")
+            return
+        if job.first_epoch is None:
+            job.first_epoch = epoch
+        nodes = [
+            {"index": i, "host": p.host, "gpus": list(p.gpus), "cpus": p.cpus, "memory": p.memory}
+            for i, p in enumerate(start.placements)
+        ]
+        number = len(job.attempts) + 1
+        attempt = Attempt(job_id=job.id, number=number, epoch=epoch, pool=start.pool, nodes=nodes, created_at=now())
+        job.attempts.append(attempt)
+        job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
+        session.commit()
+        self._launch(session, job, attempt)
+
+    def _describe(self, run: Run, job: Job) -> None:
+        needs = gang_needs(job.node_properties)
+        run.create(
+            {
+                "run": run.name,
+                "job": job.id,
+                "created": now(),
+                "version": __version__,
+                "spec": needs.spec,
+                "name": job.name,
+            }
+        )
+
+    def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
+        needs = gang_needs(job.node_properties)
+        try:
+            attempt.handle = self.engine.launch(self.engine.plan(self._gang(job, attempt, needs)))
+        except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
+            self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
+        session.commit()
+
+    def _gang(self, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+        nodes = needs.nodes[: len(attempt.nodes)]
+        return Gang(
+            job=job.id,
+            attempt=attempt.number,
+            epoch=attempt.epoch,
+            job_epoch=job.first_epoch or attempt.epoch,
+            run=job.run,
+            store=str(self.store.path),
+            queue=job.queue,
+            pool=attempt.pool or "local",
+            main=needs.main,
+            commands=[node.command for node in nodes],
+            environments=[node.environment for node in nodes],
+            placements=placements_of(attempt),
+            grace=GRACE,
+            directory=needs.setting("MUSTER_DIRECTORY") or None,
+            stall_timeout=float(stall) if (stall := needs.setting("MUSTER_STALL_TIMEOUT")) else None,
+            is_gang=job.kind == "multinode",
+            array=None if job.array_index is None else (job.array_index, job.array_size or 0),
+            bus=self.bus.endpoint,
+            bus_token=self.bus.token,
+        )
+
+    def advance(self, session: Session, job: Job, attempt: Attempt) -> None:
+        """One look at an open attempt: what the engine and the store say of it, and what follows."""
+        if attempt.handle is None:
+            self._launch(session, job, attempt)
+            return
+        status = self.engine.observe(attempt.handle)
+        ends = self._ends(job, attempt, status)
+        main = gang_needs(job.node_properties).main
+        if job.status == Status.STARTING and (status[main].running or ends[main]):
+            job.started_at = attempt.started_at = now()
+            job.move(Status.RUNNING, f"attempt {attempt.number} runs on {_size(job, len(status))}")
+        if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
+            attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
+            session.commit()
+        if attempt.ending is not None and not self._finishing(job, attempt, status) and self._stopped(job, attempt):
+            ends = self._ends(job, attempt, self.engine.observe(attempt.handle))
+            self._close(
+                session,
+                job,
+                attempt,
+                Verdict(Ending(attempt.ending), attempt.status_reason or "", attempt.exit_code),
+                ends,
+            )
+
+    def _finishing(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
+        """Whether the children of a native job whose main node is done are still given time to end by themselves.
+
+        On AWS the main node's end cuts them off; a rank that prints its last line or closes a file deserves better.
+        """
+        if attempt.ending != Ending.SUCCEEDED or not gang_needs(job.node_properties).is_native:
+            return False
+        since = self._finished.setdefault((job.id, attempt.number), time.monotonic())
+        return any(node.running for node in status) and time.monotonic() - since < _FINISHING
+
+    def _verdict(self, job: Job, attempt: Attempt, ends: list[NodeEnd | None], main: int) -> Verdict | None:
+        needs = gang_needs(job.node_properties)
+        if needs.is_native:
+            verdict = judge(needs.on_child_failure, main, ends)
+        else:
+            verdict = judge_as_aws(main, ends, attempt.nodes[main]["host"])
+        if verdict:
+            return verdict
+        if job.stop_reason is not None:
+            return Verdict(Ending.STOPPED, job.stop_reason)
+        for index, end in enumerate(ends):
+            silence = self.bus.silence(job.id, attempt.number, index, bool(attempt.nodes[index].get("met")))
+            if end is None and silence is not None and silence > LOST:
+                reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
+                return Verdict(Ending.FAILED, reason)
+        if job.timeout and attempt.started_at and now() - attempt.started_at > job.timeout * 1000:
+            return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
+        return None
+
+    def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
+        """How each node ended: by the outcome in the store, else by what the engine saw; noted in the attempt's record."""
+        run = self.store.run(job.run)
+        ends: list[NodeEnd | None] = []
+        records = []
+        for record, node in zip(attempt.nodes, status, strict=True):
+            end = None
+            if not node.running:
+                outcome = read_outcome(run, job.id, attempt.number, record["index"])
+                if outcome:
+                    message = outcome.error.message if outcome.error else None
+                    end = NodeEnd(
+                        outcome.exit_code,
+                        outcome.reason,
+                        outcome.error.time if outcome.error else outcome.ended,
+                        message,
+                    )
+                else:
+                    code = 137 if node.exit_code in (None, 0) else node.exit_code
+                    detail = node.detail or "the supervisor died without an outcome"
+                    end = NodeEnd(code or 137, detail, now() / 1000, lost=not node.detail)
+            ends.append(end)
+            seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
+            if self.bus.met(job.id, attempt.number, record["index"]):
+                seen["met"] = True  # the next controller must miss it, too, if it does not come back
+            records.append({**record, "address": node.address, **seen})
+        if records != attempt.nodes:
+            attempt.nodes = records
+        return ends
+
+    def _stopped(self, job: Job, attempt: Attempt) -> bool:
+        """Stop the gang in the background; True once no process of it is left."""
+        key = (job.id, attempt.number)
+        if key not in self._stops:
+            grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
+            assert attempt.handle is not None
+            self._stops[key] = self._stoppers.submit(self.engine.stop, attempt.handle, grace)
+            self._stops[key].add_done_callback(lambda _: self.changed())
+        if not self._stops[key].done():
+            return False
+        self._finished.pop(key, None)
+        self.bus.forget(*key)
+        self._stops.pop(key).result()
+        return True
+
+    def _close(
+        self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
+    ) -> None:
+        """The gang is gone: close its attempt and decide what becomes of the job."""
+        ended, ending = now(), verdict.ending
+        attempt.ending, attempt.status_reason, attempt.exit_code = ending, verdict.reason, verdict.exit_code
+        attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended
+        left = ending == Ending.REQUEUE and ended - attempt.started_at >= _SHORTEST_REQUEUE
+        attempt.spent = not (left or ending == Ending.PREEMPTED)
+        charge(attempt, self.store.run(job.run))
+        self._charge_share(session, job, attempt)
+        spent = sum(1 for each in job.attempts if each.spent)
+        tries_left = spent < job.attempts_allowed
+        number, progress = attempt.number, self._progress(job)
+        if job.stop_reason is not None and ending not in (Ending.SUCCEEDED, Ending.FATAL, Ending.TIMEOUT):
+            job.move(Status.FAILED, f"{job.stop_reason}{progress}" if _is_native(job) else job.stop_reason)
+        elif ending == Ending.SUCCEEDED:
+            job.move(Status.SUCCEEDED, verdict.reason)
+        elif ending == Ending.PREEMPTED:
+            job.move(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
+        elif ending == Ending.REQUEUE and (not attempt.spent or tries_left):
+            job.move(Status.RUNNABLE, f"attempt {number} left on request{progress}; starting again")
+        elif ending == Ending.FAILED and tries_left and self._retries(job, verdict, ends):
+            job.move(Status.RUNNABLE, f"attempt {number} failed ({verdict.reason}){progress}; trying again")
+        else:
+            of = f" (attempt {spent} of {job.attempts_allowed})" if ending == Ending.FAILED and _is_native(job) else ""
+            job.move(Status.FAILED, f"{verdict.reason}{of}")
+
+    @staticmethod
+    def _retries(job: Job, verdict: Verdict, ends: Sequence[NodeEnd | None]) -> bool:
+        main = int(job.node_properties["mainNode"])
+        head = ends[main] if main < len(ends) else None
+        return retries(job.evaluate_on_exit, verdict.exit_code, head.reason if head else "", verdict.reason)
+
+    @staticmethod
+    def _charge_share(session: Session, job: Job, attempt: Attempt) -> None:
+        queue = session.get(JobQueue, job.queue)
+        policy = session.get(SchedulingPolicy, queue.policy) if queue and queue.policy else None
+        if policy is not None:
+            decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
+            add_usage(session, job.queue, job.share or "", resource_seconds(attempt, now()), decay)
+
+    def _progress(self, job: Job) -> str:
+        checkpoints = list_checkpoints(self.store.run(job.run))
+        return f"; last checkpoint: iteration {checkpoints[-1].iteration}" if checkpoints else ""
+
+
+def _is_native(job: Job) -> bool:
+    return gang_needs(job.node_properties).is_native
+
+
+def _size(job: Job, nodes: int) -> str:
+    """How many nodes an attempt has, and of how many, where there was no room for all."""
+    most = int(job.node_properties["numNodes"])
+    if nodes < most:
+        return f"{nodes} of {most} nodes: there is no room for more"
+    return f"{nodes} node{'s' if nodes != 1 else ''}"

@@ -1,0 +1,104 @@
+"""The controller's memory of the jobs that are not over: who waits for room, whose gang runs, who is to be looked at.
+
+It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Sequence
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.definition import gang_needs
+from orchestrator.jobs import Status
+from orchestrator.scheduling import Shape, Waiting
+from orchestrator.tables import Dependency, Job
+
+_LOADED_AT_ONCE = 1000
+
+
+class Roster:
+    """Jobs by what the controller has to do with them. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: dict[str, Waiting] = {}
+        self._active: dict[str, None] = {}
+        self._due: dict[str, None] = {}
+        self._ended: dict[str, None] = {}
+        self._shapes: dict[Shape, Shape] = {}
+        self.version = 0
+        """Grows whenever something changes that a scheduling pass depends on."""
+
+    def load(self, session: Session) -> None:
+        """Read all jobs that are not over. Whoever depends on a job that ended meanwhile is looked at too."""
+        over = [Status.SUCCEEDED, Status.FAILED]
+        query = select(Job).where(Job.status.not_in(over)).order_by(Job.created_at, Job.id)
+        for jobs in session.scalars(query).partitions(_LOADED_AT_ONCE):
+            self.note(jobs)
+            session.expunge_all()
+
+    def note(self, jobs: Iterable[Job]) -> None:
+        """These jobs are in the database as they are here."""
+        with self._lock:
+            for job in jobs:
+                self._note(job)
+
+    def _note(self, job: Job) -> None:
+        before = (job.id in self._waiting, job.id in self._active)
+        for group in (self._waiting, self._active, self._due):
+            group.pop(job.id, None)
+        if job.is_over:
+            self._ended[job.id] = None
+            if job.parent is not None:
+                self._due[job.parent] = None
+        elif job.status in (Status.STARTING, Status.RUNNING):
+            self._active[job.id] = None
+        elif job.status == Status.RUNNABLE and job.stop_reason is None:
+            self._waiting[job.id] = self._entry(job)
+        else:
+            self._due[job.id] = None
+        if before != (job.id in self._waiting, job.id in self._active):
+            self.version += 1
+
+    def take_due(self) -> Sequence[str]:
+        """The jobs to be looked at once, oldest note first; each is handed out once."""
+        with self._lock:
+            due, self._due = list(self._due), {}
+        return due
+
+    def look_again(self, jobs: Iterable[str]) -> None:
+        """Hand these out at the next :meth:`take_due`."""
+        with self._lock:
+            self._due.update(dict.fromkeys(jobs))
+
+    def take_dependents(self, session: Session) -> None:
+        """Have those looked at that wait for jobs which ended since the last call."""
+        with self._lock:
+            ended, self._ended = list(self._ended), {}
+        for start in range(0, len(ended), _LOADED_AT_ONCE):
+            some = ended[start : start + _LOADED_AT_ONCE]
+            self.look_again(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
+
+    def active(self) -> Sequence[str]:
+        """The jobs whose gang starts, runs or is being stopped."""
+        with self._lock:
+            return list(self._active)
+
+    def waiting(self) -> Sequence[Waiting]:
+        """The jobs that wait for room."""
+        with self._lock:
+            return list(self._waiting.values())
+
+    def since(self, job: str) -> int | None:
+        """Since when a job waits for room [ms]; None where it does not."""
+        entry = self._waiting.get(job)
+        return entry.since if entry else None
+
+    def _entry(self, job: Job) -> Waiting:
+        shape = gang_needs(job.node_properties).shape
+        shape = self._shapes.setdefault(shape, shape)
+        since = job.runnable_at or job.created_at
+        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, job.created_at, since, job.timeout)

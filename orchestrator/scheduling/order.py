@@ -1,0 +1,76 @@
+"""In which order a queue's jobs are offered what is free."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Mapping
+from operator import attrgetter
+
+from orchestrator.scheduling.snapshot import FairShare, Queue, Waiting
+
+_NOMINAL = 60.0
+"""Seconds of its resources that a job's share is charged when the job is taken, so that shares take turns in one pass."""
+_DEFAULT_DECAY = 600
+"""What AWS takes for ``shareDecaySeconds`` 0 [s]."""
+
+
+def decayed(seconds: float, age_seconds: float, decay_seconds: int) -> float:
+    """What is left of past use.
+
+    Args:
+        seconds: Resource-seconds used.
+        age_seconds: How long ago that was counted [s].
+        decay_seconds: Its half-life, ``shareDecaySeconds``; 0 stands for AWS's default of 600.
+    """
+    return float(seconds * 0.5 ** (max(0.0, age_seconds) / (decay_seconds or _DEFAULT_DECAY)))
+
+
+def weight(policy: FairShare, share: str) -> float:
+    """The share's ``weightFactor``: by its name, else by the longest prefix given, else 1."""
+    if share in policy.weights:
+        return policy.weights[share]
+    prefixes = [key for key in policy.weights if key.endswith("*") and share.startswith(key[:-1])]
+    return policy.weights[max(prefixes, key=len)] if prefixes else 1.0
+
+
+def score(queue: Queue, share: str, usage: Mapping[tuple[str, str], float]) -> float:
+    """Weighted use of a share; the share with the lowest is served first."""
+    return usage.get((queue.name, share), 0.0) * (weight(queue.policy, share) if queue.policy else 1.0)
+
+
+def dispatch_order(
+    queue: Queue | None, jobs: Iterable[Waiting], usage: Mapping[tuple[str, str], float]
+) -> list[Waiting]:
+    """The queue's jobs, the first to be served first."""
+    if queue is None or queue.policy is None:
+        return sorted(jobs, key=attrgetter("created_at", "job"))
+    return _by_shares(queue, queue.policy, jobs, usage)
+
+
+def _by_shares(
+    queue: Queue, policy: FairShare, jobs: Iterable[Waiting], usage: Mapping[tuple[str, str], float]
+) -> list[Waiting]:
+    """One heap of shares, each with its own jobs in order: O(n log n)."""
+    shares: dict[str, list[Waiting]] = {}
+    for job in jobs:
+        shares.setdefault(job.share or "", []).append(job)
+    charges = {share: _NOMINAL * weight(policy, share) for share in shares}
+    heap = [(score(queue, share, usage), share) for share in shares]
+    heapq.heapify(heap)
+    for line in shares.values():
+        line.sort(key=_by_priority, reverse=True)  # served from the end
+    ordered: list[Waiting] = []
+    while heap:
+        used, share = heap[0]
+        line = shares[share]
+        job = line.pop()
+        ordered.append(job)
+        if line:
+            heapq.heapreplace(heap, (used + charges[share] * job.shape.demand, share))
+        else:
+            heapq.heappop(heap)
+    return ordered
+
+
+def _by_priority(job: Waiting) -> tuple[int, int, str]:
+    return -job.priority, job.created_at, job.job

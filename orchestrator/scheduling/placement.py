@@ -1,0 +1,137 @@
+"""Where the nodes of a gang go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from math import inf
+
+from orchestrator.engines.base import Host, Placement
+from orchestrator.scheduling.snapshot import NodeShape, Shape
+
+EPSILON = 1e-9
+"""CPUs are fractions that are added and taken away: this much [CPUs] is rounding."""
+
+
+def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[Placement, ...] | None:
+    """Where each node would go: as many nodes as fit between the gang's minimum and its size; None where too few do.
+
+    Args:
+        shape: The gang.
+        free: What is free of each host, in the order in which hosts are filled.
+        most: No more nodes than this; None for the gang's size.
+    """
+    count = len(shape.nodes) if most is None else min(most, len(shape.nodes))
+    if len(shape.groups) == 1:  # equal nodes: how many fit is a sum, and no other number needs to be tried
+        count = min(count, _seats(shape.nodes[0], free, count))
+        return _pack(shape, count, free, tight=False) if count >= shape.minimum else None
+    for number in range(count, shape.minimum - 1, -1):
+        # first the hosts as they come; where that fails, the tightest ones, so that a small node leaves the only host
+        # that a large one fits on
+        for tight in (False, True):
+            if placements := _pack(shape, number, free, tight):
+                return placements
+    return None
+
+
+def never_fits(shape: Shape, hosts: Sequence[Host]) -> str | None:
+    """Why the gang could not start even if all that the hosts have were free; None where it could."""
+    if place(shape, hosts):
+        return None
+    for node in shape.nodes[: shape.minimum]:
+        if not any(_room(node, host) for host in hosts):
+            best = max(hosts, key=lambda h: (len(h.gpus) >= node.gpus, h.cpus >= node.cpus, h.memory), default=None)
+            has = amounts(best.cpus, len(best.gpus), best.memory) if best else "nothing: there is no host"
+            return f"each node needs {amounts(*node)}; the largest host has {has}"
+    return f"{needs(shape)}; all hosts together have {together(hosts)}"
+
+
+def affordable(shape: Shape, cpus: float = inf, gpus: float = inf) -> int:
+    """How many of the gang's first nodes stay within these amounts in all; 0 where that is less than its minimum."""
+    count = 0
+    for node in shape.nodes:
+        cpus, gpus = cpus - node.cpus, gpus - node.gpus
+        if cpus < -EPSILON or gpus < -EPSILON:
+            break
+        count += 1
+    return count if count >= shape.minimum else 0
+
+
+def less(host: Host, taken: Iterable[Placement]) -> Host:
+    """What is left of the host when these nodes are on it."""
+    cpus, memory, gone = host.cpus, host.memory, set[str]()
+    for placement in taken:
+        cpus, memory = cpus - placement.cpus, memory - placement.memory
+        gone.update(placement.gpus)
+    return Host(host.name, cpus, tuple(gpu for gpu in host.gpus if gpu not in gone) if gone else host.gpus, memory)
+
+
+def needs(shape: Shape) -> str:
+    """What the gang needs at the least, in words."""
+    at_least = "at least " if shape.minimum < len(shape.nodes) else ""
+    nodes = f"{shape.minimum} node{'s' if shape.minimum != 1 else ''}"
+    return f"needs {at_least}{nodes} with {amounts(*shape.least)} in all"
+
+
+def together(hosts: Sequence[Host]) -> str:
+    """What the hosts have in all, in words."""
+    return amounts(
+        max(0, sum(host.cpus for host in hosts)),
+        sum(len(host.gpus) for host in hosts),
+        max(0, sum(host.memory for host in hosts)),
+    )
+
+
+def amounts(cpus: float, gpus: int, memory: int) -> str:
+    """``memory`` [MiB]."""
+    size = f"{memory / 1024:.3g} GiB" if memory >= 1024 else f"{memory} MiB"
+    return f"{count_of(cpus, 'CPU')}, {count_of(gpus, 'GPU')}, {size}"
+
+
+def count_of(number: float, what: str) -> str:
+    """``1 CPU``, ``2.5 CPUs``, ``96000 CPUs``."""
+    text = f"{round(number, 2):.2f}".rstrip("0").rstrip(".")
+    return f"{text} {what}{'s' if text != '1' else ''}"
+
+
+def _room(node: NodeShape, host: Host) -> int:
+    """How many such nodes fit on what is free of the host."""
+    if host.cpus + EPSILON < node.cpus or len(host.gpus) < node.gpus or host.memory < node.memory:
+        return 0
+    by_cpus = (host.cpus + EPSILON) // node.cpus if node.cpus > 0 else inf
+    by_gpus = len(host.gpus) // node.gpus if node.gpus else inf
+    by_memory = host.memory // node.memory if node.memory > 0 else inf
+    return int(min(by_cpus, by_gpus, by_memory, 1_000_000))  # a node that takes nothing fits any number of times
+
+
+def _seats(node: NodeShape, free: Sequence[Host], enough: int) -> int:
+    """How many such nodes fit on all hosts; counting stops at ``enough``."""
+    seats = 0
+    for host in free:
+        seats += _room(node, host)
+        if seats >= enough:
+            break
+    return seats
+
+
+def _pack(shape: Shape, count: int, free: Sequence[Host], tight: bool) -> tuple[Placement, ...] | None:
+    """Put the first ``count`` nodes on hosts, the most demanding first; None where one finds no place."""
+    left = list(free)
+    placements: dict[int, Placement] = {}
+    for node, indices in shape.groups:
+        waiting = [index for index in indices if index < count]
+        sizes = [(len(host.gpus), host.cpus, host.memory) for host in left] if tight else []
+        for position in sorted(range(len(left)), key=sizes.__getitem__) if tight else range(len(left)):
+            if not waiting:
+                break
+            host = left[position]
+            here, waiting = waiting[: (room := _room(node, host))], waiting[room:]
+            if here:
+                seated = [
+                    Placement(host.name, host.gpus[k * node.gpus : (k + 1) * node.gpus], node.cpus, node.memory)
+                    for k in range(len(here))
+                ]
+                placements.update(zip(here, seated, strict=True))
+                left[position] = less(host, seated)
+        if waiting:
+            return None
+    return tuple(placements[index] for index in range(count))

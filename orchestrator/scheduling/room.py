@@ -1,0 +1,130 @@
+"""What is free, host by host and pool by pool, while a pass starts gangs or imagines that they end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import NamedTuple
+
+from orchestrator.engines.base import Host, Placement
+from orchestrator.scheduling.placement import affordable, less, place
+from orchestrator.scheduling.snapshot import Shape, Snapshot
+
+
+class Seat(NamedTuple):
+    """A place for a whole gang."""
+
+    pool: str
+    placements: tuple[Placement, ...]
+
+
+@dataclass
+class Spare:
+    """What a gang that has reserved leaves to others from the time at which it starts.
+
+    A gang that may run longer than that has to fit into this too; one that ends sooner does not touch it.
+    """
+
+    at: float
+    """When the reserving gang starts [ms]; infinite where nobody knows."""
+    pool: str
+    hosts: dict[str, Host]
+    """The hosts that it reserves on, with what is left of them then. GPUs count by number, not by id."""
+    cpus: float
+    """What others may use of its pool then."""
+
+    def binds(self, end: float) -> bool:
+        """Whether a gang that ends at ``end`` [ms] at the latest has to fit into this."""
+        return end > self.at or self.at == inf
+
+    def take(self, seat: Seat) -> None:
+        for placement in seat.placements:
+            if host := self.hosts.get(placement.host):
+                cpus, memory = host.cpus - placement.cpus, host.memory - placement.memory
+                self.hosts[host.name] = Host(host.name, cpus, host.gpus[len(placement.gpus) :], memory)
+            if seat.pool == self.pool:
+                self.cpus -= placement.cpus
+
+
+class Room:
+    """What is free of the hosts, and what each pool may still use.
+
+    A host may be in several pools. Hosts that running gangs name and that are gone count for nothing.
+    """
+
+    def __init__(
+        self,
+        total: dict[str, Host],
+        members: dict[str, tuple[str, ...]],
+        hosts: dict[str, Host],
+        cpus: dict[str, float],
+    ) -> None:
+        """Args:
+        total: What each host has.
+        members: Hosts of each pool, in the engine's order.
+        hosts: What is free of each.
+        cpus: What each pool may still use, infinite for one without ``max_cpus``.
+        """
+        self.total, self.members, self.hosts, self.cpus = total, members, hosts, cpus
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> Room:
+        """What the running gangs leave."""
+        total = {host.name: host for host in snapshot.hosts}
+        members = {}
+        for name, pool in snapshot.pools.items():
+            allowed = total.keys() if pool.hosts is None else set(pool.hosts)
+            members[name] = tuple(host for host in total if host in allowed)
+        cpus = {name: inf if pool.max_cpus is None else pool.max_cpus for name, pool in snapshot.pools.items()}
+        room = cls(total, members, dict(total), cpus)
+        taken: dict[str, list[Placement]] = {}
+        for gang in snapshot.running:
+            for placement in gang.placements:
+                taken.setdefault(placement.host, []).append(placement)
+                if gang.pool in cpus:
+                    cpus[gang.pool] -= placement.cpus
+        for name in taken.keys() & total.keys():
+            room.hosts[name] = less(total[name], taken[name])
+        return room
+
+    def copy(self) -> Room:
+        return Room(self.total, self.members, dict(self.hosts), dict(self.cpus))
+
+    def take(self, seat: Seat) -> None:
+        for placement in seat.placements:
+            self.hosts[placement.host] = less(self.hosts[placement.host], [placement])
+            self.cpus[seat.pool] -= placement.cpus
+
+    def release(self, pool: str, placements: Iterable[Placement]) -> None:
+        """What the gang held comes free."""
+        for placement in placements:
+            if pool in self.cpus:
+                self.cpus[pool] += placement.cpus
+            if host := self.hosts.get(placement.host):
+                known = self.total[host.name].gpus
+                gpus = host.gpus + tuple(gpu for gpu in placement.gpus if gpu in known)
+                self.hosts[host.name] = Host(
+                    host.name, host.cpus + placement.cpus, gpus, host.memory + placement.memory
+                )
+
+    def totals(self, pool: str) -> list[Host]:
+        """The pool's hosts with all that they have."""
+        return [self.total[name] for name in self.members[pool]]
+
+    def seat(self, shape: Shape, pool: str, bounds: Sequence[Spare] = (), most: int | None = None) -> Seat | None:
+        """A place for the gang in the pool, within what each of the ``bounds`` leaves; of ``most`` nodes, where given."""
+        hosts = [self.hosts[name] for name in self.members[pool]]
+        cpus = self.cpus[pool]
+        for bound in bounds:
+            hosts = [_smaller(host, bound.hosts[host.name]) if host.name in bound.hosts else host for host in hosts]
+            if bound.pool == pool:
+                cpus = min(cpus, bound.cpus)
+        if cpus < inf:
+            most = min(affordable(shape, cpus), len(shape.nodes) if most is None else most)
+        placements = place(shape, hosts, most)
+        return Seat(pool, placements) if placements else None
+
+
+def _smaller(free: Host, spare: Host) -> Host:
+    return Host(free.name, min(free.cpus, spare.cpus), free.gpus[: len(spare.gpus)], min(free.memory, spare.memory))

@@ -1,0 +1,214 @@
+"""The tables of the database: definitions, queues, compute environments, policies, jobs, attempts.
+
+Times are Unix milliseconds, as in the Batch API. A change here needs a migration (``orchestrator/migrations``); a test compares.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, ForeignKey, Index, String
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+
+from orchestrator.jobs import Status, check_transition
+
+
+def now() -> int:
+    """Unix time [ms], the unit of every time in the database and in the Batch API."""
+    return int(time.time() * 1000)
+
+
+class Base(DeclarativeBase):
+    type_annotation_map = {
+        dict[str, Any]: JSON,
+        dict[str, str]: JSON,
+        list[dict[str, Any]]: JSON,
+        list[str]: JSON,
+        int: BigInteger,
+    }
+
+
+class JobDefinition(Base):
+    """A registered job definition; a revision is never changed, only deregistered."""
+
+    __tablename__ = "job_definitions"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    revision: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    document: Mapped[dict[str, Any]]
+    """The request as registered."""
+    status: Mapped[str] = mapped_column(default="ACTIVE")
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class JobQueue(Base):
+    """A job queue."""
+
+    __tablename__ = "job_queues"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    state: Mapped[str] = mapped_column(default="ENABLED")
+    """``ENABLED``; ``DISABLED`` takes no new job and finishes those that it has."""
+    priority: Mapped[int] = mapped_column(default=1)
+    """Greater is served first."""
+    environments: Mapped[list[str]]
+    """Names of its compute environments, in the order in which they are tried."""
+    policy: Mapped[str | None] = mapped_column(default=None)
+    """Name of its scheduling policy; None: first in, first out."""
+    limits: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
+    """``jobStateTimeLimitActions``."""
+    deleting: Mapped[bool] = mapped_column(default=False)
+    """Deleted by a person; gone once its last job is over."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class ComputeEnvironment(Base):
+    """A named pool of the engine's hosts."""
+
+    __tablename__ = "compute_environments"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    state: Mapped[str] = mapped_column(default="ENABLED")
+    document: Mapped[dict[str, Any]]
+    """The request that created it, with later updates applied."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class SchedulingPolicy(Base):
+    """How a queue's capacity is shared."""
+
+    __tablename__ = "scheduling_policies"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    fairshare: Mapped[dict[str, Any]]
+    """``fairsharePolicy`` of the request."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class Job(Base):
+    """A submitted job: a multi-node job, a single-node one, an array of such, or one child of an array."""
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
+        Index("ix_jobs_queue_created", "queue", "created_at", "id"),
+    )
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """A UUID; of an array's child ``<parent>:<index>``."""
+    name: Mapped[str] = mapped_column(index=True)
+    queue: Mapped[str]
+    definition: Mapped[str]
+    """ARN with revision."""
+    kind: Mapped[str] = mapped_column(default="multinode")
+    """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
+    request: Mapped[dict[str, Any]]
+    """SubmitJob as it came; empty for an array's child."""
+    node_properties: Mapped[dict[str, Any]]
+    """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
+    run: Mapped[str] = mapped_column(index=True)
+    status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
+    status_reason: Mapped[str | None] = mapped_column(default=None)
+    created_at: Mapped[int] = mapped_column(default=now, index=True)
+    runnable_at: Mapped[int | None] = mapped_column(default=None)
+    """Since when it waits for room."""
+    started_at: Mapped[int | None] = mapped_column(default=None)
+    stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
+    attempts_allowed: Mapped[int] = mapped_column(default=1)
+    evaluate_on_exit: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
+    timeout: Mapped[int | None] = mapped_column(default=None)
+    """Seconds of each attempt."""
+    stop_reason: Mapped[str | None] = mapped_column(default=None)
+    """Set when somebody asked the job to end."""
+    cancelled: Mapped[bool] = mapped_column(default=False)
+    """Ended by CancelJob, or by the queue; else, with a stop reason, by TerminateJob."""
+    first_epoch: Mapped[int | None] = mapped_column(default=None)
+    share: Mapped[str | None] = mapped_column(default=None)
+    priority: Mapped[int] = mapped_column(default=0)
+    """Within its share; greater is served first."""
+    parameters: Mapped[dict[str, str]] = mapped_column(default=dict)
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    parent: Mapped[str | None] = mapped_column(default=None, index=True)
+    array_index: Mapped[int | None] = mapped_column(default=None)
+    array_size: Mapped[int | None] = mapped_column(default=None)
+    """Of the array that it is, or belongs to."""
+    idempotency_key: Mapped[str | None] = mapped_column(default=None, unique=True)
+    attempts: Mapped[list[Attempt]] = relationship(
+        back_populates="job", order_by="Attempt.number", cascade="all, delete-orphan"
+    )
+    dependencies: Mapped[list[Dependency]] = relationship(
+        foreign_keys="Dependency.job_id", order_by="Dependency.on_id", cascade="all, delete-orphan"
+    )
+
+    @property
+    def open_attempt(self) -> Attempt | None:
+        """The attempt whose gang exists or may exist."""
+        return next((attempt for attempt in self.attempts if attempt.stopped_at is None), None)
+
+    @property
+    def is_over(self) -> bool:
+        return Status(self.status).is_terminal
+
+    def move(self, status: Status, reason: str | None = None) -> None:
+        """Change the state; the reason stands until it is replaced. Raises ValueError for an illegal transition."""
+        check_transition(Status(self.status), status)
+        self.status = status
+        if status == Status.RUNNABLE:
+            self.runnable_at = now()
+        if status.is_terminal:
+            self.stopped_at = now()
+        if reason is not None:
+            self.status_reason = reason[:1024]
+
+
+class Dependency(Base):
+    """One job waits for the success of another."""
+
+    __tablename__ = "dependencies"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    on_id: Mapped[str] = mapped_column(String, primary_key=True, index=True)
+    """Id of the job that is waited for; kept when that job is forgotten."""
+    kind: Mapped[str | None] = mapped_column(default=None)
+    """``N_TO_N`` or ``SEQUENTIAL`` as it was asked for; None: plain."""
+
+
+class Attempt(Base):
+    """One launch of a job's gang."""
+
+    __tablename__ = "attempts"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    epoch: Mapped[int]
+    pool: Mapped[str | None] = mapped_column(default=None)
+    """Name of the compute environment."""
+    handle: Mapped[str | None] = mapped_column(default=None)
+    """The engine's name for the gang; None until it was launched."""
+    ending: Mapped[str | None] = mapped_column(default=None)
+    """An :class:`orchestrator.jobs.Ending`, from the moment that the end was decided."""
+    spent: Mapped[bool] = mapped_column(default=True)
+    """Whether it counts against the job's attempts."""
+    created_at: Mapped[int] = mapped_column(default=now)
+    started_at: Mapped[int | None] = mapped_column(default=None)
+    stopped_at: Mapped[int | None] = mapped_column(default=None)
+    status_reason: Mapped[str | None] = mapped_column(default=None)
+    exit_code: Mapped[int | None] = mapped_column(default=None)
+    gpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    """GPUs held, times the seconds that they were held; with ``cpu_seconds`` filled in when the attempt is closed."""
+    cpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    wasted_gpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    """Those since the last checkpoint, for an attempt that did not end well: their work was lost."""
+    wasted_cpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    nodes: Mapped[list[dict[str, Any]]]
+    """By index: index, host, gpus, and, as they become known, address, exitCode, reason, error, and whether the bus met it."""
+    job: Mapped[Job] = relationship(back_populates="attempts")
+
+
+class ShareUsage(Base):
+    """What a share has used of a queue, decayed to ``as_of``."""
+
+    __tablename__ = "share_usage"
+    queue: Mapped[str] = mapped_column(primary_key=True)
+    share: Mapped[str] = mapped_column(primary_key=True)
+    seconds: Mapped[float]
+    """GPU-seconds; CPU-seconds of jobs without GPUs."""
+    as_of: Mapped[int]

@@ -1,0 +1,430 @@
+"""Who starts, where, and whose turn it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import pytest
+
+from orchestrator.definition import GangNeeds, NodeNeeds
+from orchestrator.engines.base import Host, Placement
+from orchestrator.scheduling import (
+    Decisions,
+    FairShare,
+    NodeShape,
+    Pool,
+    Queue,
+    Running,
+    Shape,
+    Snapshot,
+    Start,
+    TimeLimit,
+    Waiting,
+    decayed,
+    decide,
+)
+
+NOW = 1_800_000_000_000
+"""2027-01-15 08:00:00 UTC [ms]."""
+
+
+def host(name: str = "a", cpus: float = 4, gpus: int = 0, memory: int = 8192) -> Host:
+    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), memory)
+
+
+def node(cpus: float = 1, gpus: int = 0, memory: int = 100) -> NodeShape:
+    return NodeShape(cpus, gpus, memory)
+
+
+def gang(*nodes: NodeShape, minimum: int | None = None) -> Shape:
+    return Shape(nodes, len(nodes) if minimum is None else minimum, 0)
+
+
+def job(
+    name: str,
+    shape: Shape | None = None,
+    *,
+    queue: str = "default",
+    priority: int = 0,
+    share: str | None = None,
+    age: int = 0,
+    runnable: int = 0,
+    timeout: int | None = None,
+) -> Waiting:
+    """A job of one node with one CPU, where nothing else is said; ``age`` and ``runnable`` in seconds."""
+    created, since = NOW - 1000 * age, NOW - 1000 * runnable
+    return Waiting(f"{name}-0123456789", name, queue, shape or gang(node()), priority, share, created, since, timeout)
+
+
+def line(*jobs: Waiting) -> list[Waiting]:
+    """The jobs as if created one after the other."""
+    return [
+        Waiting(j.job, j.name, j.queue, j.shape, j.priority, j.share, NOW - 1000 + i, j.since, j.timeout)
+        for i, j in enumerate(jobs)
+    ]
+
+
+def running(
+    name: str,
+    *placements: Placement,
+    queue: str = "default",
+    share: str | None = None,
+    priority: int = 0,
+    pool: str = "all",
+    for_seconds: int = 100,
+    timeout: int | None = None,
+    preemptible: bool = False,
+    ending: bool = False,
+) -> Running:
+    started = NOW - 1000 * for_seconds
+    return Running(
+        f"{name}-0123456789", name, queue, share, priority, pool, placements, started, timeout, preemptible, ending
+    )
+
+
+def on(name: str, cpus: float = 0, gpus: Iterable[int] = (), memory: int = 0) -> Placement:
+    return Placement(name, tuple(f"{name}{i}" for i in gpus), cpus, memory)
+
+
+def queue(
+    name: str = "default",
+    priority: int = 1,
+    pools: tuple[str, ...] = ("all",),
+    policy: FairShare | None = None,
+    limits: tuple[TimeLimit, ...] = (),
+) -> Queue:
+    return Queue(name, priority, pools, policy, limits)
+
+
+def pool(
+    name: str = "all", hosts: tuple[str, ...] | None = None, enabled: bool = True, max_cpus: float | None = None
+) -> Pool:
+    return Pool(name, enabled, hosts, max_cpus)
+
+
+def snapshot(
+    hosts: Sequence[Host],
+    waiting: Sequence[Waiting],
+    held: Sequence[Running] = (),
+    queues: Sequence[Queue] = (),
+    pools: Sequence[Pool] = (),
+    usage: Mapping[tuple[str, str], float] | None = None,
+) -> Snapshot:
+    return Snapshot(
+        now=NOW,
+        hosts=hosts,
+        pools={each.name: each for each in pools or [pool()]},
+        queues={each.name: each for each in queues or [queue()]},
+        waiting=waiting,
+        running=held,
+        usage=usage or {},
+    )
+
+
+def names(jobs: Iterable[str]) -> str:
+    return " ".join(each.removesuffix("-0123456789") for each in jobs)
+
+
+def started(decisions: Decisions) -> str:
+    """Each started job with its hosts, in the order in which they were decided."""
+    return " ".join(
+        f"{names([start.job])}:{'+'.join(placement.host for placement in start.placements)}"
+        for start in decisions.starts
+    )
+
+
+def reason(decisions: Decisions, name: str) -> str:
+    return decisions.board.reason(f"{name}-0123456789")
+
+
+FAIR = FairShare(600, 0, {})
+
+
+# -- gangs ------------------------------------------------------------------------------------------------------------
+
+
+def test_where_nothing_waits_nothing_is_decided() -> None:
+    decisions = decide(snapshot([host()], []))
+    assert (decisions.starts, decisions.preempts, decisions.cancels) == ((), (), ())
+    assert list(decisions.board.order("default")) == []
+
+
+def test_a_gang_that_fits_starts_with_what_it_asked_for() -> None:
+    waiting = [job("ant", gang(node(0.5, 1, 1024), node(1, 2, 512)))]
+    assert decide(snapshot([host(gpus=3)], waiting)).starts == (
+        Start("ant-0123456789", "all", (Placement("a", ("a2",), 0.5, 1024), Placement("a", ("a0", "a1"), 1, 512))),
+    )
+
+
+def test_no_gpu_is_given_twice() -> None:
+    held = [running("other", on("a", 1, [0, 2]))]
+    [start] = decide(snapshot([host(gpus=4)], [job("ant", gang(node(1, 1), node(1, 1)))], held)).starts
+    assert [placement.gpus for placement in start.placements] == [("a1",), ("a3",)]
+
+
+def test_a_gang_starts_whole_or_not_at_all() -> None:
+    held = [running("cart", on("a", 5, memory=10))]
+    decisions = decide(snapshot([host(cpus=8)], [job("ant", gang(*[node()] * 4))], held))
+    assert decisions.starts == ()
+    assert reason(decisions, "ant") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 4 nodes with 4 CPUs, 0 GPUs, 400 MiB in all; "
+        "3 CPUs, 0 GPUs, 7.99 GiB free until job cart (cart-012) ends"
+    )
+
+
+def test_a_gang_may_span_hosts() -> None:
+    assert started(decide(snapshot([host("a"), host("b", 2)], [job("ant", gang(*[node(2)] * 3))]))) == "ant:a+a+b"
+
+
+def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
+    waiting = [job("ant", gang(*[node()] * 4, minimum=2))]
+    assert started(decide(snapshot([host(cpus=8)], waiting))) == "ant:a+a+a+a"
+    assert started(decide(snapshot([host(cpus=8)], waiting, [running("x", on("a", 5))]))) == "ant:a+a+a"
+    decisions = decide(snapshot([host(cpus=8)], waiting, [running("x", on("a", 7))]))
+    assert reason(decisions, "ant") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs at least 2 nodes with 2 CPUs, 0 GPUs, 200 MiB in all; "
+        "1 CPU, 0 GPUs, 8 GiB free until job x (x-012345) ends"
+    )
+
+
+def test_what_a_vanished_host_held_counts_for_nothing() -> None:
+    held = [running("lost", on("gone", 4)), running("cart", on("a", 1))]
+    assert started(decide(snapshot([host()], [job("ant", gang(node(3)))], held))) == "ant:a"
+
+
+def test_the_shape_of_a_job_is_read_from_its_definition_once() -> None:
+    needs = GangNeeds(0, (NodeNeeds(("x",), {}, 2, 1, 512), NodeNeeds(("y",), {"A": "b"}, 2, 1, 512)), 1)
+    assert needs.shape == Shape((NodeShape(2, 1, 512), NodeShape(2, 1, 512)), 1, 0)
+    assert needs.shape is needs.shape
+    assert hash(needs.shape) == hash(Shape((NodeShape(2, 1, 512), NodeShape(2, 1, 512)), 1, 0))
+
+
+# -- order ------------------------------------------------------------------------------------------------------------
+
+
+def test_first_in_first_out_whatever_the_priority_and_the_order_of_the_snapshot() -> None:
+    waiting = [job("young", age=1, priority=9), job("old", age=3), job("tie-b", age=2), job("tie-a", age=2)]
+    decisions = decide(snapshot([host()], waiting))
+    assert started(decisions) == "old:a tie-a:a tie-b:a young:a"
+    full = decide(snapshot([host()], waiting, [running("x", on("a", 4))]))
+    assert names(full.board.order("default")) == "old tie-a tie-b young"
+
+
+def test_queues_come_by_priority_then_by_name() -> None:
+    queues = [queue("low", 1), queue("high-b", 5), queue("high-a", 5)]
+    waiting = [job("l", queue="low", age=9), job("b", queue="high-b", age=5), job("a", queue="high-a")]
+    assert started(decide(snapshot([host()], waiting, queues=queues))) == "a:a b:a l:a"
+
+
+def test_the_share_with_the_least_weighted_use_is_served_first() -> None:
+    policy = FairShare(600, 0, {"heavy": 0.1, "team*": 2.0, "team-x*": 3.0})
+    waiting = [job(share, share=share) for share in ("heavy", "team-a", "team-xy", "other")]
+    usage = {("default", s): u for s, u in {"heavy": 5000, "team-a": 240, "team-xy": 170, "other": 490}.items()}
+    usage["elsewhere", "heavy"] = 1e9
+    # weighted: heavy 500, team-a 480, team-xy 510 (the longer prefix), other 490
+    decisions = decide(snapshot([host()], waiting, queues=[queue(policy=policy)], usage=usage))
+    assert started(decisions) == "team-a:a other:a heavy:a team-xy:a"
+
+
+def test_shares_take_turns_as_their_weights_say() -> None:
+    policy = FairShare(600, 0, {"a": 0.5})
+    waiting = [job(f"{share}{i}", share=share, age=9 - i) for share in "ab" for i in range(4)]
+    decisions = decide(snapshot([host(cpus=8)], waiting, queues=[queue(policy=policy)]))
+    # a CPU of a is charged 30, one of b 60: a0 (a 30) b0 (b 60) a1 (60) a2 (90) b1 (120) a3; then only b is left
+    assert started(decisions) == "a0:a b0:a a1:a a2:a b1:a a3:a b2:a b3:a"
+
+
+def test_gpus_count_where_a_gang_has_any_else_cpus() -> None:
+    waiting = [
+        job("a0", gang(node(1, 2), node(1, 2)), share="a", age=9),  # charges 240
+        job("a1", gang(node(1)), share="a", age=8),
+        job("b0", gang(node(3)), share="b", age=9),  # 180
+        job("b1", gang(node(1)), share="b", age=8),  # 60
+        job("b2", gang(node(1)), share="b", age=7),
+    ]
+    # a 240, then b: 180, b: 240, a tie that a's name wins
+    decisions = decide(snapshot([host(cpus=16, gpus=4)], waiting, queues=[queue(policy=FAIR)]))
+    assert started(decisions) == "a0:a+a b0:a b1:a a1:a b2:a"
+
+
+def test_in_a_share_priority_comes_before_age() -> None:
+    waiting = [
+        job("young", share="s", priority=5),
+        job("old", share="s", priority=5, age=5),
+        job("eldest", share="s", age=9),
+        job("first", share="s", priority=9999),
+    ]
+    decisions = decide(snapshot([host()], waiting, queues=[queue(policy=FAIR)]))
+    assert started(decisions) == "first:a old:a young:a eldest:a"
+
+
+def test_jobs_without_a_share_have_one_of_their_own() -> None:
+    waiting = [job("named", share="s"), job("none")]
+    usage = {("default", ""): 50.0, ("default", "s"): 10.0}
+    assert started(decide(snapshot([host()], waiting, queues=[queue(policy=FAIR)], usage=usage))) == "named:a none:a"
+
+
+@pytest.mark.parametrize(
+    ("age", "decay", "left"), [(0, 100, 800.0), (100, 100, 400.0), (300, 100, 100.0), (600, 0, 400.0), (-5, 100, 800.0)]
+)
+def test_use_halves_with_every_half_life(age: float, decay: int, left: float) -> None:
+    assert decayed(800.0, age, decay) == left
+
+
+# -- pools ------------------------------------------------------------------------------------------------------------
+
+
+def test_pools_are_tried_in_the_queues_order() -> None:
+    pools = [pool("p", ("a",)), pool("q", ("b",)), pool("r", ("c",), enabled=False)]
+    queues = [queue(pools=("r", "q", "p"))]
+    hosts = [host("a", 2), host("b", 1), host("c", 8)]
+    decisions = decide(snapshot(hosts, line(job("x"), job("y"), job("z")), queues=queues, pools=pools))
+    assert started(decisions) == "x:b y:a z:a"
+    assert [start.pool for start in decisions.starts] == ["q", "p", "p"]
+
+
+def test_a_gang_stays_in_one_pool() -> None:
+    pools = [pool("p", ("a",)), pool("q", ("b",))]
+    decisions = decide(
+        snapshot(
+            [host("a", 2), host("b", 2)],
+            [job("wide", gang(*[node()] * 3))],
+            queues=[queue(pools=("p", "q"))],
+            pools=pools,
+        )
+    )
+    assert decisions.starts == ()
+    assert reason(decisions, "wide") == (
+        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - "
+        "compute environment p: needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; "
+        "all hosts together have 2 CPUs, 0 GPUs, 8 GiB; "
+        "compute environment q: needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; "
+        "all hosts together have 2 CPUs, 0 GPUs, 8 GiB"
+    )
+
+
+def test_a_pool_uses_no_more_cpus_than_it_may() -> None:
+    held = [running("cart", on("a", 2)), running("other", on("b", 1), pool="rest")]
+    pools = [pool(max_cpus=5), pool("rest")]
+    waiting = line(job("x", gang(node(2))), job("y", gang(node(2))))
+    decisions = decide(snapshot([host("a", 8), host("b", 8)], waiting, held, pools=pools))
+    assert started(decisions) == "x:a"
+    assert reason(decisions, "y") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 2 CPUs, 0 GPUs, 100 MiB in all; "
+        "compute environment all may use 1 CPU more at this time until job cart (cart-012) ends"
+    )
+
+
+def test_an_elastic_gang_shrinks_to_what_the_pool_may_use() -> None:
+    waiting = [job("ant", gang(*[node(2)] * 4, minimum=1))]
+    assert started(decide(snapshot([host(cpus=16)], waiting, pools=[pool(max_cpus=5)]))) == "ant:a+a"
+
+
+def test_pools_that_share_a_host_do_not_give_it_out_twice() -> None:
+    pools = [pool("p", ("a",)), pool("q", ("a", "b"))]
+    queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
+    waiting = [job("x", gang(node(3)), queue="one"), job("y", gang(node(3)), queue="two")]
+    assert started(decide(snapshot([host("a"), host("b")], waiting, queues=queues, pools=pools))) == "x:a y:b"
+
+
+# -- jobs that can never start ----------------------------------------------------------------------------------------
+
+
+def test_a_job_that_can_never_start_says_so_and_holds_up_nobody() -> None:
+    waiting = line(job("huge", gang(node(64, 2))), job("small"))
+    decisions = decide(snapshot([host(cpus=4, gpus=1), host("b", 2)], waiting))
+    assert started(decisions) == "small:a"
+    assert reason(decisions, "huge") == (
+        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 64 CPUs, 2 GPUs, 100 MiB; "
+        "the largest host has 4 CPUs, 1 GPU, 8 GiB"
+    )
+
+
+def test_a_gang_too_large_for_all_hosts_together_says_so_even_behind_one_that_waits() -> None:
+    waiting = line(job("first", gang(node(4))), job("wide", gang(*[node()] * 9)))
+    decisions = decide(snapshot([host(cpus=4), host("b", 3)], waiting, [running("cart", on("a", 1))]))
+    assert reason(decisions, "wide") == (
+        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - needs 9 nodes with 9 CPUs, 0 GPUs, 900 MiB in all; "
+        "all hosts together have 7 CPUs, 0 GPUs, 16 GiB"
+    )
+
+
+def test_without_any_host_the_job_says_so() -> None:
+    assert reason(decide(snapshot([], [job("ant")])), "ant") == (
+        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 1 CPU, 0 GPUs, 100 MiB; "
+        "the largest host has nothing: there is no host"
+    )
+
+
+def test_a_job_with_more_cpus_than_any_pool_may_use_says_so_and_holds_up_nobody() -> None:
+    waiting = line(job("big", gang(node(2), node(2))), job("small"))
+    queues, pools = [queue(pools=("p", "q"))], [pool("p", max_cpus=3), pool("q", max_cpus=2.5)]
+    decisions = decide(snapshot([host()], waiting, queues=queues, pools=pools))
+    assert started(decisions) == "small:a"
+    assert reason(decisions, "big") == (
+        "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - needs 2 nodes with 4 CPUs, 0 GPUs, 200 MiB in all; "
+        "compute environment p has at most 3 CPUs; compute environment q has at most 2.5 CPUs"
+    )
+
+
+def test_a_job_that_each_pool_refuses_for_another_reason_hears_both() -> None:
+    queues, pools = [queue(pools=("p", "q"))], [pool("p", max_cpus=1), pool("q", ("b",))]
+    decisions = decide(snapshot([host(), host("b", 1)], [job("x", gang(node(2)))], queues=queues, pools=pools))
+    assert reason(decisions, "x") == (
+        "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - needs 1 node with 2 CPUs, 0 GPUs, 100 MiB in all; "
+        "compute environment p has at most 1 CPU; "
+        "compute environment q: each node needs 2 CPUs, 0 GPUs, 100 MiB; the largest host has 1 CPU, 0 GPUs, 8 GiB"
+    )
+
+
+@pytest.mark.parametrize(
+    ("queues", "pools"),
+    [
+        ([queue()], [pool(enabled=False)]),
+        ([queue(pools=())], [pool()]),
+        ([queue(pools=("deleted",))], [pool()]),
+        ([queue("another")], [pool()]),
+    ],
+)
+def test_a_queue_without_a_usable_pool_says_so(queues: list[Queue], pools: list[Pool]) -> None:
+    decisions = decide(snapshot([host()], [job("x")], queues=queues, pools=pools))
+    assert decisions.starts == ()
+    assert reason(decisions, "x") == "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
+    assert names(decisions.board.order("default")) == "x"
+
+
+# -- the board --------------------------------------------------------------------------------------------------------
+
+
+def test_the_board_lists_who_still_waits_and_numbers_them() -> None:
+    waiting = line(job("runs"), job("large", gang(node(4))), *[job(f"j{i:02}", gang(node(4))) for i in range(2, 25)])
+    decisions = decide(snapshot([host()], waiting, [running("cart", on("a", 1), timeout=160)]))
+    assert started(decisions) == "runs:a"
+    assert names(decisions.board.order("default")[:3]) == "large j02 j03"
+    assert len(decisions.board.order("default")) == 24
+    assert list(decisions.board.order("nowhere")) == []
+    behind = "behind job large (large-01), which needs 1 node with 4 CPUs, 0 GPUs, 100 MiB in all"
+    assert reason(decisions, "j02") == f"2nd in queue default, {behind}"
+    ordinals = [reason(decisions, f"j{i:02}").partition(" ")[0] for i in (3, 4, 10, 11, 12, 13, 20, 21, 22, 23)]
+    assert ordinals == ["3rd", "4th", "10th", "11th", "12th", "13th", "20th", "21st", "22nd", "23rd"]
+    with pytest.raises(KeyError):
+        reason(decisions, "runs")
+
+
+def test_room_that_is_enough_in_all_but_in_pieces_says_so() -> None:
+    held = [running("x", on("a", 2)), running("y", on("b", 2)), running("z", on("b", 1)), running("v", on("a", 1))]
+    decisions = decide(snapshot([host("a"), host("b")], [job("ant", gang(node(2)))], held))
+    assert reason(decisions, "ant") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 2 CPUs, 0 GPUs, 100 MiB in all; "
+        "2 CPUs, 0 GPUs, 16 GiB free, but not in one piece for each node until job v (v-012345) ends"
+    )
+
+
+def test_a_reason_names_the_last_gangs_that_it_waits_for_and_counts_the_others() -> None:
+    held = [running(f"r{i}", on("a", 1), timeout=100 + i) for i in range(1, 6)]
+    decisions = decide(snapshot([host(cpus=5)], [job("ant", gang(node(5)))], held))
+    assert reason(decisions, "ant") == (
+        "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 1 node with 5 CPUs, 0 GPUs, 100 MiB in all; "
+        "0 CPUs, 0 GPUs, 8 GiB free until jobs r3 (r3-01234), r4 (r4-01234), r5 (r5-01234) and 2 more end, "
+        "at the latest at 2027-01-15 08:00:05 UTC"
+    )
