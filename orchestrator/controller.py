@@ -97,14 +97,15 @@ class Controller:
             self.roster.take_dependents(session)
         due = self.roster.take_due()
         for start in range(0, len(due), _SETTLED_AT_ONCE):
-            some = due[start : start + _SETTLED_AT_ONCE]
-            self._guarded(",".join(some[:1]), some, lambda session, job: self._settle(session, job))
+            self._guarded(due[start : start + _SETTLED_AT_ONCE], self._settle)
         for job_id in self.roster.active():
-            self._guarded(job_id, [job_id], self._advance)
+            self._guarded([job_id], self._advance)
         self._admit()
         self._sweep()
 
-    def _guarded(self, name: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
+    def _guarded(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
+        """Look at these jobs in one commit; where that fails, at each by itself."""
+        name = ids[0]
         try:
             with self.database.session() as session:
                 for job_id in ids:
@@ -117,6 +118,10 @@ class Controller:
             self._troubles[name] = str(error)
             self.roster.look_again(ids)
         except Exception:
+            if len(ids) > 1:
+                for job_id in ids:
+                    self._guarded([job_id], body)
+                return
             log.exception("job %s: reconciling failed; trying again", name)
             self.roster.look_again(ids)
 

@@ -89,6 +89,8 @@ class NodeNeeds:
     gpus: int
     memory: int
     """MiB."""
+    container: Mapping[str, Any]
+    """``containerProperties`` as they are."""
 
 
 @dataclass(frozen=True)
@@ -170,4 +172,5 @@ def _node_needs(container: Mapping[str, Any]) -> NodeNeeds:
         cpus=float(resources.get("VCPU", container.get("vcpus", 1))),
         gpus=int(resources.get("GPU", 0)),
         memory=int(resources.get("MEMORY", container.get("memory", 4))),
+        container=container,
     )

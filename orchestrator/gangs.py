@@ -124,6 +124,7 @@ class Gangs:
             directory=needs.setting("MUSTER_DIRECTORY") or None,
             stall_timeout=float(stall) if (stall := needs.setting("MUSTER_STALL_TIMEOUT")) else None,
             is_gang=job.kind == "multinode",
+            containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,
             bus_token=self.bus.token,

@@ -28,14 +28,14 @@ class Status(StrEnum):
 
 TRANSITIONS = {
     Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
-    Status.PENDING: {Status.RUNNABLE, Status.FAILED},
+    Status.PENDING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
     Status.RUNNABLE: {Status.STARTING, Status.FAILED},
     Status.STARTING: {Status.RUNNING, Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
     Status.RUNNING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
     Status.SUCCEEDED: set[Status](),
     Status.FAILED: set[Status](),
 }
-"""A failed attempt with tries left goes back to RUNNABLE, as on AWS."""
+"""A failed attempt with tries left goes back to RUNNABLE, as on AWS; an array is PENDING until its children have ended."""
 
 
 def check_transition(before: Status, after: Status) -> None:

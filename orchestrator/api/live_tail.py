@@ -79,8 +79,8 @@ class LiveTail:
             self._over.add(name)
         merged = list(heapq.merge(*fresh))
         if len(merged) > _MOST_PENDING:
-            count = len(merged)
-            return [merged[index * count // _MOST_PENDING] for index in range(_MOST_PENDING)], True
+            count = len(merged)  # the newest is always among them
+            return [merged[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
         return merged, behind
 
     def _refresh(self) -> list[str]:

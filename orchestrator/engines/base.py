@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
 
@@ -64,6 +64,8 @@ class Gang:
     """False for a single-node job, whose environment has no node variables on AWS."""
     array: tuple[int, int] | None = None
     """Index and size, of an array's child."""
+    containers: Sequence[Mapping[str, Any]] = ()
+    """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
     bus: str | None = None
     bus_token: str | None = None
     """Where the controller's bus router listens, and its password."""

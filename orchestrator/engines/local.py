@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodePlan, NodeStatus, Plan
+from orchestrator.engines.mounts import mounts_of, with_mounts
 from shared_store.contract import NodeContract
 from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
@@ -126,12 +127,14 @@ class LocalEngine:
             **node.environment,
             **contract,
         }
+        # -P: a folder called "worker" in the job's directory must not hide ours
+        command = [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command]
+        container = plan.gang.containers[index] if plan.gang.containers else {}
         said = self._said(plan.gang.name, index)
         said.parent.mkdir(parents=True, exist_ok=True)
         with open(said, "ab") as stderr:
             process = subprocess.Popen(
-                # -P: a folder called "worker" in the job's directory must not hide ours
-                [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command],
+                with_mounts(command, mounts_of(container, plan.gang.store)),
                 env=env,
                 cwd=plan.gang.directory,
                 stdin=subprocess.DEVNULL,
@@ -205,7 +208,8 @@ def _supervisors(gang: str) -> list[tuple[int, int, int]]:
         except OSError:
             continue
         index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0")  # a single-node job has none
-        if b"worker.supervisor" in command[:4] and index.isdigit():
+        # its ranks have a RANK; a supervisor that is still being given its mounts has another command in front
+        if b"worker.supervisor" in command and b"RANK" not in environment and index.isdigit():
             found.append((pid, int(index), int(environment[b"MASTER_PORT"])))
     return found
 

@@ -121,7 +121,7 @@ def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
         "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY - needs 2 nodes with 2 CPUs, 0 GPUs, 32 MiB in all; 1 CPU, 0 GPUs, "
     )
     assert reason == wanted + reason.split("GPUs, ")[2]
-    assert reason.endswith(f"free until big ({first[:8]}) ends")
+    assert reason.endswith(f"free until job big ({first[:8]}) ends")
     impossible = server.gang("pass", nodes=1, cpus="64", name="impossible")
     reason = wait_for(
         lambda: (r := server.detail(impossible)["statusReason"]) and "MISCONF" in r and r, what="a reason"

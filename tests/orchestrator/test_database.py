@@ -1,0 +1,247 @@
+"""The database on SQLite and on a real PostgreSQL server: migrations, locks, history, and a controller on top."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from sqlalchemy import create_engine, select, text
+
+from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_now
+from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
+from orchestrator.roster import Roster
+from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, now
+from shared_store.layout import Store
+from tests.conftest import Serving
+from tests.orchestrator import postgres
+
+NODES = {
+    "numNodes": 2,
+    "mainNode": 0,
+    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
+}
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[postgres.Server]:
+    binaries = postgres.programs()
+    if binaries is None:
+        pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
+    with postgres.serving(binaries) as running:
+        yield running
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'muster.db'}"
+    return str(request.getfixturevalue("server").new_database())
+
+
+@pytest.fixture
+def opened(url: str) -> Iterator[Callable[[], Database]]:
+    """Opens the database; all are closed at the end."""
+    databases: list[Database] = []
+
+    def make() -> Database:
+        databases.append(Database(url))
+        return databases[-1]
+
+    yield make
+    for database in databases:
+        database.close()
+
+
+def job(job_id: str, **facts: Any) -> Job:
+    values = {"id": job_id, "name": job_id, "queue": "default", "definition": "arn:d:1", "request": {}, "run": job_id}
+    return Job(**{**values, "node_properties": NODES, **facts})
+
+
+def test_the_migrations_make_what_the_tables_say(opened: Callable[[], Database]) -> None:
+    database = opened()
+    with database.engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+    with database.session() as session:
+        assert [queue.name for queue in session.scalars(select(JobQueue))] == ["default"]
+        assert [each.name for each in session.scalars(select(ComputeEnvironment))] == ["local"]
+
+
+def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_jobs(
+    url: str, opened: Callable[[], Database]
+) -> None:
+    _migrate(url, "upgrade", "0001")
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
+        connection.execute(
+            text(
+                "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
+                "attempts_allowed) VALUES ('j1', 'old', 'default', 'arn', '{}', '{}', 'r', 'FAILED', 5, 3)"
+            )
+        )
+    engine.dispose()
+    with opened().session() as session:
+        old = session.get_one(Job, "j1")
+        assert (old.name, old.attempts_allowed, old.kind, old.tags, old.evaluate_on_exit) == (
+            "old",
+            3,
+            "multinode",
+            {},
+            [],
+        )
+
+
+def test_down_and_up_again_leaves_the_tables_as_they_are(url: str, opened: Callable[[], Database]) -> None:
+    opened().close()
+    _migrate(url, "downgrade", "0001")
+    _migrate(url, "downgrade", "base")
+    with opened().engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+
+
+def test_a_database_of_a_newer_version_is_refused_in_one_line(url: str, opened: Callable[[], Database]) -> None:
+    first = opened()
+    with first.engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    first.close()
+    with pytest.raises(DatabaseError, match=r"written by a newer Muster \(schema 9999\); install that version"):
+        Database(url)
+
+
+def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseError, match=r"^database sqlite:///.*nowhere/x.db: .*unable to open database file$"):
+        Database(f"sqlite:///{tmp_path}/nowhere/x.db")
+    with pytest.raises(DatabaseError) as refused:
+        Database("postgresql+psycopg://muster:secret@127.0.0.1:1/none")
+    assert "secret" not in str(refused.value) and "127.0.0.1:1/none" in str(refused.value)
+    with pytest.raises(DatabaseError, match="nosuch"):
+        Database("nosuch://x/y")
+
+
+def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(server: postgres.Server) -> None:
+    url = server.new_database()
+    script = f"from orchestrator.database import Database; d = Database({url!r}); print('up', flush=True); input()"
+    first = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert first.stdout is not None and first.stdout.readline() == b"up\n"
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        Database(url)
+    first.kill()
+    first.wait()
+    Database(url).close()
+
+
+def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:
+    database = opened()
+    told: list[set[str]] = []
+    database.committed = lambda jobs: told.append({each.id for each in jobs})
+    with database.session() as session:
+        session.add_all([job("a"), job("b")])
+    with pytest.raises(RuntimeError), database.session() as session:
+        session.get_one(Job, "a").stop_reason = "never"
+        session.flush()
+        raise RuntimeError
+    with database.session() as session:
+        session.get_one(Job, "b").status_reason = "changed"
+    assert told == [{"a", "b"}, {"b"}]
+
+
+def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
+    database, live = opened(), Roster()
+    database.committed = live.note
+    with database.session() as session:
+        states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+        session.add_all(job(status, status=status) for status in states)
+        session.add(job("ending", status="RUNNABLE", stop_reason="enough"))
+    fresh = Roster()
+    with database.session() as session:
+        fresh.load(session)
+    for roster in (live, fresh):
+        assert [entry.job for entry in roster.waiting()] == ["RUNNABLE"]
+        assert sorted(roster.active()) == ["RUNNING", "STARTING"]
+        assert sorted(roster.take_due()) == ["PENDING", "SUBMITTED", "ending"]
+
+
+def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Database]) -> None:
+    over = {"status": "SUCCEEDED", "stopped_at": 1000}
+    with opened().session() as session:
+        session.add_all([job("old", **over), job("needed", **over), job("waits", status="PENDING")])
+        session.add(job("young", status="SUCCEEDED", stopped_at=now()))
+        session.add(Attempt(job_id="old", number=1, epoch=1, nodes=[]))
+        session.add(Dependency(job_id="waits", on_id="needed"))
+        session.commit()
+        assert forget_before(session, 2000) == 1
+        assert sorted(session.scalars(select(Job.id))) == ["needed", "waits", "young"]
+        assert session.scalars(select(Attempt.job_id)).all() == []
+
+
+def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Database], tmp_path: Path) -> None:
+    run = Store(tmp_path / "store").open().run("r")
+    nodes = [{"gpus": ["0", "1"], "cpus": 4.0}, {"gpus": ["2", "3"], "cpus": 4.0}]
+    failed = Attempt(job_id="a", number=1, epoch=1, nodes=nodes, created_at=10_000, stopped_at=70_000, ending="failed")
+    charge(failed, run)
+    assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
+    assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
+    done = Attempt(job_id="a", number=2, epoch=2, nodes=nodes, created_at=10_000, stopped_at=20_000, ending="succeeded")
+    charge(done, run)
+    assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
+    assert resource_seconds(failed, 0) == 240.0
+
+
+def test_what_a_share_used_halves_with_its_decay_time(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        add_usage(session, "default", "red", 100.0, 60)
+        session.flush()
+        session.execute(text("UPDATE share_usage SET as_of = as_of - 60000"))
+        session.expire_all()
+        add_usage(session, "default", "red", 10.0, 60)
+        found = usage_now(session, {"default": 60}, [])
+        assert found[("default", "red")] == pytest.approx(60.0, rel=0.02)
+        assert usage_now(session, {}, []) == {}
+
+
+def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        session.add_all([job("aaaa1111", name="x"), job("aaaa2222", name="y"), job("aaaa2222:0", parent="aaaa2222")])
+        session.flush()
+        found = {text: find_job(session, text) for text in ("aaaa1111", "y", "aaaa2", "aaaa", "aaa", "aaaa2222:0")}
+    assert {text: each and each.id for text, each in found.items()} == {
+        "aaaa1111": "aaaa1111",
+        "y": "aaaa2222",
+        "aaaa2": "aaaa2222",
+        "aaaa": None,
+        "aaa": None,
+        "aaaa2222:0": "aaaa2222:0",
+    }
+
+
+def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.Server, tmp_path: Path) -> None:
+    url = server.new_database()
+    serving = Serving(tmp_path / "home", "--cpus", "2", "--database", url)
+    try:
+        job = serving.gang("print('hello from', __import__('os').environ['MUSTER_RUN'])", nodes=2, name="on-postgres")
+        assert serving.wait(job)["status"] == "SUCCEEDED"
+        serving.kill()
+        serving.start()
+        detail = serving.detail(job)
+        assert detail["status"] == "SUCCEEDED" and detail["attempts"][0]["cpuSeconds"] > 0
+        assert any("hello from on-postgres-" in line for line in serving.log(job))
+        assert not (serving.home / "muster.db").exists()
+    finally:
+        serving.close()
+
+
+def _migrate(url: str, direction: str, revision: str) -> None:
+    config, engine = Config(), create_engine(url)
+    config.set_main_option("script_location", str(MIGRATIONS))
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        getattr(command, direction)(config, revision)
+    engine.dispose()
