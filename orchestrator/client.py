@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
 from types import TracebackType
@@ -19,6 +20,10 @@ import httpx
 from orchestrator.home import local_url
 
 DEFAULT_URL = "http://127.0.0.1:8080"
+
+
+_SUBMISSIONS = ("/submitjob", "/resume")
+"""Paths of requests that must not be carried out twice."""
 
 
 class ApiError(Exception):
@@ -112,8 +117,15 @@ class Client:
     def _request(
         self, method: str, path: str, body: Any = None, query: dict[str, Any] | None = None, seconds: float = 30
     ) -> Any:
+        headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if path.endswith(_SUBMISSIONS) else {}
         try:
-            answer = self._http.request(method, path, json=body, params=query, timeout=seconds)
+            try:
+                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
+            except (httpx.ReadError, httpx.RemoteProtocolError):
+                if not headers:
+                    raise
+                self.await_return(30)  # the answer was lost; with its key the same request submits nothing twice
+                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
         if answer.is_error:

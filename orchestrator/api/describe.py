@@ -73,7 +73,8 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
         summary["arrayProperties"] = {"size": job.array_size}
         if job.array_index is not None:
             summary["arrayProperties"]["index"] = job.array_index
-    record = main_container(job.attempts[-1].nodes, node or 0) if job.attempts else {}
+    index = int(job.node_properties["mainNode"]) if node is None else node
+    record = main_container(job.attempts[-1].nodes, index) if job.attempts else {}
     if "exitCode" in record:
         summary["container"] = {"exitCode": record["exitCode"], "reason": str(record.get("reason") or "")[:255]}
     if job.share:
@@ -82,7 +83,9 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
 
 
 def node_status(job: Job, node: int) -> str:
-    """A node's own state: by its exit code where it ended, else the job's."""
+    """A node's own state: by its exit code where it ended, else the job's; between two attempts it waits like all others."""
+    if job.status == Status.RUNNABLE:
+        return job.status
     record = main_container(job.attempts[-1].nodes, node) if job.attempts else {}
     if "exitCode" in record:
         return str(Status.SUCCEEDED if record["exitCode"] == 0 else Status.FAILED)

@@ -111,7 +111,14 @@ def resume(
     with controller.writing, controller.database.session() as session:
         context = Context(session, controller, idempotency_key)
         if (earlier := submission.answered(context)) is not None:
-            return {**submission.answer(earlier), "run": run.name, "iteration": 0, "kind": "train"}
+            kind = "train" if (spec_of(session, run) or {}).get("train") else "command"
+            began = _choose(run, checkpoint)
+            return {
+                **submission.answer(earlier),
+                "run": run.name,
+                "iteration": began.iteration if began else 0,
+                "kind": kind,
+            }
         document = spec_of(session, run)
         if document is None:
             raise ClientError(

@@ -9,7 +9,7 @@ import sys
 
 import typer
 
-from orchestrator.cli import jobs, keys, logs, runs, serving, verify
+from orchestrator.cli import jobs, keys, logs, queues, runs, serving, verify
 from orchestrator.client import ApiError, Unreachable
 from orchestrator.home import ServerError
 from orchestrator.spec import SpecError
@@ -30,6 +30,7 @@ jobs.register(app)
 logs.register(app)
 runs.register(app)
 verify.register(app)
+queues.register(app)
 keys.register(app)
 
 

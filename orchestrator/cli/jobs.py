@@ -82,24 +82,14 @@ def submit(
 
 def list_jobs(
     all_: Annotated[bool, typer.Option("--all", "-a", help="All jobs, not the newest 20.")] = False,
+    queue: Annotated[str | None, typer.Option(help="Only of this queue.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List jobs, the newest first."""
-    summaries: list[dict[str, Any]] = []
     with Client.connect() as client:
-        token: str | None = None
-        while True:
-            # a filter, because a listing by status shows one status at a time
-            page = client.batch(
-                "ListJobs",
-                jobQueue="default",
-                filters=[{"name": "AFTER_CREATED_AT", "values": ["0"]}],
-                **({"nextToken": token} if token else {}),
-            )
-            summaries += page["jobSummaryList"]
-            token = page.get("nextToken")
-            if not token or (not all_ and len(summaries) >= 20):
-                break
+        queues = [queue] if queue else client.get("/api/capacity")["queues"]
+        summaries = [summary for name in queues for summary in _list_queue(client, name, all_)]
+    summaries.sort(key=lambda summary: -summary["createdAt"])
     shown = summaries if all_ else summaries[:20]
     if as_json:
         typer.echo(json.dumps(shown, indent=1))
@@ -115,12 +105,41 @@ def list_jobs(
         colour = _COLOURS.get(summary["status"], "white")
         took = _took(summary.get("startedAt"), summary.get("stoppedAt"))
         reason = summary.get("statusReason", "") if summary["status"] != "SUCCEEDED" else ""
-        nodes = str(summary["nodeProperties"]["numNodes"])
+        nodes = _nodes(summary)
         created = _when(summary["createdAt"])
         table.add_row(
             summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took, reason
         )
     Console().print(table)
+
+
+def _list_queue(client: Client, queue: str, all_: bool) -> list[dict[str, Any]]:
+    """The newest 20 jobs of a queue, or all."""
+    summaries: list[dict[str, Any]] = []
+    more: dict[str, str] = {}
+    while True:
+        # a filter, because a listing by status shows one status at a time
+        everything = [{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+        page = client.batch("ListJobs", jobQueue=queue, filters=everything, **more)
+        summaries += page["jobSummaryList"]
+        if not page.get("nextToken") or (not all_ and len(summaries) >= 20):
+            return summaries
+        more = {"nextToken": page["nextToken"]}
+
+
+def _nodes(summary: dict[str, Any]) -> str:
+    if size := summary.get("arrayProperties", {}).get("size"):
+        return f"1 × {size}"
+    return str(summary.get("nodeProperties", {}).get("numNodes", 1))
+
+
+def _used(attempt: dict[str, Any]) -> str:
+    """GPU time of an attempt (CPU time where it has no GPUs), and how much of it was lost."""
+    kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
+    used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
+    if not used:
+        return ""
+    return f", {used:.0f} {kind.upper()}-seconds" + (f" of which {lost:.0f} lost" if lost >= 1 else "")
 
 
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
@@ -138,6 +157,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "why": detail["statusReason"],
         "created": _when(detail["createdAt"]),
         "took": _took(detail["startedAt"], detail["stoppedAt"]),
+        "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"],
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
     }
@@ -155,7 +175,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         reason = f": {attempt['statusReason']}" if attempt["statusReason"] else ""
         took = _took(attempt["startedAt"], attempt["stoppedAt"])
         console.print(
-            f"  attempt {attempt['number']} of {detail['attemptsAllowed']} (epoch {attempt['epoch']}, {took}) {ended}{counted}{reason}",
+            f"  attempt {attempt['number']} of {detail['attemptsAllowed']} (epoch {attempt['epoch']}, {took}{_used(attempt)}) {ended}{counted}{reason}",
             markup=False,
         )
         for node in attempt["nodes"]:

@@ -76,10 +76,12 @@ class Batch:
         return found
 
     def lines(self, job: str) -> list[str]:
-        """What a job or node (``id#N``) printed in its newest attempt, by the stream that DescribeJobs names."""
+        """What a job (its main node) or a node (``id#N``) printed in its newest attempt; nothing before it runs."""
         detail = self.describe(job)
-        container = detail.get("container") or detail["attempts"][-1]["container"]
-        return self.stream(container["logStreamName"])
+        if "nodeProperties" in detail:
+            detail = self.describe(f"{job}#{detail['nodeProperties']['mainNode']}")
+        name = detail["container"].get("logStreamName")
+        return self.stream(name) if name else []
 
     def stream(self, name: str) -> list[str]:
         page = self.logs.get_log_events(logGroupName=GROUP, logStreamName=name, startFromHead=True)

@@ -1,0 +1,80 @@
+"""``muster queues``: the queues, what waits in them and what they hold."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.client import Client
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        epilog="Example:  muster queues     or, one queue's next jobs and why they wait:  muster queues default"
+    )(queues)
+
+
+def queues(
+    name: Annotated[
+        str | None, typer.Argument(help="A queue: show the jobs that start next, and why they wait.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List job queues; of one, the waiting jobs in the order in which they will start.
+
+    Queues are made with AWS's own commands: aws batch create-job-queue --endpoint-url …
+    """
+    with Client.connect() as client:
+        found = client.batch("DescribeJobQueues", **({"jobQueues": [name]} if name else {}))["jobQueues"]
+        if name and not found:
+            client.batch("GetJobQueueSnapshot", jobQueue=name)  # refused with the names that there are
+        for queue in found:
+            queue["snapshot"] = client.batch("GetJobQueueSnapshot", jobQueue=queue["jobQueueName"])
+        front = _front(client, found[0]) if name else []
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    console = Console()
+    console.print(_table(found))
+    if name:
+        console.print(_waiting(front) if front else "no job waits")
+
+
+def _front(client: Client, queue: dict[str, Any]) -> list[dict[str, Any]]:
+    ids = [job["jobArn"].rpartition("/")[2] for job in queue["snapshot"]["frontOfQueue"]["jobs"]]
+    jobs = {job["jobId"]: job for job in client.batch("DescribeJobs", jobs=ids)["jobs"]} if ids else {}
+    return [jobs[job_id] for job_id in ids if job_id in jobs]
+
+
+def _table(queues: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("QUEUE", "STATE", "PRIORITY", "ORDER", "WAITING", "IN USE"):
+        table.add_column(column, no_wrap=True)
+    for queue in queues:
+        snapshot = queue["snapshot"]
+        waiting = len(snapshot["frontOfQueue"]["jobs"])
+        used = snapshot["queueUtilization"]["totalCapacityUsage"]
+        table.add_row(
+            queue["jobQueueName"],
+            queue["state"] if queue["status"] == "VALID" else queue["status"],
+            str(queue["priority"]),
+            "fair share" if "schedulingPolicyArn" in queue else "first in, first out",
+            f"{waiting}{'+' if waiting == 100 else ''}",
+            ", ".join(f"{each['quantity']:g} {each['capacityUnit']}" for each in used if each["quantity"]) or "-",
+        )
+    return table
+
+
+def _waiting(jobs: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in ("NEXT", "JOB", "NAME"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("WHY IT WAITS", overflow="fold")
+    for number, job in enumerate(jobs, 1):
+        table.add_row(str(number), job["jobId"][:8], job["jobName"], job.get("statusReason", ""))
+    return table

@@ -1,0 +1,65 @@
+"""The client against a network that loses answers: a real proxy between it and a real server."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import pytest
+
+from orchestrator.client import Client
+from tests.conftest import Serving
+
+
+class LossyProxy:
+    """Forwards connections to a server; the first answer to a request that holds ``marker`` is thrown away."""
+
+    def __init__(self, url: str, marker: bytes) -> None:
+        parts = urlsplit(url)
+        self._target, self._marker, self.lost = (parts.hostname, parts.port), marker, 0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def close(self) -> None:
+        self._listener.close()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._carry, args=(client,), daemon=True).start()
+
+    def _carry(self, client: socket.socket) -> None:
+        with client, socket.create_connection(self._target) as server:
+            while request := client.recv(1 << 16):
+                server.sendall(request)
+                answer = server.recv(1 << 16)
+                if self._marker in request and not self.lost:
+                    self.lost += 1
+                    return  # the server has done it, and the client will never know
+                client.sendall(answer)
+
+
+@pytest.fixture
+def proxy(shared_server: Serving) -> Iterator[LossyProxy]:
+    proxy = LossyProxy(shared_server.url, b"/v1/submitjob")
+    yield proxy
+    proxy.close()
+
+
+def test_a_submission_whose_answer_was_lost_is_submitted_once(shared_server: Serving, proxy: LossyProxy) -> None:
+    container = {"image": "x", "command": ["true"], "resourceRequirements": [{"type": "VCPU", "value": "0.1"}]}
+    shared_server.client.batch(
+        "RegisterJobDefinition", jobDefinitionName="lossy", type="container", containerProperties=container
+    )
+    with Client(proxy.url) as client:
+        submitted = client.batch("SubmitJob", jobName="lossy-once", jobQueue="default", jobDefinition="lossy")
+    assert proxy.lost == 1
+    there = [{"name": "JOB_NAME", "values": ["lossy-once"]}]
+    found = shared_server.client.batch("ListJobs", jobQueue="default", filters=there)["jobSummaryList"]
+    assert [job["jobId"] for job in found] == [submitted["jobId"]]
