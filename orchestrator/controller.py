@@ -58,7 +58,7 @@ class Controller:
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
         bus.changed = self.wake
-        database.committed = self.roster.note
+        database.committed = self._committed
         self._board: Board | None = None
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
         self._swept = 0.0
@@ -129,10 +129,18 @@ class Controller:
         if attempt := job.open_attempt:
             self.gangs.advance(session, job, attempt)
 
+    def _committed(self, jobs: Sequence[Job]) -> None:
+        """Only what this thread has written is known to be the newest; what a request has changed is read again."""
+        if threading.current_thread() is self._thread:
+            self.roster.note(jobs)
+        else:
+            self.roster.look_again(job.id for job in jobs)
+
     # -- jobs without a gang ------------------------------------------------------------------------------------------
 
     def _settle(self, session: Session, job: Job) -> None:
         """A job that has no gang: ended on request, held back by others, an array by its children, or ready to run."""
+        self.roster.note([job])
         if job.is_over or job.open_attempt is not None:
             return
         if job.kind == "array":

@@ -57,10 +57,7 @@ class Database:
     @contextmanager
     def session(self) -> Iterator[Session]:
         """A session: committed at the end of the block (and wherever the block commits), rolled back on an exception."""
-        with Session(self.engine, expire_on_commit=False) as session:
-            event.listen(session, "after_flush", _note_jobs)
-            event.listen(session, "after_commit", self._tell)
-            event.listen(session, "after_rollback", lambda session: session.info.pop("jobs", None))
+        with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
             yield session
             session.commit()
 
@@ -68,11 +65,6 @@ class Database:
         if self._lock is not None:
             self._lock.close()
         self.engine.dispose()
-
-    def _tell(self, session: Session) -> None:
-        jobs = session.info.pop("jobs", None)
-        if jobs and self.committed:
-            self.committed(list(jobs.values()))
 
     def _take_lock(self) -> Connection:
         """PostgreSQL drops it when the connection ends, however its process ends."""
@@ -107,6 +99,24 @@ def _shown(url: str) -> str:
     return f"{scheme}{sign}{rest.rpartition('@')[2]}"
 
 
+class _Session(Session):
+    """A session that tells its database which jobs a commit has changed."""
+
+
+@event.listens_for(_Session, "after_commit")
+def _tell(session: Session) -> None:
+    jobs = session.info.pop("jobs", None)
+    committed = session.info["database"].committed
+    if jobs and committed:
+        committed(list(jobs.values()))
+
+
+@event.listens_for(_Session, "after_rollback")
+def _forget(session: Session) -> None:
+    session.info.pop("jobs", None)
+
+
+@event.listens_for(_Session, "after_flush")
 def _note_jobs(session: Session, _context: object) -> None:
     jobs = session.info.setdefault("jobs", {})
     for changed in (session.new, session.dirty):

@@ -38,10 +38,11 @@ class Roster:
         query = select(Job).where(Job.status.not_in(over)).order_by(Job.created_at, Job.id)
         for jobs in session.scalars(query).partitions(_LOADED_AT_ONCE):
             self.note(jobs)
+            self.look_again(job.id for job in jobs if job.status == Status.PENDING)
             session.expunge_all()
 
     def note(self, jobs: Iterable[Job]) -> None:
-        """These jobs are in the database as they are here."""
+        """These jobs are in the database as they are here: for the one thread that changes their states."""
         with self._lock:
             for job in jobs:
                 self._note(job)
@@ -58,8 +59,9 @@ class Roster:
             self._active[job.id] = None
         elif job.status == Status.RUNNABLE and job.stop_reason is None:
             self._waiting[job.id] = self._entry(job)
-        else:
+        elif job.stop_reason is not None or job.status == Status.SUBMITTED:
             self._due[job.id] = None
+        # a PENDING job is looked at when one that it waits for, or a child of it, has ended
         if before != (job.id in self._waiting, job.id in self._active):
             self.version += 1
 

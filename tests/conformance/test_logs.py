@@ -48,6 +48,27 @@ def test_the_stream_that_describe_jobs_names_has_both_outputs_and_the_supervisor
     assert described["createdAt"] <= times[0] <= described["stoppedAt"] + 1000
 
 
+def test_every_child_of_an_array_has_a_stream(shared_server: Serving, logs: Any) -> None:
+    batch = client_of(shared_server.url, "batch")
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+    container = {
+        "image": "any",
+        "command": ["sh", "-c", "echo $AWS_BATCH_JOB_ARRAY_INDEX"],
+        "resourceRequirements": needs,
+    }
+    batch.register_job_definition(jobDefinitionName="array", type="container", containerProperties=container)
+    job = batch.submit_job(jobName="arr", jobQueue="default", jobDefinition="array", arrayProperties={"size": 2})[
+        "jobId"
+    ]
+    for child in (0, 1):
+        shared_server.wait(f"{job}:{child}")
+        described = batch.describe_jobs(jobs=[f"{job}:{child}"])["jobs"][0]
+        name = described["container"]["logStreamName"]
+        assert str(child) in messages(logs.get_log_events(logGroupName=GROUP, logStreamName=name))
+    listed = logs.describe_log_streams(logGroupName=GROUP, logStreamNamePrefix=f"arr/{job}")["logStreams"]
+    assert len(listed) == 2 and listed[-1]["logStreamName"] == name
+
+
 def test_at_the_end_the_same_token_comes_back_and_goes_on_when_lines_arrive(
     shared_server: Serving, logs: Any, quiet: str
 ) -> None:
@@ -351,6 +372,9 @@ def test_streams_are_listed_by_name_page_by_page(shared_server: Serving, logs: A
         assert stream["creationTime"] <= stream["firstEventTimestamp"]
         assert stream["arn"] == f"{ARN}:log-stream:{stream['logStreamName']}"
         assert stream["uploadSequenceToken"] and stream["storedBytes"] > 60 * 30
+    for narrower, count in ((f"{prefix}/1/node-1", 1), (prefix[:-3], 3), (f"{prefix}/2", 0), ("tri", 3)):
+        found = logs.describe_log_streams(logGroupName=GROUP, logStreamNamePrefix=narrower)["logStreams"]
+        assert len(found) == count and all(stream in streams for stream in found)
     backwards = logs.describe_log_streams(logGroupIdentifier=ARN, logStreamNamePrefix=prefix, descending=True)
     assert backwards["logStreams"] == streams[::-1] and "nextToken" not in backwards
 

@@ -32,6 +32,7 @@ def gang(store: Store, job: str, epoch: int) -> Gang:
         run="r",
         store=str(store.path),
         queue="default",
+        pool="local",
         main=0,
         commands=[node.command],
         environments=[node.environment],

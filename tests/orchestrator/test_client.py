@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 from collections.abc import Iterator
@@ -36,13 +37,27 @@ class LossyProxy:
 
     def _carry(self, client: socket.socket) -> None:
         with client, socket.create_connection(self._target) as server:
-            while request := client.recv(1 << 16):
+            while request := _message(client):
                 server.sendall(request)
-                answer = server.recv(1 << 16)
+                answer = _message(server)
                 if self._marker in request and not self.lost:
                     self.lost += 1
                     return  # the server has done it, and the client will never know
                 client.sendall(answer)
+
+
+def _message(connection: socket.socket) -> bytes:
+    """One whole HTTP message; empty where the other side has closed."""
+    text = b""
+    while b"\r\n\r\n" not in text:
+        if not (part := connection.recv(1 << 16)):
+            return b""
+        text += part
+    head, _, body = text.partition(b"\r\n\r\n")
+    length = re.search(rb"content-length: (\d+)", head, re.IGNORECASE)
+    while len(body) < (int(length[1]) if length else 0):
+        body += connection.recv(1 << 16)
+    return head + b"\r\n\r\n" + body
 
 
 @pytest.fixture
