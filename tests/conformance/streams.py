@@ -35,11 +35,16 @@ def log_of(server: Serving, job: str, node: int = 0) -> Path:
     return Path(server.detail(job)["attempts"][0]["nodes"][node]["log"])
 
 
-def append(server: Serving, job: str, *texts: str, node: int = 0, seconds: float | None = None) -> None:
-    """Write lines as the node's supervisor would, at Unix time ``seconds`` (now)."""
+def write(path: Path, *texts: str, seconds: float | None = None) -> None:
+    """Add lines as a supervisor would, but in one go, at Unix time ``seconds`` (now)."""
     lines = "".join(format_line(time.time() if seconds is None else seconds, 0, "o", text) for text in texts)
-    with open(log_of(server, job, node), "ab", buffering=0) as file:  # in one go
+    with open(path, "ab", buffering=0) as file:
         file.write(lines.encode())
+
+
+def append(server: Serving, job: str, *texts: str, node: int = 0, seconds: float | None = None) -> None:
+    """Add lines to the log of a node of the first attempt."""
+    write(log_of(server, job, node), *texts, seconds=seconds)
 
 
 def finished(server: Serving, script: str, nodes: int = 1, name: str = "logs") -> str:
