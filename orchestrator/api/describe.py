@@ -28,7 +28,7 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
         "timeout": {"attemptDurationSeconds": job.timeout} if job.timeout else None,
         "parameters": job.parameters,
         "dependsOn": [_dependency(each.on_id, each.kind) for each in job.dependencies],
-        "tags": {**(document.get("tags") or {} if document.get("propagateTags") else {}), **job.tags},
+        "tags": job.tags,
         "propagateTags": bool(job.request.get("propagateTags", document.get("propagateTags", False))),
         "platformCapabilities": document.get("platformCapabilities", ["EC2"]),
         "shareIdentifier": job.share,
@@ -93,8 +93,8 @@ def node_status(job: Job, node: int) -> str:
 
 
 def stream_name(job: Job, attempt: int, node: int) -> str:
-    """Name of the log stream of one node and attempt."""
-    return f"{job.name}/{job.id}/{attempt}/node-{node}"
+    """Name of the log stream of one node and attempt; AWS allows no colon in it, which the ids of array children have."""
+    return f"{job.name}/{job.id.replace(':', '.')}/{attempt}/node-{node}"
 
 
 def _common(job: Job, reason: str | None) -> dict[str, Any]:

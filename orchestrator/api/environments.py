@@ -192,9 +192,13 @@ def _check_shares(shares: Sequence[Mapping[str, Any]]) -> None:
             raise ClientError(f"weightFactor is {each['weightFactor']}; it must be 0.0001 to 999.9999")
     for i, name in enumerate(names):
         for other in names[:i]:
-            short, long = sorted((name, other), key=len)
-            if name == other or (short.endswith("*") and long.startswith(short[:-1])):
+            if _matches(name, other) or _matches(other, name):
                 raise ClientError(f"shareDistribution: {other} and {name} overlap")
+
+
+def _matches(pattern: str, name: str) -> bool:
+    """Whether an entry (a name, or a prefix and ``*``) speaks of what another one does."""
+    return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 
 def _describe(environment: ComputeEnvironment) -> dict[str, Any]:

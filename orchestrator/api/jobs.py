@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import func, select
 
 from orchestrator.api import auth
-from orchestrator.api.arns import split_reference
+from orchestrator.api.arns import definition_arn, split_reference
 from orchestrator.api.context import Context
 from orchestrator.api.describe import array_properties, describe_job, summarize
 from orchestrator.api.errors import ClientError
@@ -17,6 +17,8 @@ from orchestrator.jobs import Status
 from orchestrator.tables import Job
 
 _LONGEST_REASON = 1024
+_BEFORE_NAME = len(definition_arn("", 1)) - 1
+"""Where the name begins in a definition's ARN, from 1."""
 _EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
 
 
@@ -112,15 +114,14 @@ def _conditions(request: Mapping[str, Any]) -> Sequence[Any]:
 
 
 def _by_definition(value: str) -> Any:
-    """A definition's name (any revision), name:revision or ARN; only a name may end in ``*``."""
+    """A definition's name (any revision), name:revision or ARN; only a name may end in ``*``. The case matters."""
     if value.startswith("arn:"):
         return Job.definition == value
-    if value.endswith("*"):
-        return Job.definition.contains(f"job-definition/{value[:-1]}", autoescape=True)
     name, _, revision = value.partition(":")
-    if revision:
-        return Job.definition.endswith(f"job-definition/{name}:{revision}", autoescape=True)
-    return Job.definition.contains(f"job-definition/{name}:", autoescape=True)
+    if revision and not value.endswith("*"):
+        return func.substr(Job.definition, _BEFORE_NAME) == value
+    start = value[:-1] if value.endswith("*") else f"{name}:"
+    return func.substr(Job.definition, _BEFORE_NAME, len(start)) == start  # LIKE would not heed the case in SQLite
 
 
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from shared_store.layout import Store
 
 MOST_STREAMS = 1000
 """A request that names no stream is about this many: those of the newest jobs that it can be about."""
-_NAME = re.compile(r"[^/:*]+/([0-9A-Za-z:-]{1,128})/([1-9][0-9]{0,5})/node-(0|[1-9][0-9]{0,5})")
+_NAME = re.compile(r"[^/:*]+/([0-9A-Za-z.-]{1,128})/([1-9][0-9]{0,5})/node-(0|[1-9][0-9]{0,5})")
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Stream:
 def find_stream(session: Session, store: Store, name: str) -> Stream | None:
     """The stream of that name; None where no such job, attempt or node exists."""
     match = _NAME.fullmatch(name)
-    job = session.get(Job, match[1]) if match else None
-    attempt = session.get(Attempt, (match[1], int(match[2]))) if match and job else None
+    job = session.get(Job, match[1].replace(".", ":")) if match else None
+    attempt = session.get(Attempt, (job.id, int(match[2]))) if match and job else None
     if not job or not attempt:
         return None
     return next((stream for stream in _streams(store, job, attempt) if stream.name == name), None)
@@ -66,7 +66,7 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
     )
     name, slash, rest = prefix.partition("/")
     if slash:
-        query = query.where(Job.name == name, Job.id.startswith(rest.partition("/")[0], autoescape=True))
+        query = query.where(Job.name == name, Job.id.startswith(rest.partition("/")[0].replace(".", ":"), autoescape=True))
     elif prefix:
         query = query.where(Job.name.startswith(prefix, autoescape=True))
     found = [stream for attempt, job in session.execute(query) for stream in _streams(store, job, attempt)]

@@ -37,7 +37,8 @@ SETTLE = 500
 """Milliseconds for which FilterLogEvents keeps back the newest lines of running gangs.
 
 A follower goes on from the newest time that it has seen. A node's line must not turn up after a later one of another node was
-given out, so a line has this long to get from its node's clock into the file that is read here.
+given out, so a line has this long to get from its node's clock into the file that is read here: hosts' clocks must agree to less
+than this, and a shared volume must show what was written within it.
 """
 _MOST_EVENTS = 10_000
 _MOST_BYTES = 1 << 20

@@ -10,7 +10,7 @@ from math import inf
 from orchestrator.engines.base import Placement
 from orchestrator.scheduling.head import Head, Holder, end_of, holder_of, reserve, victims
 from orchestrator.scheduling.lane import NO_ROOM, Lane
-from orchestrator.scheduling.order import dispatch_order
+from orchestrator.scheduling.order import dispatch_order, turn
 from orchestrator.scheduling.quota import quota_of
 from orchestrator.scheduling.reasons import Board, Line
 from orchestrator.scheduling.room import Room, Seat
@@ -109,7 +109,7 @@ class _Pass:
                 gone.add(job.job)
             else:
                 lane.failed[span].add(job.shape)
-                self._hold(lane, job)
+                self._hold(queue, lane, job, ordered)
             first = False
         self.lines[queue.name] = Line([job for job in ordered if job.job not in gone] if gone else ordered, lane)
 
@@ -143,7 +143,7 @@ class _Pass:
                 return True
         return False
 
-    def _hold(self, lane: Lane, job: Waiting) -> None:
+    def _hold(self, queue: Queue, lane: Lane, job: Waiting, ordered: Sequence[Waiting]) -> None:
         """The job does not start: make it the head of the hosts that it could use and that nobody before it waits for."""
         pools = tuple(
             pool
@@ -152,7 +152,8 @@ class _Pass:
         )
         if not pools:
             return
-        for victim in victims(job, pools, self.room, self.snapshot, self.ending):
+        used = turn(queue, ordered, job, self.snapshot.usage)
+        for victim in victims(job, used, pools, self.room, self.snapshot, self.ending):
             self.ending.add(victim.job)
             self.preempts.append(Preempt(victim.job, job.job))
         held = [holder_of(gang, self.now, gang.job in self.ending) for gang in self.snapshot.running]

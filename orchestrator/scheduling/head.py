@@ -94,13 +94,16 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
     return Head(job, pools, hosts, seat, spare, awaits)
 
 
-def victims(job: Waiting, pools: tuple[str, ...], room: Room, snapshot: Snapshot, ending: set[str]) -> list[Running]:
+def victims(
+    job: Waiting, turn: float, pools: tuple[str, ...], room: Room, snapshot: Snapshot, ending: set[str]
+) -> list[Running]:
     """Whom to preempt so that the job can start: none more than needed, and none at all where that would not be enough.
 
     Of those that may be preempted the least important go first: lowest queue priority, lowest job priority, youngest.
 
     Args:
         job: A head.
+        turn: What its share has used when its turn comes (:func:`orchestrator.scheduling.order.turn`).
         pools: Where it would fit if nothing ran.
         room: What is free now; not changed.
         snapshot: The pass.
@@ -112,7 +115,7 @@ def victims(job: Waiting, pools: tuple[str, ...], room: Room, snapshot: Snapshot
     for gang in near:
         if gang.job in ending:
             coming.release(gang.pool, gang.placements)
-    candidates = [gang for gang in near if gang.job not in ending and _may_preempt(job, gang, snapshot)]
+    candidates = [gang for gang in near if gang.job not in ending and _may_preempt(job, turn, gang, snapshot)]
     candidates.sort(key=lambda gang: _importance(gang, snapshot))
     count = _fewest(job.shape, pools, coming, [(gang.pool, gang.placements) for gang in candidates])
     chosen = candidates[:count]
@@ -125,7 +128,7 @@ def victims(job: Waiting, pools: tuple[str, ...], room: Room, snapshot: Snapshot
     return chosen
 
 
-def _may_preempt(job: Waiting, gang: Running, snapshot: Snapshot) -> bool:
+def _may_preempt(job: Waiting, turn: float, gang: Running, snapshot: Snapshot) -> bool:
     """Whether the job is more important than the gang and, once the gang waits again, is served before it.
 
     Without the second condition the gang would take back what it gave up, and so on for ever: in a queue that is first in,
@@ -139,7 +142,7 @@ def _may_preempt(job: Waiting, gang: Running, snapshot: Snapshot) -> bool:
     if mine.policy is None or job.priority <= gang.priority:
         return False
     share, other = job.share or "", gang.share or ""
-    return share == other or (score(mine, share, snapshot.usage), share) < (score(mine, other, snapshot.usage), other)
+    return share == other or (turn, share) < (score(mine, other, snapshot.usage), other)
 
 
 def _importance(gang: Running, snapshot: Snapshot) -> tuple[int, int, float, str]:

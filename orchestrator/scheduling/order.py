@@ -47,6 +47,19 @@ def dispatch_order(
     return _by_shares(queue, queue.policy, jobs, usage)
 
 
+def turn(queue: Queue, ordered: Iterable[Waiting], job: Waiting, usage: Mapping[tuple[str, str], float]) -> float:
+    """What the job's share has used, weighted, when its turn comes: with what the jobs before it in ``ordered`` are charged."""
+    share = job.share or ""
+    used = score(queue, share, usage)
+    charge = _NOMINAL * (weight(queue.policy, share) if queue.policy else 1.0)
+    for each in ordered:
+        if each is job:
+            break
+        if (each.share or "") == share:
+            used += charge * each.shape.demand
+    return used
+
+
 def _by_shares(
     queue: Queue, policy: FairShare, jobs: Iterable[Waiting], usage: Mapping[tuple[str, str], float]
 ) -> list[Waiting]:

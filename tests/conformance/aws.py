@@ -22,6 +22,7 @@ PREFIX = "arn:aws:batch:us-east-1:000000000000:"
 OVER = ("SUCCEEDED", "FAILED")
 EXITED = "Essential container in task exited"
 """What AWS says of every attempt whose main container ended by itself (reference §3.6)."""
+NO_ROOM = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
 UNTIL = 'until [ -e "$GATE/{}" ]; do sleep 0.05; done'
 """Shell: wait until the test opens a gate (:func:`gate`), so that nothing depends on how fast anything is."""
 
@@ -86,6 +87,11 @@ class Batch:
     def stream(self, name: str) -> list[str]:
         page = self.logs.get_log_events(logGroupName=GROUP, logStreamName=name, startFromHead=True)
         return [event["message"] for event in page["events"] if not event["message"].startswith("node ")]
+
+    def front(self, queue: str) -> list[str]:
+        """Ids of the waiting jobs in the order in which GetJobQueueSnapshot shows them."""
+        snapshot = self.api.get_job_queue_snapshot(jobQueue=queue)
+        return [each["jobArn"].rpartition("/")[2] for each in snapshot["frontOfQueue"]["jobs"]]
 
     def pool(self, name: str, cpus: int = 8, state: str = "ENABLED") -> str:
         """A compute environment of at most ``cpus``; a DISABLED one holds its jobs RUNNABLE for as long as a test likes."""

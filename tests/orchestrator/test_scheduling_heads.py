@@ -395,6 +395,16 @@ def test_across_shares_only_one_that_would_be_served_first_preempts() -> None:
         assert preempted(decide(snapshot([host()], waiting, held, queues, usage=usage))) == expected
 
 
+def test_what_is_charged_for_the_jobs_before_it_counts_when_shares_are_compared() -> None:
+    # the share of the head comes first, but the head itself only after one that never fits, for which 120 are charged
+    held = [running("cart", on("a", 4), share="t", priority=1, preemptible=True)]
+    waiting = [job("huge", gang(node(2, 2)), share="s", priority=9), job("ant", share="s", priority=2)]
+    for its, expected in ((129.0, ""), (131.0, "cart")):
+        usage = {("default", "s"): 10.0, ("default", "t"): its}
+        decisions = decide(snapshot([host()], waiting, held, [queue(policy=FAIR)], usage=usage))
+        assert preempted(decisions) == expected
+
+
 def test_in_a_queue_that_is_first_in_first_out_nobody_is_preempted() -> None:
     held = [running("cart", on("a", 4), preemptible=True)]
     assert decide(snapshot([host()], [job("ant", priority=9)], held)).preempts == ()
