@@ -7,7 +7,6 @@ import random
 import statistics
 import sys
 import time
-from collections.abc import Callable
 
 from orchestrator.engines.base import Host, Placement
 from orchestrator.scheduling import FairShare, NodeShape, Pool, Queue, Running, Shape, Snapshot, Waiting, decide
@@ -71,13 +70,13 @@ def snapshot(count: int, shapes: list[Shape], policy: FairShare | None) -> Snaps
     return Snapshot(NOW, hosts, {"all": Pool("all", True, None, None)}, {"default": queue}, waiting, running, usage)
 
 
-def milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """Median of several calls."""
+def measure(each: Snapshot, repeats: int) -> float:
+    """Median of several passes [ms]."""
     taken = []
     for _ in range(repeats):
         gc.collect()
         begin = time.perf_counter()
-        call()
+        decide(each)
         taken.append(time.perf_counter() - begin)
     return 1000 * statistics.median(taken)
 
@@ -94,8 +93,7 @@ def main() -> None:
     print(f"| jobs waiting | {' | '.join(f'{count:,}' for count in COUNTS)} |")
     print(f"|---|{'---:|' * len(COUNTS)}")
     for name, shapes, policy in cases:
-        snapshots = [snapshot(count, shapes, policy) for count in COUNTS]
-        times = [milliseconds(lambda s=each: decide(s), 15 if len(each.waiting) <= 10_000 else 7) for each in snapshots]  # type: ignore[misc, arg-type]
+        times = [measure(snapshot(count, shapes, policy), 15 if count <= 10_000 else 7) for count in COUNTS]
         print(f"| {name} | {' | '.join(f'{each:.1f}' for each in times)} |")
     board = decide(snapshot(10_000, mixed_shapes(), fair)).board
     order = board.order("default")

@@ -1,14 +1,9 @@
-"""Requests that nobody sane would send: hypothesis strategies over botocore's own service models, and ways to spoil them.
-
-Requests are drawn with placeholders (``<gang>``, ``<array>`` …) for the ids that a server gives out, so that the same examples
-can be drawn for every server.
-"""
+"""Requests that nobody sane would send: hypothesis strategies over botocore's own service models, and ways to spoil them."""
 
 from __future__ import annotations
 
 import copy
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,96 +15,13 @@ from hypothesis import strategies as st
 
 from orchestrator.api import batch, logs
 from orchestrator.api.arns import PREFIX
+from tests.conformance.fuzz_requests import ARRAYS, GOOD, KNOWN, NUMBERS, ODD_TEXTS
 
 TAGS = ("TagResource", "UntagResource", "ListTagsForResource")
 BATCH = tuple(name for name in batch.OPERATIONS if name not in TAGS)
 LOGS = (*logs.OPERATIONS, "StartLiveTail")
 DIGITS = "<digits>"
 """Becomes a number of 5,000 digits, which Python would refuse to write."""
-
-ODD_TEXTS = (
-    *("", " ", "\0", "a\0b", "\n", "\r\n", "\x1b[0m", "\u202e", "é", "Ω" * 64, "😀", "\ud800", "a\udfffb", "\ufeff"),
-    *(
-        "x" * 128,
-        "x" * 129,
-        "x" * 256,
-        "x" * 1025,
-        "x" * 20_000,
-        "../..",
-        "..",
-        "/",
-        "%2F",
-        "%00",
-        "#",
-        "#0",
-        ":",
-        ":0",
-    ),
-    *("*", "a*b", "**", "-x", "_", "null", "true", "NaN", "-1", "0", "1", "1e9", "9" * 30, "9" * 5000, "٣", "0.5"),
-    *("Ref::", "Ref::who", "Ref::nobody", "${x}", "$(x)", "%s%n", "{}", "'", '"', "\\", "';--", "AWS_BATCH_X", "aws:x"),
-    *(
-        "arn:",
-        "arn:aws:batch:::",
-        f"{PREFIX}job/",
-        f"{PREFIX}job-queue/../x",
-        f"{PREFIX}job-definition/fuzz:{'9' * 30}",
-    ),
-    *(
-        "MUSTER_SPEC",
-        "MUSTER_RUN",
-        "MUSTER_MIN_NODES",
-        "W10=",
-        "WyJ4Il0=",
-        "f/1",
-        "b/99999999999999999",
-        f"f{'9' * 56}",
-    ),
-)
-NUMBERS = (
-    *(0, 1, -1, 2, 3, 4, 59, 60, 99, 100, 101, 600, 1001, 9999, 10_001, 86_400, 2**31 - 1, 2**31, 2**53 + 1),
-    *(2**63 - 1, 2**63, -(2**63), -(2**63) - 1, 10**30, 10**400, 0.0, -0.0, 0.5, 1e308, 5e-324),
-    *(math.nan, math.inf, -math.inf),
-)
-# what a member of this name may hold so that it hits something; by the end of the member's name, lower case
-_JOBS = ("<gang>", "<single>", "<array>", "<waiting>", "<gang>#0", "<gang>#1", "<array>:1", f"{PREFIX}job/<gang>#1")
-_QUEUES = ("fuzz", "default", "fair", f"{PREFIX}job-queue/fair", "spare", "made")
-_DEFINITIONS = ("gang", "gang:1", "single", f"{PREFIX}job-definition/gang", f"{PREFIX}job-definition/single:1", "made")
-_POOLS = ("fuzz", "local", f"{PREFIX}compute-environment/fuzz", "spare", "made")
-_STREAMS = ("gang/<gang>/1/node-0", "gang/<gang>/1/node-1", "single/<single>/1/node-0", "gang/", "gang/<gang>/2/node-0")
-_GROUPS = ("/aws/batch/job", f"{logs.GROUP_ARN}", f"{logs.GROUP_ARN}:*", "/aws", "other")
-_TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:999999")
-_KNOWN = {
-    "jobid": _JOBS,
-    "jobs": _JOBS,
-    "jobqueue": _QUEUES,
-    "jobqueues": _QUEUES,
-    "jobqueuename": _QUEUES,
-    "jobdefinition": _DEFINITIONS,
-    "jobdefinitions": _DEFINITIONS,
-    "jobdefinitionname": ("gang", "single", "made"),
-    "computeenvironment": _POOLS,
-    "computeenvironments": _POOLS,
-    "computeenvironmentname": _POOLS,
-    "arn": (f"{PREFIX}scheduling-policy/fuzz", f"{PREFIX}scheduling-policy/made"),
-    "arns": (f"{PREFIX}scheduling-policy/fuzz",),
-    "schedulingpolicyarn": (f"{PREFIX}scheduling-policy/fuzz",),
-    "shareidentifier": ("blue", "red*", "*"),
-    "targetnodes": _TARGETS,
-    "logstreamname": _STREAMS,
-    "logstreamnames": _STREAMS,
-    "logstreamnameprefix": _STREAMS,
-    "logstreamnameprefixes": _STREAMS,
-    "loggroupname": _GROUPS,
-    "loggroupidentifier": _GROUPS,
-    "loggroupidentifiers": _GROUPS,
-    "filterpattern": ("line", '"a line" -x', "%l[ia]ne+$%", "{ $.x = 1 }", "?a ?b", "%(%", "%[%", "%a{1,999}%"),
-    "image": ("any",),
-    "command": ("true", "Ref::who"),
-    "onexitcode": ("0", "1*", "137"),
-    "nexttoken": ("W10=", "WzBd", "WyJ4IiwxXQ==", f"f{'0' * 56}", "f/0", "b/5", "1/x", "0/gang/"),
-}
-_ARRAYS = (2, 3, 1, 0, -1, 10_001)
-"""An array of 10,000 is no fault, but takes its time."""
 
 
 @cache
@@ -143,7 +55,7 @@ def shaped(shape: Any, name: str = "", depth: int = 0) -> st.SearchStrategy[Any]
         case "boolean":
             return st.booleans()
         case "integer" | "long":
-            numbers = _ARRAYS if name == "size" else [each for each in NUMBERS if isinstance(each, int)]
+            numbers = ARRAYS if name == "size" else [each for each in NUMBERS if isinstance(each, int)]
             return st.one_of(st.integers(0, 5), st.sampled_from(numbers))
         case "float" | "double":
             return st.one_of(st.floats(0, 2), st.sampled_from(NUMBERS))
@@ -162,127 +74,19 @@ def _texts(shape: Any, name: str) -> st.SearchStrategy[str]:
     choices: list[st.SearchStrategy[str]] = []
     if shape.enum:
         choices += [st.sampled_from(shape.enum)] * 3
-    if known := _KNOWN.get(name.lower()) or next((v for k, v in _KNOWN.items() if name.lower().endswith(k)), None):
+    if known := KNOWN.get(name.lower()) or next((v for k, v in KNOWN.items() if name.lower().endswith(k)), None):
         choices += [st.sampled_from(known)] * 2
     return st.one_of(*choices, st.sampled_from(ODD_TEXTS), st.text(max_size=12))
 
 
 # -- requests that mean something -------------------------------------------------------------------------------------
-
-
-def _container(**changes: Any) -> dict[str, Any]:
-    return {
-        "image": "any",
-        "command": ["echo", "a line", "Ref::who"],
-        "environment": [{"name": "GREETING", "value": "hello"}],
-        "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "16"}],
-        **changes,
-    }
-
-
-def gang(name: str) -> dict[str, Any]:
-    """RegisterJobDefinition of two nodes."""
-    ranges = [{"targetNodes": "0:", "container": _container()}]
-    properties = {"numNodes": 2, "mainNode": 0, "nodeRangeProperties": ranges}
-    definition = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
-    retry = {"attempts": 2, "evaluateOnExit": [{"onExitCode": "1*", "action": "EXIT"}]}
-    return {**definition, "parameters": {"who": "all"}, "retryStrategy": retry}
-
-
-def single(name: str) -> dict[str, Any]:
-    """RegisterJobDefinition of one node."""
-    definition = {"jobDefinitionName": name, "type": "container", "containerProperties": _container()}
-    return {**definition, "parameters": {"who": "you"}, "timeout": {"attemptDurationSeconds": 60}}
-
-
-def submission(definition: str, queue: str = "fuzz", **more: Any) -> dict[str, Any]:
-    return {"jobName": "fuzz", "jobQueue": queue, "jobDefinition": definition, **more}
-
-
-def environment(name: str) -> dict[str, Any]:
-    resources = {"type": "EC2", "maxvCpus": 8, "subnets": ["a"], "instanceRole": "any", "instanceTypes": ["any"]}
-    return {"computeEnvironmentName": name, "type": "MANAGED", "state": "DISABLED", "computeResources": resources}
-
-
-def queue(name: str, **more: Any) -> dict[str, Any]:
-    order = [{"order": 1, "computeEnvironment": "fuzz"}]
-    return {"jobQueueName": name, "priority": 1, "computeEnvironmentOrder": order, **more}
-
-
-def policy(name: str) -> dict[str, Any]:
-    shares = [{"shareIdentifier": "blue", "weightFactor": 0.5}, {"shareIdentifier": "red*"}]
-    return {"name": name, "fairsharePolicy": {"shareDecaySeconds": 60, "shareDistribution": shares}}
-
-
-_OVERRIDE = {"targetNodes": "0:", "containerOverrides": {"command": ["true"], "environment": [{"name": "A"}]}}
-_LIMIT = {"reason": "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY", "state": "RUNNABLE", "maxTimeSeconds": 600}
-_FILTERS = {
-    "JOB_NAME": "f*",
-    "JOB_DEFINITION": "gang*",
-    "BEFORE_CREATED_AT": "99999999999999",
-    "SHARE_IDENTIFIER": "blue",
-}
-POLICY = f"{PREFIX}scheduling-policy/fuzz"
-GOOD: dict[str, tuple[dict[str, Any], ...]] = {
-    "RegisterJobDefinition": (gang("made"), single("made")),
-    "DescribeJobDefinitions": ({"jobDefinitions": ["gang", "single:1"]}, {"maxResults": 1}, {"status": "INACTIVE"}),
-    "DeregisterJobDefinition": ({"jobDefinition": "made:1"},),
-    "SubmitJob": (
-        submission("gang", nodeOverrides={"numNodes": 3, "nodePropertyOverrides": [_OVERRIDE]}, tags={"k": "v"}),
-        submission("single", containerOverrides={"command": ["Ref::who"]}, parameters={"who": "x"}),
-        submission("single", arrayProperties={"size": 3}, dependsOn=[{"type": "SEQUENTIAL"}]),
-        submission("single", arrayProperties={"size": 3}, dependsOn=[{"jobId": "<array>", "type": "N_TO_N"}]),
-        submission(
-            "gang", "fair", shareIdentifier="blue", schedulingPriorityOverride=5, dependsOn=[{"jobId": "<gang>"}]
-        ),
-    ),
-    "DescribeJobs": ({"jobs": ["<gang>", "<gang>#1", "<array>:1"]}, {"jobs": ["<single>", "<waiting>"]}),
-    "ListJobs": (
-        *({"jobQueue": "fuzz", "filters": [{"name": name, "values": [value]}]} for name, value in _FILTERS.items()),
-        *({"arrayJobId": "<array>"}, {"multiNodeJobId": "<gang>"}, {"jobQueue": "fuzz", "jobStatus": "RUNNABLE"}),
-    ),
-    "TerminateJob": ({"jobId": "<waiting>", "reason": "enough"},),
-    "CancelJob": ({"jobId": "<array>", "reason": "enough"},),
-    "CreateJobQueue": (
-        queue("made", jobStateTimeLimitActions=[{**_LIMIT, "action": "CANCEL"}]),
-        queue("made", schedulingPolicyArn=f"{PREFIX}scheduling-policy/fuzz"),
-    ),
-    "DescribeJobQueues": ({"jobQueues": ["fuzz", "fair"]}, {"maxResults": 1}),
-    "UpdateJobQueue": ({"jobQueue": "spare", "priority": 2}, {"jobQueue": "made", "state": "DISABLED"}),
-    "DeleteJobQueue": ({"jobQueue": "made"},),
-    "GetJobQueueSnapshot": ({"jobQueue": "fuzz"}, {"jobQueue": "fair"}),
-    "CreateComputeEnvironment": (environment("made"),),
-    "DescribeComputeEnvironments": ({"computeEnvironments": ["fuzz"]}, {"maxResults": 1}),
-    "UpdateComputeEnvironment": ({"computeEnvironment": "spare", "computeResources": {"maxvCpus": 4}},),
-    "DeleteComputeEnvironment": ({"computeEnvironment": "made"},),
-    "CreateSchedulingPolicy": (policy("made"),),
-    "DescribeSchedulingPolicies": ({"arns": [f"{PREFIX}scheduling-policy/fuzz"]},),
-    "ListSchedulingPolicies": ({"maxResults": 1},),
-    "UpdateSchedulingPolicy": ({**policy("made"), "arn": f"{PREFIX}scheduling-policy/fuzz"},),
-    "DeleteSchedulingPolicy": ({"arn": f"{PREFIX}scheduling-policy/made"},),
-    "GetLogEvents": tuple(
-        {"logGroupName": "/aws/batch/job", "logStreamName": _STREAMS[0], **more}
-        for more in ({"startFromHead": True, "limit": 1}, {"nextToken": "f/5"}, {"startTime": 1, "endTime": 2**62})
-    ),
-    "FilterLogEvents": (
-        {"logGroupName": "/aws/batch/job", "filterPattern": "line", "limit": 1},
-        {"logGroupIdentifier": logs.GROUP_ARN, "logStreamNamePrefix": "gang/", "interleaved": True},
-    ),
-    "DescribeLogStreams": tuple(
-        {"logGroupName": "/aws/batch/job", **more}
-        for more in ({"orderBy": "LastEventTime", "descending": True}, {"logStreamNamePrefix": "gang/", "limit": 1})
-    ),
-    "DescribeLogGroups": ({"logGroupNamePrefix": "/aws"}, {"logGroupNamePattern": "batch"}),
-    "StartLiveTail": ({"logGroupIdentifiers": [logs.GROUP_ARN], "logEventFilterPattern": "line"},),
-}
-
-
 @st.composite
 def _good(draw: st.DrawFn, operation: str, shape: Any) -> dict[str, Any]:
     """A request that works, with members added or changed within the schema."""
     request = copy.deepcopy(draw(st.sampled_from(GOOD[operation])))
-    for name in draw(st.lists(st.sampled_from(sorted(shape.members)), max_size=2, unique=True)):
-        request[name] = draw(shaped(shape.members[name], name, 1))
+    if draw(st.booleans()):
+        for name in draw(st.lists(st.sampled_from(sorted(shape.members)), max_size=2, unique=True)):
+            request[name] = draw(shaped(shape.members[name], name, 1))
     return request
 
 
@@ -399,7 +203,7 @@ _ODD_HEADERS: tuple[dict[str, str], ...] = (
     {"Origin": "null"},
     {"Content-Encoding": "gzip"},
     {"Expect": "100-continue"},
-    {"Connection": "Upgrade", "Upgrade": "websocket"},
+    {"Connection": "Upgrade", "Upgrade": "h2c"},
     {"X-Forwarded-For": "é", "Accept": "x/y", "Range": "bytes=5-1", "Cookie": "=;;"},
     {"X-HTTP-Method-Override": "DELETE"},
 )
@@ -422,12 +226,12 @@ def batch_calls(draw: st.DrawFn, spoil: bool) -> Call:
     operation = draw(st.sampled_from(BATCH))
     requests = valid("batch", operation)
     body = draw(encoded(mutated(requests))) if spoil else json.dumps(draw(requests)).encode()
-    paths = (f"/v1/{operation.lower()}",) * 12 + (
+    paths = (f"/v1/{operation.lower()}",) * 25 + (
         f"/v1/{operation}",
         f"/v1/{operation.lower()}/",
         f"/v1/%00{operation}",
     )
-    method = draw(st.sampled_from(("POST",) * 20 + ("GET", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH")))
+    method = draw(st.sampled_from(("POST",) * 40 + ("GET", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH")))
     if not spoil:
         return Call("POST", paths[0], body, draw(st.sampled_from(({}, {}, _ODD_HEADERS[0]))))
     return Call(method, draw(st.sampled_from(paths)), body, draw(_headers()))
@@ -455,7 +259,7 @@ _RESOURCES = (
 @st.composite
 def tag_calls(draw: st.DrawFn) -> Call:
     """The three operations that have the resource's ARN in their path."""
-    method = draw(st.sampled_from(("GET", "POST", "DELETE", "PUT", "HEAD")))
+    method = draw(st.sampled_from((*(("GET", "POST", "DELETE") * 5), "PUT", "HEAD")))
     arn = draw(st.one_of(st.sampled_from(_RESOURCES), st.sampled_from(_RESOURCES), st.sampled_from(ODD_TEXTS)))
     plain = arn.encode(errors="surrogatepass")
     segment = draw(
@@ -509,3 +313,64 @@ def stray_calls(draw: st.DrawFn) -> Call:
     native = ("/api/jobs/<gang>/logs?node=-1", "/api/jobs/<gang>/logs?attempt=99999999999999999999", "/api/runs/<run>")
     target = draw(st.one_of(st.sampled_from((*known, *more, *native)), st.text(_SAFE, max_size=30).map("/{}".format)))
     return Call(method, target, draw(st.binary(max_size=20)), draw(_headers()))
+
+
+_CHANGES = (
+    *(
+        "name=other",
+        "command=[echo]",
+        "nodes=3",
+        "nodes={min: 1, max: 2}",
+        "train.iterations=5",
+        "retry.attempts=0",
+        "x=1",
+        "=",
+    ),
+    *(
+        "name=2001-99-99",
+        "name=0x_",
+        "name==",
+        "name=[" + "[" * 3000,
+        "nodes=" + "9" * 5000,
+        "nodes=.nan",
+        "timeout=.inf",
+        "a.b",
+    ),
+    *(
+        'environment.X="\\ud800"',
+        'environment.X="\\0"',
+        "environment.AWS_BATCH_X=1",
+        'command=["\\udfff"]',
+        "name=*x",
+        "a..b=1",
+    ),
+    *(
+        "name=!!python/object:os.system x",
+        "name=&a [*a]",
+        "environment=[]",
+        "environment.1=1",
+        "name={? {a: b} : c}",
+        "timeout=1e400",
+    ),
+    *(
+        "resources.cpus=1e308",
+        "resources.memory=99999999999999TiB",
+        "checkpoint.every=0",
+        "stall_timeout=99999999999d",
+        "\0=\0",
+    ),
+)
+
+
+@st.composite
+def resume_calls(draw: st.DrawFn) -> Call:
+    """POST …/resume of a run that exists: what goes on behind it is compiled, registered and submitted."""
+    changes = draw(st.lists(st.one_of(st.sampled_from(_CHANGES), st.sampled_from(ODD_TEXTS)), max_size=2))
+    request: dict[str, Any] = {"set": changes}
+    request |= draw(
+        st.sampled_from(({}, {}, {"nodes": 2}, {"nodes": 10**30}, {"checkpoint": 3}, {"checkpoint": -(10**30)}))
+    )
+    if draw(st.booleans()):
+        request["directory"] = draw(st.sampled_from(ODD_TEXTS))
+    body = draw(encoded(st.one_of(st.just(request), st.just(request), mutated(st.just(request)))))
+    return Call("POST", "/api/runs/<run>/resume", body, draw(_headers()))

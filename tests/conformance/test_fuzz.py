@@ -21,10 +21,12 @@ import pytest
 import requests
 import schemathesis
 from botocore.config import Config
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from orchestrator.client import ApiError, Client
+from orchestrator.keys import KeyStore
+from tests.conformance import fuzz_requests as good
 from tests.conformance import fuzzing
 from tests.conformance.fuzzing import Call
 from tests.conftest import MUSTER, Serving, processes_of
@@ -50,6 +52,13 @@ def share(part: float) -> settings:
 class Fuzzed(Serving):
     """A server with a token (so that odd Host headers get past the guard), whose errors are kept in a file."""
 
+    def __init__(self, home: Path, *options: str) -> None:
+        self.names: dict[str, str] = {}
+        """Ids for the placeholders of drawn requests."""
+        self.counts: Counter[int] = Counter()
+        """Requests by the status of the answer."""
+        super().__init__(home, *options)
+
     def start(self) -> None:
         self.errors = self.home.parent / "stderr"
         with open(self.errors, "ab") as errors:
@@ -66,10 +75,6 @@ class Fuzzed(Serving):
         self.url = line.split()[2]
         self.client = Client(self.url, TOKEN)
         self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
-        self.names: dict[str, str] = getattr(self, "names", {})
-        self.counts: Counter[int] = Counter()
-        self.fine: set[str] = set()
-        """Targets that answered 200 at least once."""
 
     def restart(self, *options: str) -> None:
         """Go on with other options on the same home."""
@@ -79,24 +84,24 @@ class Fuzzed(Serving):
 
     def restore(self) -> None:
         """Bring back what requests have deleted or changed, so that names go on hitting something."""
-        self._try("CreateComputeEnvironment", **fuzzing.environment("fuzz"))
-        self._try("CreateComputeEnvironment", **fuzzing.environment("spare"))
-        self._try("CreateSchedulingPolicy", **fuzzing.policy("fuzz"))
+        self._try("CreateComputeEnvironment", **good.environment("fuzz"))
+        self._try("CreateComputeEnvironment", **good.environment("spare"))
+        self._try("CreateSchedulingPolicy", **good.policy("fuzz"))
         for queue in (queue for queue in self._queues() if queue not in KEPT):
             self._try("UpdateJobQueue", jobQueue=queue, state="DISABLED")
             self._try("DeleteJobQueue", jobQueue=queue)
-        self._try("CreateJobQueue", **fuzzing.queue("spare"))
-        self._try("CreateJobQueue", **fuzzing.queue("fuzz"))
-        self._try("CreateJobQueue", **fuzzing.queue("fair", schedulingPolicyArn=fuzzing.POLICY))
+        self._try("CreateJobQueue", **good.queue("spare"))
+        self._try("CreateJobQueue", **good.queue("fuzz"))
+        self._try("CreateJobQueue", **good.queue("fair", schedulingPolicyArn=good.POLICY))
         for queue in KEPT:
             self._try("UpdateJobQueue", jobQueue=queue, state="ENABLED")
         for name in ("gang", "single"):
             if not self.client.batch("DescribeJobDefinitions", jobDefinitionName=name, status="ACTIVE")[
                 "jobDefinitions"
             ]:
-                self._try("RegisterJobDefinition", **getattr(fuzzing, name)(name))
+                self._try("RegisterJobDefinition", **getattr(good, name)(name))
         for name, more in (("waiting", {}), ("array", {"arrayProperties": {"size": 3}})):
-            submitted = self._try("SubmitJob", **fuzzing.submission("single", **more))
+            submitted = self._try("SubmitJob", **good.submission("single", **more))
             self.names |= {name: submitted["jobId"]} if submitted else {}
 
     def _queues(self) -> list[str]:
@@ -111,7 +116,7 @@ class Fuzzed(Serving):
 
     def send(self, call: Call) -> None:
         """Send the call as it is and check what every answer must be."""
-        if sum(self.counts.values()) % 100 == 0:
+        if sum(self.counts.values()) % 100 == 99:
             self.restore()
         call = call.fill(self.names)
         given = {"Authorization": f"Bearer {TOKEN}", **call.headers}
@@ -126,8 +131,6 @@ class Fuzzed(Serving):
         self.counts[answer.status_code] += 1
         said = self.errors.read_text()
         assert answer.status_code < 500 and "Traceback" not in said, f"{answer.status_code} for {call}\n{said[-6000:]}"
-        if answer.status_code == 200:
-            self.fine.add(call.target if call.target != "/" else call.headers.get("X-Amz-Target", "/"))
         if answer.status_code >= 400:
             assert answer.headers.get("x-amzn-errortype"), (call, answer.status_code, answer.headers)
             if call.method != "HEAD":
@@ -148,7 +151,7 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
     batch = server.client.batch
     native = {"MUSTER_ON_CHILD_FAILURE": "restart", "MUSTER_SPEC": json.dumps({"name": "native", "command": ["true"]})}
     for name, changes in (("gang", {}), ("single", {}), ("native", {"environment": native})):
-        definition = fuzzing.gang(name) if name != "single" else fuzzing.single(name)
+        definition = good.gang(name) if name != "single" else good.single(name)
         for each in definition.get("nodeProperties", {}).get("nodeRangeProperties", []):
             pairs = [{"name": key, "value": value} for key, value in changes.get("environment", {}).items()]
             each["container"]["environment"] += pairs
@@ -157,6 +160,7 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
     runs = [server.wait(server.names[name])["run"] for name in ("gang", "single", "native")]
     server.names["run"] = runs[-1]
     server.restart("--cpus", "0.1", "--rate-limit", "0")
+    server.restore()
     yield server
     if IS_LONG:
         print(f"\n{sum(server.counts.values())} requests to {server.url}: {dict(sorted(server.counts.items()))}")
@@ -169,19 +173,19 @@ def test_batch_requests_within_the_schema(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
 
 
-@share(0.35)
+@share(0.3)
 @given(call=fuzzing.batch_calls(spoil=True))
 def test_batch_requests_with_faults(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
 
 
-@share(0.15)
+@share(0.12)
 @given(call=fuzzing.logs_calls())
 def test_logs_requests(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
 
 
-@share(0.1)
+@share(0.08)
 @given(call=fuzzing.tag_calls())
 def test_tag_requests(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
@@ -191,3 +195,111 @@ def test_tag_requests(fuzzed: Fuzzed, call: Call) -> None:
 @given(call=fuzzing.stray_calls())
 def test_stray_paths(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
+
+
+@share(0.05)
+@given(call=fuzzing.resume_calls())
+def test_resume_requests(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
+    schema = schemathesis.openapi.from_url(
+        f"{fuzzed.url}/api/openapi.json", headers={"Authorization": f"Bearer {TOKEN}"}
+    )
+    operations = [each.ok() for each in schema.get_all_operations()]
+    known = st.sampled_from(
+        (None, None, fuzzed.names["gang"], "gang", fuzzed.names["run"], f"{fuzzed.names['array']}:1")
+    )
+    with requests.Session() as session:
+        session.trust_env = False
+
+        def probe(case: schemathesis.Case, name: str | None) -> None:
+            for key in case.path_parameters if name else ():
+                case.path_parameters[key] = name
+            case.query.pop("follow", None)  # the answer goes on until the job is over
+            sent = {"session": session, "headers": {"Authorization": f"Bearer {TOKEN}"}, "timeout": 60}
+            answer = case.call(base_url=fuzzed.url, **sent)
+            case.validate_response(answer, checks=[schemathesis.checks.not_a_server_error])
+            fuzzed.counts[answer.status_code] += 1
+
+        for operation in operations:
+            has_input = any(operation.iter_parameters()) or any(operation.body)  # else there is nothing to get wrong
+            for mode in schemathesis.GenerationMode if has_input else [schemathesis.GenerationMode.POSITIVE]:
+                cases = operation.as_strategy(generation_mode=mode)
+                share(0.3 / len(operations))(given(case=cases, name=known)(probe))()
+    assert "Traceback" not in fuzzed.errors.read_text()
+
+
+GARBAGE = (
+    b"\r\n\r\n",
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"POST http://elsewhere/v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\n\r\n{}",
+    b"OPTIONS * HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: -1\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999999999999999\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n{}\r\n0\r\n\r\n",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: gzip\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: a\r\nHost: b\r\nContent-Length: 2\r\n\r\n{}",
+    b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Amz-Target: \xff\xfe\r\nContent-Length: 2\r\n\r\n{}",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"X: " + b"y" * 100_000 + b"\r\n\r\n",
+    b"GET /" + b"x" * 100_000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"GET / HTTP/1.0\r\n\r\n",
+)
+
+
+@pytest.mark.parametrize("data", GARBAGE, ids=range(len(GARBAGE)))
+def test_bytes_that_are_hardly_http(fuzzed: Fuzzed, data: bytes) -> None:
+    address = httpx.URL(fuzzed.url)
+    with socket.create_connection((address.host, address.port), timeout=60) as connection:
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        try:
+            answer = connection.recv(1 << 16)
+        except ConnectionResetError:
+            answer = b""
+    assert not answer or answer.split()[1].startswith(b"4"), answer
+    assert "Traceback" not in (said := fuzzed.errors.read_text()), said[-6000:]
+
+
+def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed) -> None:
+    """What all these requests have left behind spoils no answer, no pass of the scheduler and no start."""
+    key = KeyStore(fuzzed.home).create("reader")
+    statuses = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+    for _ in range(2):
+        batch = boto3.client(
+            "batch",
+            endpoint_url=fuzzed.url,
+            region_name="us-east-1",
+            aws_access_key_id=key.access_key_id,
+            aws_secret_access_key=key.secret,
+            config=Config(retries={"max_attempts": 0}),
+        )
+
+        def pages(operation: str, member: str, client: Any = batch, **request: Any) -> list[Any]:
+            return [each for page in client.get_paginator(operation).paginate(**request) for each in page[member]]
+
+        assert pages("describe_compute_environments", "computeEnvironments")
+        assert pages("describe_job_definitions", "jobDefinitions") and pages(
+            "list_scheduling_policies", "schedulingPolicies"
+        )
+        jobs = {status: 0 for status in statuses}
+        for queue in pages("describe_job_queues", "jobQueues"):
+            batch.get_job_queue_snapshot(jobQueue=queue["jobQueueName"])
+            for status in statuses:
+                found = pages("list_jobs", "jobSummaryList", jobQueue=queue["jobQueueName"], jobStatus=status)
+                jobs[status] += len(found)
+                for start in range(0, len(found), 100):
+                    some = [each["jobId"] for each in found[start : start + 100]]
+                    assert len(batch.describe_jobs(jobs=some)["jobs"]) == len(some)
+        assert (
+            jobs["SUCCEEDED"] == 3
+            and jobs["STARTING"] == jobs["RUNNING"] == 0
+            and jobs["FAILED"] + jobs["RUNNABLE"] > 3
+        )
+        assert processes_of(fuzzed.home) == []
+        fuzzed.restart("--cpus", "0.1")
+    assert "Traceback" not in fuzzed.errors.read_text()

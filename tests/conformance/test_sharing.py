@@ -35,6 +35,26 @@ def test_a_disabled_queue_finishes_what_it_has(batch: Batch, one_cpu: str, tmp_p
     assert [batch.wait(job)["status"] for job in jobs] == ["SUCCEEDED", "SUCCEEDED"]
 
 
+def test_a_deleted_queue_ends_its_jobs_and_is_there_until_the_last_one_is_over(
+    batch: Batch, one_cpu: str, tmp_path: Path
+) -> None:
+    script = f"trap 'touch $GATE/asked' TERM; touch $GATE/ready; {UNTIL.format('go')}"
+    definition = batch.single("q-ended", script, env={"GATE": str(tmp_path)}, cpus="1", retryStrategy={"attempts": 2})
+    batch.queue("q-ended", one_cpu)
+    running, waiting = batch.submit(definition, queue="q-ended"), batch.submit(definition, queue="q-ended")
+    wait_for((tmp_path / "ready").exists, what="the trap")
+    batch.api.update_job_queue(jobQueue="q-ended", state="DISABLED")
+    batch.api.delete_job_queue(jobQueue="q-ended")
+    wait_for((tmp_path / "asked").exists, what="SIGTERM")
+    [shown] = batch.api.describe_job_queues(jobQueues=["q-ended"])["jobQueues"]
+    assert (shown["status"], shown["state"]) == ("DELETING", "DISABLED")
+    assert batch.wait(waiting)["attempts"] == []
+    gate(tmp_path, "go")
+    detail = batch.wait(running)
+    assert detail["status"] == "FAILED" and "q-ended" in detail["statusReason"] and len(detail["attempts"]) == 1
+    wait_for(lambda: not batch.api.describe_job_queues(jobQueues=["q-ended"])["jobQueues"], what="the queue's end")
+
+
 def test_every_job_that_waits_says_what_it_needs_and_for_whom_it_waits(
     batch: Batch, one_cpu: str, tmp_path: Path
 ) -> None:
