@@ -7,7 +7,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-resume torture env clean
+.PHONY: run test lint format bench bench-scheduling bench-logs bench-resume torture env clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -27,6 +27,12 @@ format: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks.spine
+
+bench-scheduling: $(READY)
+	$(BIN)/python -m benchmarks.scheduling | tee benchmarks/scheduling.md
+
+bench-logs: $(READY)
+	$(BIN)/python -m benchmarks.log_follow | tee benchmarks/log_follow.md
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume

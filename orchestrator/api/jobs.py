@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import func, select
+from sqlalchemy.orm import selectinload
 
 from orchestrator.api import auth
 from orchestrator.api.arns import definition_arn, split_reference
@@ -53,6 +54,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         query = select(Job).where(Job.parent == job_id).order_by(Job.array_index, Job.id)
         if status := request.get("jobStatus"):
             query = query.where(Job.status == status)
+        query = query.options(selectinload(Job.attempts))
         rows, token = page(
             context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
         )
@@ -60,7 +62,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         queue = context.queue(request["jobQueue"])
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
-        query = query.order_by(Job.created_at.desc(), Job.id.desc())
+        query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
         most = 100 if request.get("filters") else 1000
         keys = (Job.created_at, Job.id)
         rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))

@@ -66,7 +66,9 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
     )
     name, slash, rest = prefix.partition("/")
     if slash:
-        query = query.where(Job.name == name, Job.id.startswith(rest.partition("/")[0].replace(".", ":"), autoescape=True))
+        query = query.where(
+            Job.name == name, Job.id.startswith(rest.partition("/")[0].replace(".", ":"), autoescape=True)
+        )
     elif prefix:
         query = query.where(Job.name.startswith(prefix, autoescape=True))
     found = [stream for attempt, job in session.execute(query) for stream in _streams(store, job, attempt)]
