@@ -7,6 +7,7 @@ machine in, and ignores signatures, since AWS clients always sign with something
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import ipaddress
 import re
@@ -117,6 +118,8 @@ class Guard:
             return
         except ClientError as refusal:
             if scope["type"] == "http":
+                # a body that is not even HTTP is answered by uvicorn itself: it then must not see a second answer
+                await asyncio.sleep(0)
                 await error_response(str(refusal), refusal.status, kind_of(refusal))(scope, receive, send)
             else:
                 await send({"type": "websocket.close", "code": 1008, "reason": "refused"})  # the server answers 403
