@@ -372,5 +372,6 @@ def kind_of(error: ClientError) -> str:
 
 def error_response(message: str, status: int, kind: str = "ClientException") -> JSONResponse:
     """An error that botocore maps to its class (by header and body) and that a person can read."""
-    content: dict[str, Any] = {"__type": kind, "message": message}
+    text = message.encode(errors="backslashreplace").decode()  # it may repeat half of a character that was sent
+    content: dict[str, Any] = {"__type": kind, "message": text}
     return JSONResponse(content, status, {"x-amzn-errortype": kind})

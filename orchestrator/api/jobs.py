@@ -77,8 +77,8 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     wanted = request.get("jobStatus")
     summaries = [summary for summary in summaries if not wanted or summary["status"] == wanted]
     token = request.get("nextToken")
-    start = decode(token, 1)[0] if token else 0
-    if not isinstance(start, int) or start < 0:
+    start = decode(token, [int])[0] if token else 0
+    if start < 0:
         raise ClientError(f"nextToken {str(token)[:100]!r} is not one that was given out")
     end = start + page_size(dict(request), 1000)
     more = {"nextToken": encode([end])} if len(summaries) > end else {}

@@ -37,7 +37,7 @@ def page(
         descending: Of each key.
     """
     if token := request.get("nextToken"):
-        values = decode(token, len(keys))
+        values = decode(token, [key.type.python_type for key in keys])
         behind = []
         for index, (key, value) in enumerate(zip(keys, values, strict=True)):
             same = [keys[i] == values[i] for i in range(index)]
@@ -54,16 +54,15 @@ def encode(values: Sequence[Any]) -> str:
     return base64.urlsafe_b64encode(json.dumps(values).encode()).decode()
 
 
-def decode(token: str, count: int) -> list[Any]:
-    """The position in a token. Raises ClientError for one that was not given out."""
+def decode(token: str, kinds: Sequence[type]) -> list[Any]:
+    """The position in a token: one value of each kind (``int`` or ``str``). Raises ClientError for one that was not given out."""
     try:
         values = json.loads(base64.b64decode(token.encode(), altchars=b"-_", validate=True))
-        if (
-            isinstance(values, list)
-            and len(values) == count
-            and all(isinstance(value, str) or (type(value) is int and abs(value) < 2**63) for value in values)
-        ):
-            return values
+        if isinstance(values, list) and [type(value) for value in values] == list(kinds):
+            text = json.dumps(values, ensure_ascii=False)
+            text.encode()  # no database takes half of a character
+            if "\\u0000" not in text and all(abs(value) < 2**63 for value in values if isinstance(value, int)):
+                return values
     except (ValueError, RecursionError):
         pass
     raise ClientError(f"nextToken {token[:100]!r} is not one that was given out")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -14,6 +15,8 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
 _MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
 _SHORTEST_TIMEOUT = 60
+_DEEPEST_SPEC = 100
+"""Levels of MUSTER_SPEC; what is nested much deeper can be stored, but no answer could show it."""
 
 
 def check_name(key: str, name: str) -> None:
@@ -95,14 +98,23 @@ def check_nodes(properties: Mapping[str, Any]) -> None:
 def _check_settings(needs: GangNeeds) -> None:
     """The ``MUSTER_*`` variables that the controller itself reads."""
     try:
-        needs.spec  # noqa: B018 - parsed here for its errors
+        spec = needs.spec
+        json.dumps(spec, ensure_ascii=False).encode()  # half of a character can't be shown
+        if _depth(spec) > _DEEPEST_SPEC:
+            raise ValueError
         float(needs.setting("MUSTER_STALL_TIMEOUT", "0"))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ClientError(
             "MUSTER_SPEC or MUSTER_STALL_TIMEOUT is malformed; both are written by `muster submit`"
         ) from None
     if needs.setting("MUSTER_ON_CHILD_FAILURE", "ignore") not in ("restart", "fail", "ignore"):
         raise ClientError("MUSTER_ON_CHILD_FAILURE: expected restart, fail or ignore")
+
+
+def _depth(value: object) -> int:
+    """How deep lists and mappings are nested. Raises RecursionError."""
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return 1 + max(map(_depth, inner), default=0)
 
 
 def _check_target(target: str, count: int) -> None:
@@ -118,7 +130,9 @@ def _check_target(target: str, count: int) -> None:
 def check_container(container: Mapping[str, Any], where: str) -> None:
     """``containerProperties``: an image or a command, environment, resources."""
     for pair in container.get("environment") or []:
-        name = pair.get("name", "")
+        name = pair.get("name")
+        if not name:
+            raise ClientError(f"{where}: an entry of environment has no name")
         if name.startswith("AWS_BATCH"):
             raise ClientError(f"environment variable {name[:100]}: names that start with AWS_BATCH are reserved")
         if "=" in name or "\0" in name + pair.get("value", ""):
@@ -135,9 +149,9 @@ def check_container(container: Mapping[str, Any], where: str) -> None:
         raise ClientError(f"{where}: resourceRequirements names {max(kinds, key=kinds.count)} twice")
     for entry in resources:
         _check_resource(entry, where)
-    for key, least in (("vcpus", 1), ("memory", 4)):
-        if container.get(key) is not None and container[key] < least:
-            raise ClientError(f"{where}: {key} is {container[key]}; it must be at least {least}")
+    for key, least, most in (("vcpus", 1, 10**7), ("memory", 4, 10**12)):  # the most that resourceRequirements can say
+        if container.get(key) is not None and not least <= container[key] < most:
+            raise ClientError(f"{where}: {key} is {str(container[key])[:30]}; it must be {least} to {most - 1}")
     volumes = {volume.get("name") for volume in container.get("volumes") or []}
     for mount in container.get("mountPoints") or []:
         if mount.get("sourceVolume") not in volumes:

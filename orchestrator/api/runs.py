@@ -130,6 +130,8 @@ def resume(
             spec = validate(override(document, [*assignments, *resized]), f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
+        except (ValueError, AttributeError, RecursionError):  # PyYAML's, for what only looks like a date or a number
+            raise ClientError(f"run {run.name}: the value of a change is not valid YAML") from None
         _check_changes(run, before, spec)
         chosen = _choose(run, checkpoint)
         environment = {"MUSTER_RUN": run.name}

@@ -1,7 +1,7 @@
 """What the fuzzing is made of: odd values, names that hit something, and requests that work.
 
 Requests hold placeholders (``<gang>``, ``<array>`` …) for the ids that a server gives out, so that the same examples can be drawn
-for every server.
+for every server; ``<new>`` is another name each time.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from orchestrator.api import logs
+from orchestrator.api import logs, paging
 from orchestrator.api.arns import PREFIX
 
+_DEEP = tuple('{"a":' * depth + "1" + "}" * depth for depth in (90, 300, 900, 3000))
 ODD_TEXTS = (
     *("", " ", "\0", "a\0b", "\n", "\r\n", "\x1b[0m", "\u202e", "é", "Ω" * 64, "😀", "\ud800", "a\udfffb", "\ufeff"),
     *(
@@ -63,6 +64,20 @@ _POOLS = ("fuzz", "local", f"{PREFIX}compute-environment/fuzz", "spare", "made")
 STREAMS = ("gang/<gang>/1/node-0", "gang/<gang>/1/node-1", "single/<single>/1/node-0", "gang/", "gang/<gang>/2/node-0")
 _GROUPS = ("/aws/batch/job", f"{logs.GROUP_ARN}", f"{logs.GROUP_ARN}:*", "/aws", "other")
 TARGETS = ("0:", "0", "0:0", "1:", "0:1", ":1", "1", ":", "5:1", "999999", "0:999999")
+_POSITIONS = (
+    [],
+    [0],
+    ["a"],
+    ["a", 1],
+    [1, "a"],
+    ["a", "b"],
+    [2**63, "a"],
+    ["\ud800", 1],
+    ["a\0", 1],
+    ["\ud800"],
+    [-1],
+    [None, {}],
+)
 KNOWN = {
     "jobid": _JOBS,
     "jobs": _JOBS,
@@ -91,7 +106,24 @@ KNOWN = {
     "image": ("any",),
     "command": ("true", "Ref::who"),
     "onexitcode": ("0", "1*", "137"),
-    "nexttoken": ("W10=", "WzBd", "WyJ4IiwxXQ==", f"f{'0' * 56}", "f/0", "b/5", "1/x", "0/gang/"),
+    "nexttoken": (
+        *(paging.encode(each) for each in _POSITIONS),
+        "W10=",
+        f"f{'0' * 56}",
+        "f/0",
+        "b/5",
+        "1/x",
+        "0/gang/",
+    ),
+    "name": (
+        "GREETING",
+        "MUSTER_SPEC",
+        "MUSTER_STALL_TIMEOUT",
+        "MUSTER_MIN_NODES",
+        "MUSTER_RUN",
+        "MUSTER_ON_CHILD_FAILURE",
+    ),
+    "value": ("2", "nan", '{"name": "\\ud800"}', '{"name": NaN}', "[]", "null", '"x"', "1e400", "restart"),
 }
 ARRAYS = (2, 3, 1, 0, -1, 10_001)
 """An array of 10,000 is no fault, but takes its time."""
@@ -122,6 +154,12 @@ def single(name: str) -> dict[str, Any]:
     return {**definition, "parameters": {"who": "you"}, "timeout": {"attemptDurationSeconds": 60}}
 
 
+def old(name: str) -> dict[str, Any]:
+    """The same with the fields that AWS has deprecated."""
+    container = {**_container(), "vcpus": 1, "memory": 16, "resourceRequirements": []}
+    return {**single(name), "containerProperties": container}
+
+
 def submission(definition: str, queue: str = "fuzz", **more: Any) -> dict[str, Any]:
     return {"jobName": "fuzz", "jobQueue": queue, "jobDefinition": definition, **more}
 
@@ -141,7 +179,8 @@ def policy(name: str) -> dict[str, Any]:
     return {"name": name, "fairsharePolicy": {"shareDecaySeconds": 60, "shareDistribution": shares}}
 
 
-_OVERRIDE = {"targetNodes": "0:", "containerOverrides": {"command": ["true"], "environment": [{"name": "A"}]}}
+_SETTINGS = [{"name": "MUSTER_SPEC", "value": "{}"}, {"name": "MUSTER_MIN_NODES", "value": "1"}, {"name": "A"}]
+_OVERRIDE = {"targetNodes": "0:", "containerOverrides": {"command": ["true"], "environment": _SETTINGS}}
 _LIMIT = {"reason": "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY", "state": "RUNNABLE", "maxTimeSeconds": 600}
 _FILTERS = {
     "JOB_NAME": "f*",
@@ -151,12 +190,19 @@ _FILTERS = {
 }
 POLICY = f"{PREFIX}scheduling-policy/fuzz"
 GOOD: dict[str, tuple[dict[str, Any], ...]] = {
-    "RegisterJobDefinition": (gang("made"), single("made")),
-    "DescribeJobDefinitions": ({"jobDefinitions": ["gang", "single:1"]}, {"maxResults": 1}, {"status": "INACTIVE"}),
+    "RegisterJobDefinition": (gang("made"), single("made"), old("made")),
+    "DescribeJobDefinitions": (
+        {"jobDefinitions": ["gang", "single:1"]},
+        {"maxResults": 1, "nextToken": ""},
+        {"status": "INACTIVE"},
+    ),
     "DeregisterJobDefinition": ({"jobDefinition": "made:1"},),
     "SubmitJob": (
         submission("gang", nodeOverrides={"numNodes": 3, "nodePropertyOverrides": [_OVERRIDE]}, tags={"k": "v"}),
         submission("single", containerOverrides={"command": ["Ref::who"]}, parameters={"who": "x"}),
+        submission(
+            "single", containerOverrides={"vcpus": 2, "memory": 16, "environment": [{"name": "A", "value": ""}]}
+        ),
         submission("single", arrayProperties={"size": 3}, dependsOn=[{"type": "SEQUENTIAL"}]),
         submission("single", arrayProperties={"size": 3}, dependsOn=[{"jobId": "<array>", "type": "N_TO_N"}]),
         submission(
@@ -166,23 +212,24 @@ GOOD: dict[str, tuple[dict[str, Any], ...]] = {
     "DescribeJobs": ({"jobs": ["<gang>", "<gang>#1", "<array>:1"]}, {"jobs": ["<single>", "<waiting>"]}),
     "ListJobs": (
         *({"jobQueue": "fuzz", "filters": [{"name": name, "values": [value]}]} for name, value in _FILTERS.items()),
-        *({"arrayJobId": "<array>"}, {"multiNodeJobId": "<gang>"}, {"jobQueue": "fuzz", "jobStatus": "RUNNABLE"}),
+        *({"arrayJobId": "<array>"}, {"multiNodeJobId": "<gang>", "nextToken": ""}),
+        {"jobQueue": "fuzz", "jobStatus": "RUNNABLE", "maxResults": 1, "nextToken": ""},
     ),
     "TerminateJob": ({"jobId": "<waiting>", "reason": "enough"},),
     "CancelJob": ({"jobId": "<array>", "reason": "enough"},),
     "CreateJobQueue": (
-        queue("made", jobStateTimeLimitActions=[{**_LIMIT, "action": "CANCEL"}]),
-        queue("made", schedulingPolicyArn=f"{PREFIX}scheduling-policy/fuzz"),
+        queue("<new>", jobStateTimeLimitActions=[{**_LIMIT, "action": "CANCEL"}]),
+        queue("<new>", schedulingPolicyArn=f"{PREFIX}scheduling-policy/fuzz"),
     ),
-    "DescribeJobQueues": ({"jobQueues": ["fuzz", "fair"]}, {"maxResults": 1}),
+    "DescribeJobQueues": ({"jobQueues": ["fuzz", "fair"]}, {"maxResults": 1, "nextToken": ""}),
     "UpdateJobQueue": ({"jobQueue": "spare", "priority": 2}, {"jobQueue": "made", "state": "DISABLED"}),
     "DeleteJobQueue": ({"jobQueue": "made"},),
     "GetJobQueueSnapshot": ({"jobQueue": "fuzz"}, {"jobQueue": "fair"}),
-    "CreateComputeEnvironment": (environment("made"),),
+    "CreateComputeEnvironment": (environment("<new>"),),
     "DescribeComputeEnvironments": ({"computeEnvironments": ["fuzz"]}, {"maxResults": 1}),
     "UpdateComputeEnvironment": ({"computeEnvironment": "spare", "computeResources": {"maxvCpus": 4}},),
     "DeleteComputeEnvironment": ({"computeEnvironment": "made"},),
-    "CreateSchedulingPolicy": (policy("made"),),
+    "CreateSchedulingPolicy": (policy("<new>"),),
     "DescribeSchedulingPolicies": ({"arns": [f"{PREFIX}scheduling-policy/fuzz"]},),
     "ListSchedulingPolicies": ({"maxResults": 1},),
     "UpdateSchedulingPolicy": ({**policy("made"), "arn": f"{PREFIX}scheduling-policy/fuzz"},),
@@ -192,7 +239,7 @@ GOOD: dict[str, tuple[dict[str, Any], ...]] = {
         for more in ({"startFromHead": True, "limit": 1}, {"nextToken": "f/5"}, {"startTime": 1, "endTime": 2**62})
     ),
     "FilterLogEvents": (
-        {"logGroupName": "/aws/batch/job", "filterPattern": "line", "limit": 1},
+        {"logGroupName": "/aws/batch/job", "filterPattern": "line", "limit": 1, "nextToken": f"f{'0' * 56}"},
         {"logGroupIdentifier": logs.GROUP_ARN, "logStreamNamePrefix": "gang/", "interleaved": True},
     ),
     "DescribeLogStreams": tuple(
@@ -202,3 +249,49 @@ GOOD: dict[str, tuple[dict[str, Any], ...]] = {
     "DescribeLogGroups": ({"logGroupNamePrefix": "/aws"}, {"logGroupNamePattern": "batch"}),
     "StartLiveTail": ({"logGroupIdentifiers": [logs.GROUP_ARN], "logEventFilterPattern": "line"},),
 }
+CHANGES = (
+    *(
+        "name=other",
+        "command=[echo]",
+        "nodes=3",
+        "nodes={min: 1, max: 2}",
+        "train.iterations=5",
+        "retry.attempts=0",
+        "x=1",
+        "=",
+    ),
+    *(
+        "name=2001-99-99",
+        "name=0x_",
+        "name==",
+        "name=[" + "[" * 3000,
+        "nodes=" + "9" * 5000,
+        "nodes=.nan",
+        "timeout=.inf",
+        "a.b",
+    ),
+    *(
+        'environment.X="\\ud800"',
+        'environment.X="\\0"',
+        "environment.AWS_BATCH_X=1",
+        'command=["\\udfff"]',
+        "name=*x",
+        "a..b=1",
+    ),
+    *(
+        "name=!!python/object:os.system x",
+        "name=&a [*a]",
+        "environment=[]",
+        "environment.1=1",
+        "name={? {a: b} : c}",
+        "timeout=1e400",
+    ),
+    *(
+        "resources.cpus=1e308",
+        "resources.memory=99999999999999TiB",
+        "checkpoint.every=0",
+        "stall_timeout=99999999999d",
+        "\0=\0",
+    ),
+)
+"""``set`` of a resume."""

@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import json
 import os
+import random
 import socket
 import subprocess
 from collections import Counter
@@ -37,8 +38,8 @@ from tests.conftest import MUSTER, Serving, processes_of
 EXAMPLES = int(os.environ.get("MUSTER_FUZZ", "300"))
 IS_LONG = "MUSTER_FUZZ" in os.environ
 TOKEN = "fuzz-token"
-KEPT = ("default", "fuzz", "fair", "spare")
-"""Queues that the drawn requests name; others are removed now and then, since there may be only 50."""
+KEPT = {"default", "local", "fuzz", "fair", "spare", "made"}
+"""Queues and compute environments that the requests name; others are removed now and then, since there may be only 50."""
 
 
 def share(part: float) -> settings:
@@ -60,6 +61,7 @@ class Fuzzed(Serving):
         """Ids for the placeholders of drawn requests."""
         self.counts: Counter[int] = Counter()
         """Requests by the status of the answer."""
+        self.heard = 0
         super().__init__(home, *options)
 
     def start(self) -> None:
@@ -87,16 +89,18 @@ class Fuzzed(Serving):
 
     def restore(self) -> None:
         """Bring back what requests have deleted or changed, so that names go on hitting something."""
-        self._try("CreateComputeEnvironment", **good.environment("fuzz"))
-        self._try("CreateComputeEnvironment", **good.environment("spare"))
-        self._try("CreateSchedulingPolicy", **good.policy("fuzz"))
-        for queue in (queue for queue in self._queues() if queue not in KEPT):
+        for queue in self._names("DescribeJobQueues", "jobQueues", "jobQueueName") - KEPT:
             self._try("UpdateJobQueue", jobQueue=queue, state="DISABLED")
             self._try("DeleteJobQueue", jobQueue=queue)
-        self._try("CreateJobQueue", **good.queue("spare"))
-        self._try("CreateJobQueue", **good.queue("fuzz"))
+        for pool in self._names("DescribeComputeEnvironments", "computeEnvironments", "computeEnvironmentName") - KEPT:
+            self._try("UpdateComputeEnvironment", computeEnvironment=pool, state="DISABLED")
+            self._try("DeleteComputeEnvironment", computeEnvironment=pool)
+        for name in ("fuzz", "spare", "made"):
+            self._try("CreateComputeEnvironment", **good.environment(name))
+            self._try("CreateSchedulingPolicy", **good.policy(name))
+            self._try("CreateJobQueue", **good.queue(name))
         self._try("CreateJobQueue", **good.queue("fair", schedulingPolicyArn=good.POLICY))
-        for queue in KEPT:
+        for queue in self._names("DescribeJobQueues", "jobQueues", "jobQueueName") & KEPT:
             self._try("UpdateJobQueue", jobQueue=queue, state="ENABLED")
         for name in ("gang", "single"):
             if not self.client.batch("DescribeJobDefinitions", jobDefinitionName=name, status="ACTIVE")[
@@ -107,8 +111,8 @@ class Fuzzed(Serving):
             submitted = self._try("SubmitJob", **good.submission("single", **more))
             self.names |= {name: submitted["jobId"]} if submitted else {}
 
-    def _queues(self) -> list[str]:
-        return [queue["jobQueueName"] for queue in self.client.batch("DescribeJobQueues")["jobQueues"]]
+    def _names(self, operation: str, member: str, key: str) -> set[str]:
+        return {each[key] for each in self.client.batch(operation)[member]}
 
     def _try(self, operation: str, **request: Any) -> dict[str, Any] | None:
         try:
@@ -121,7 +125,7 @@ class Fuzzed(Serving):
         """Send the call as it is and check what every answer must be."""
         if sum(self.counts.values()) % 100 == 99:
             self.restore()
-        call = call.fill(self.names)
+        call = call.fill({**self.names, "new": f"new-{sum(self.counts.values())}"})
         given = {"Authorization": f"Bearer {TOKEN}", **call.headers}
         headers = [(name.encode(), value.encode("latin-1")) for name, value in given.items()]
         target = {"target": call.target.encode()}
@@ -132,7 +136,7 @@ class Fuzzed(Serving):
 
     def check(self, answer: httpx.Response, call: Call) -> None:
         self.counts[answer.status_code] += 1
-        said = self.errors.read_text()
+        said = self.complaints()
         assert answer.status_code < 500 and "Traceback" not in said, f"{answer.status_code} for {call}\n{said[-6000:]}"
         if answer.status_code >= 400:
             assert answer.headers.get("x-amzn-errortype"), (call, answer.status_code, answer.headers)
@@ -141,6 +145,14 @@ class Fuzzed(Serving):
                 assert isinstance(message, str) and message, call
         elif answer.is_success and "json" in answer.headers.get("content-type", "") and call.method != "HEAD":
             json.loads(answer.content, parse_constant=lambda name: pytest.fail(f"{name} in the answer to {call}"))
+
+    def complaints(self) -> str:
+        """What the server wrote to its standard error since the last call."""
+        with open(self.errors) as errors:
+            errors.seek(self.heard)
+            said = errors.read()
+            self.heard = errors.tell()
+        return said
 
     def close(self) -> None:
         super().close()
@@ -168,6 +180,14 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
     if IS_LONG:
         print(f"\n{sum(server.counts.values())} requests to {server.url}: {dict(sorted(server.counts.items()))}")
     server.close()
+
+
+def test_single_faults(fuzzed: Fuzzed) -> None:
+    """One value of a request that works is replaced; some of all such requests, or (``make fuzz``) as good as all."""
+    calls = fuzzing.single_faults()
+    random.Random(None if IS_LONG else 1).shuffle(calls)
+    for operation, request in calls[: EXAMPLES * 2 if IS_LONG else EXAMPLES // 3]:
+        fuzzed.send(fuzzing.call_of(operation, request))
 
 
 @share(0.35)
@@ -230,7 +250,7 @@ def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
             cases = operation.as_strategy(generation_mode=mode)
             with contextlib.suppress(Unsatisfiable):  # no input is wrong where any text will do
                 share(0.3 / len(operations))(given(case=cases, name=known)(probe))()
-    assert "Traceback" not in fuzzed.errors.read_text()
+    assert "Traceback" not in fuzzed.complaints()
 
 
 GARBAGE = (
@@ -266,7 +286,7 @@ def test_bytes_that_are_hardly_http(fuzzed: Fuzzed, data: bytes, token: str) -> 
         except ConnectionResetError:
             answer = b""
     assert not answer or answer.split()[1].startswith(b"4"), answer
-    assert "Traceback" not in (said := fuzzed.errors.read_text()), said[-6000:]
+    assert "Traceback" not in (said := fuzzed.complaints()), said
 
 
 def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed) -> None:
@@ -302,4 +322,4 @@ def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed
         assert jobs["SUCCEEDED"] == 3 and jobs["STARTING"] == jobs["RUNNING"] == 0 < jobs["RUNNABLE"]
         assert processes_of(fuzzed.home) == []
         fuzzed.restart("--cpus", "0.1")
-    assert "Traceback" not in fuzzed.errors.read_text()
+    assert "Traceback" not in fuzzed.complaints()

@@ -30,7 +30,7 @@ def queue(batch: Batch) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def overdue(batch: Batch, shared_server: Serving) -> Iterator[str]:
+def overdue(batch: Batch) -> Iterator[str]:
     """A job past its timeout whose main node does not heed SIGTERM: killed 30 s later, while the other tests run.
 
     The API takes no timeout below 60 s, so the start of its attempt is set back in the database instead of waiting.
@@ -42,11 +42,16 @@ def overdue(batch: Batch, shared_server: Serving) -> Iterator[str]:
     job = batch.submit(definition)
     batch.wait(job, "RUNNING")
     wait_for(lambda: "ready" in batch.lines(job), what="the trap")
-    with sqlite3.connect(shared_server.home / "muster.db", timeout=30) as database:
-        changed = database.execute("UPDATE attempts SET started_at = started_at - 60000 WHERE job_id = ?", [job])
-    assert changed.rowcount == 1
+    age(batch, job, 60)
     yield job
     batch.wait(job)
+
+
+def age(batch: Batch, job: str, seconds: int) -> None:
+    """Make a running attempt so much older: its start is set back in the database."""
+    with sqlite3.connect(batch.server.home / "muster.db", timeout=30) as database:
+        older = "UPDATE attempts SET started_at = started_at - ? WHERE job_id = ? AND started_at IS NOT NULL"
+        assert database.execute(older, [seconds * 1000, job]).rowcount == 1
 
 
 def children(batch: Batch, job: str, **query: Any) -> dict[int, dict[str, Any]]:
@@ -233,9 +238,14 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
 
 
 @pytest.mark.parametrize("code", [1, 75])
-def test_without_tries_left_any_code_of_the_main_node_is_a_failure(batch: Batch, code: int) -> None:
-    """75 means "requeue me" in our own jobs only."""
-    detail = batch.wait(batch.submit(batch.multinode(f"mnp-exits-{code}", f"exit {code}", 1)))
+def test_without_tries_left_any_code_of_the_main_node_is_a_failure(batch: Batch, code: int, tmp_path: Path) -> None:
+    """75 means "requeue me" in our own jobs only (there after 10 s at the soonest, and this one is older)."""
+    script = f"{UNTIL.format('go')}; exit {code}"
+    job = batch.submit(batch.multinode(f"mnp-exits-{code}", script, 1, env={"GATE": str(tmp_path)}))
+    batch.wait(job, "RUNNING")
+    age(batch, job, 20)
+    gate(tmp_path, "go")
+    detail = batch.wait(job)
     assert (detail["status"], detail["statusReason"]) == ("FAILED", EXITED)
     assert [attempt["container"]["exitCode"] for attempt in detail["attempts"]] == [code]
 

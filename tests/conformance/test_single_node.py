@@ -172,9 +172,14 @@ def test_an_array_is_ended_with_its_children(batch: Batch, tmp_path: Path) -> No
 
 
 def test_children_come_one_by_one_in_a_sequential_array(batch: Batch, tmp_path: Path) -> None:
-    script = f"echo begin {INDEX} >> $LOG; echo end {INDEX} >> $LOG"
-    definition = batch.single("one-sequential", script, env={"LOG": str(tmp_path / "log")})
+    script = f"echo begin {INDEX} >> $GATE/log; {UNTIL.format('go')}; echo end {INDEX} >> $GATE/log"
+    definition = batch.single("one-sequential", script, env={"GATE": str(tmp_path)})
     job = batch.submit(definition, arrayProperties={"size": 3}, dependsOn=[{"type": "SEQUENTIAL"}])
+    batch.wait(f"{job}:0", "RUNNING")
+    for index in (1, 2):
+        held = batch.describe(f"{job}:{index}")
+        assert held["status"] == "PENDING" and f"{job}:{index - 1}" in held["statusReason"]
+    gate(tmp_path, "go")
     assert batch.wait(job)["status"] == "SUCCEEDED"
     order = (tmp_path / "log").read_text().splitlines()
     assert order == ["begin 0", "end 0", "begin 1", "end 1", "begin 2", "end 2"]

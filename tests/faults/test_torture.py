@@ -26,4 +26,4 @@ def test_a_run_under_fire_ends_with_the_bits_of_a_straight_one(tmp_path: Path) -
     assert not result.verdict.violations
     assert len(result.hits) == len(PLAN.blows) and {hit.target for hit in result.hits} < SHARES.keys()
     assert result.verdict.attempts == 2 and result.verdict.checkpoints >= 3
-    assert result.verdict.repeated > 0 and result.controller_starts >= 3
+    assert result.controller_starts >= 3
