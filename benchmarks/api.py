@@ -1,13 +1,18 @@
-"""SubmitJob and DescribeJobs side by side with moto's server, and the controller with 100,000 waiting jobs.
+"""The Batch API's speed against moto's server, and what 100,000 waiting jobs cost: ``python -m benchmarks.api``.
 
-``make bench-api`` prints the table and writes it to ``benchmarks/api.md``. Jobs wait (the controller has no room for them), so that
-nothing but the API is measured; moto's simple backend marks them as done.
+Both servers run at the same time on this machine and are asked in turns, over HTTP, by clients in processes of their own; no job
+ever runs (Muster has no room for one, moto's simple backend calls every job finished at once). The tables go to ``api.md``.
 """
 
 from __future__ import annotations
 
+import http.client
+import json
+import multiprocessing
 import os
 import platform
+import random
+import signal
 import socket
 import statistics
 import subprocess
@@ -15,182 +20,372 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import boto3
-import httpx
 from botocore.config import Config
 
-from tests.conftest import Serving
+from benchmarks.spine import MUSTER, REPOSITORY
 
-SAMPLES = 200
-LEVELS = (0, 1_000, 10_000)
-MOTO_SECONDS = 150
-"""How long moto is given to reach the next number of jobs."""
-CONTAINER = {"image": "x", "vcpus": 64, "memory": 128, "command": ["true"]}
-
-
-def batch_of(url: str) -> Any:
-    """A boto3 client."""
-    config = Config(retries={"total_max_attempts": 1})
-    keys = {"aws_access_key_id": "any", "aws_secret_access_key": "any"}
-    return boto3.client("batch", endpoint_url=url, region_name="us-east-1", config=config, **keys)
-
-
-@contextmanager
-def moto() -> Iterator[str]:
-    """moto's server with one queue and one definition."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    quiet = subprocess.DEVNULL
-    process = subprocess.Popen([sys.executable, "-m", "moto.server", "-p", str(port)], stdout=quiet, stderr=quiet)
-    url = f"http://127.0.0.1:{port}"
-    try:
-        until(lambda: httpx.post(f"{url}/moto-api/config", json={"batch": {"use_docker": False}}).is_success)
-        keys = {"aws_access_key_id": "any", "aws_secret_access_key": "any", "region_name": "us-east-1"}
-        role = boto3.client("iam", endpoint_url=url, **keys).create_role(
-            RoleName="bench", AssumeRolePolicyDocument="{}"
-        )
-        environment = {"computeEnvironmentName": "bench", "type": "UNMANAGED", "serviceRole": role["Role"]["Arn"]}
-        made = batch_of(url).create_compute_environment(**environment)["computeEnvironmentArn"]
-        order = [{"order": 1, "computeEnvironment": made}]
-        batch_of(url).create_job_queue(
-            jobQueueName="default", state="ENABLED", priority=1, computeEnvironmentOrder=order
-        )
-        yield url
-    finally:
-        process.kill()
+EXISTING = (0, 1_000, 10_000)
+SECONDS = float(os.environ.get("MUSTER_BENCH_SECONDS", "3"))
+"""Of each measurement."""
+PATIENCE = 180.0
+"""Seconds within which a server must have got its existing jobs, else the number that it has got counts."""
+WAITING, CHILDREN = 100_000, 10_000
+_HEADERS = {
+    "Content-Type": "application/json",
+    # moto finds the service by the credential's scope; neither server checks the signature here
+    "Authorization": "AWS4-HMAC-SHA256 Credential=x/20260101/us-east-1/batch/aws4_request, SignedHeaders=host, Signature=x",
+}
+_KEYS = {"region_name": "us-east-1", "aws_access_key_id": "x", "aws_secret_access_key": "x"}
+SUBMISSION = {"jobName": "bench", "jobQueue": "bench", "jobDefinition": "bench"}
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Poll until it is true and raises nothing."""
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        try:
-            if condition():
-                return
-        except httpx.HTTPError:
-            pass
-        time.sleep(0.1)
-    raise SystemExit("a server did not come up within 60 s")
+def raw(url: str) -> Callable[[str, dict[str, Any]], dict[str, Any]]:
+    """Calls operations over one kept-alive connection, with nothing but the standard library."""
+    connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=120)
+    connection.connect()
+    connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def call(operation: str, request: dict[str, Any]) -> dict[str, Any]:
+        connection.request("POST", f"/v1/{operation.lower()}", json.dumps(request).encode(), _HEADERS)
+        answer = connection.getresponse()
+        body = answer.read()
+        assert answer.status == 200, body[:500]
+        return json.loads(body)  # type: ignore[no-any-return]
+
+    return call
 
 
-def timed(body: Callable[[], object], samples: int = SAMPLES) -> tuple[float, float, float]:
-    """Calls per second, p50 [ms], p99 [ms]."""
-    taken = []
-    for _ in range(samples):
-        started = time.perf_counter()
-        body()
-        taken.append(time.perf_counter() - started)
-    cut = statistics.quantiles(taken, n=100)
-    return samples / sum(taken), cut[49] * 1e3, cut[98] * 1e3
+def boto(url: str) -> Callable[[str, dict[str, Any]], dict[str, Any]]:
+    """Calls operations through the real boto3."""
+    client = boto3.client("batch", endpoint_url=url, config=Config(retries={"max_attempts": 0}), **_KEYS)
+    methods = {
+        client.meta.method_to_api_mapping[name]: getattr(client, name) for name in client.meta.method_to_api_mapping
+    }
+    return lambda operation, request: methods[operation](**request)
 
 
-def submitter(url: str, http: httpx.Client) -> Callable[[], Any]:
-    request = {"jobName": "bench", "jobQueue": "default", "jobDefinition": "bench"}
-    return lambda: http.post(f"{url}/v1/submitjob", json=request).raise_for_status().json()
+CLIENTS = {"raw HTTP": raw, "boto3": boto}
 
 
-def compare(name: str, url: str, most: int = LEVELS[-1]) -> list[str]:
-    """Rows of one server, at growing numbers of jobs that are there."""
-    batch_of(url).register_job_definition(jobDefinitionName="bench", type="container", containerProperties=CONTAINER)
-    rows, there, client = [], 0, batch_of(url)
-    with httpx.Client(timeout=60) as http:
-        submit = submitter(url, http)
-        for level in LEVELS:
-            deadline = time.monotonic() + MOTO_SECONDS
-            while there < min(level, most) and time.monotonic() < deadline:
-                job, there = submit(), there + 1
-            raw = timed(submit)
-            through = timed(lambda: client.submit_job(jobName="bench", jobQueue="default", jobDefinition="bench"))
-            job = submit()["jobId"]
-            shown = timed(lambda job=job: http.post(f"{url}/v1/describejobs", json={"jobs": [job]}).raise_for_status())
-            for what, figures in (("SubmitJob", raw), ("SubmitJob, boto3", through), ("DescribeJobs", shown)):
-                rows.append(
-                    f"| {name} | {there:,} | {what} | {figures[0]:,.0f} | {figures[1]:.1f} | {figures[2]:.1f} |"
-                )
-                print(rows[-1], flush=True)
-            there += 2 * SAMPLES + 1
-            if level and there < level:
-                rows.append(f"| {name} | {there:,} | *did not reach {level:,} jobs in {MOTO_SECONDS} s* | | | |")
-                break
-    return rows
+@dataclass(frozen=True)
+class Rate:
+    """What some clients got out of a server at once."""
+
+    per_second: float
+    latencies: list[float]
+    ids: list[str]
+
+    @property
+    def p50(self) -> float:
+        return 1000 * statistics.median(self.latencies)
+
+    @property
+    def p99(self) -> float:
+        return 1000 * sorted(self.latencies)[int(len(self.latencies) * 0.99)]
 
 
-def resident(pid: int) -> float:
-    """Memory of a process [MB]."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def cpu_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def crowd(server: Serving) -> list[str]:
-    """The controller with 100,000 waiting jobs: ten arrays of 10,000."""
-    rows = [f"| memory before | {resident(server.process.pid):.0f} MB |"]
-    batch = batch_of(server.url)
-    started = time.perf_counter()
-    array = {"arrayProperties": {"size": 10_000}}
-    jobs = [
-        batch.submit_job(jobName="crowd", jobQueue="default", jobDefinition="bench", **array)["jobId"]
-        for _ in range(10)
+def measure(
+    url: str, kind: str, clients: int, operation: str, jobs: list[str], seconds: float, most: int = 10**9
+) -> Rate:
+    """Have ``clients`` processes call ``operation`` for some time, or until each of them has called it ``most`` times."""
+    context = multiprocessing.get_context("fork")
+    ready, results = context.Barrier(clients), context.SimpleQueue()
+    processes = [
+        context.Process(target=_client, args=(url, kind, operation, jobs, seconds, most, seed, ready, results))
+        for seed in range(clients)
     ]
-    rows.append(f"| submitting 10 arrays of 10,000 | {time.perf_counter() - started:.1f} s |")
-    last = f"{jobs[-1]}:9999"
-    started = time.perf_counter()
-    while "needs" not in batch.describe_jobs(jobs=[last])["jobs"][0].get("statusReason", ""):
-        time.sleep(0.5)
-    rows.append(f"| until the last of them says why it waits | {time.perf_counter() - started:.1f} s |")
-    rows.append(f"| memory with 100,000 waiting | {resident(server.process.pid):.0f} MB |")
-    used = cpu_seconds(server.process.pid)
-    time.sleep(20)
-    rows.append(
-        f"| CPU of the controller while nothing changes | {(cpu_seconds(server.process.pid) - used) / 20:.0%} |"
+    for process in processes:
+        process.start()
+    gathered = [results.get() for _ in processes]
+    for process in processes:
+        process.join()
+    begin, end = min(each[0] for each in gathered), max(each[1] for each in gathered)
+    latencies = [latency for each in gathered for latency in each[2]]
+    return Rate(len(latencies) / (end - begin), latencies, [job for each in gathered for job in each[3]])
+
+
+def _client(
+    url: str, kind: str, operation: str, jobs: list[str], seconds: float, most: int, seed: int, ready: Any, results: Any
+) -> None:
+    call, draw = CLIENTS[kind](url), random.Random(seed)
+    call("DescribeJobQueues", {})  # connected, and everything imported
+    latencies, ids = [], []
+    ready.wait()
+    first = now = time.perf_counter()
+    while now < first + seconds and len(latencies) < most:
+        request = SUBMISSION if operation == "SubmitJob" else {"jobs": [draw.choice(jobs)]}
+        before = time.perf_counter()
+        answer = call(operation, request)
+        now = time.perf_counter()
+        latencies.append(now - before)
+        if operation == "SubmitJob":
+            ids.append(answer["jobId"])
+        else:
+            assert len(answer["jobs"]) == 1
+    results.put((first, now, latencies, ids))
+
+
+class Server:
+    """A server process with a queue and a definition called ``bench``."""
+
+    name: str
+    url: str
+    process: subprocess.Popen[str]
+
+    def __init__(self) -> None:
+        self.jobs: list[str] = []
+
+    def fill(self, count: int) -> int:
+        """Submit jobs until there are ``count``, or patience is at its end; returns how many there are."""
+        deadline = time.monotonic() + PATIENCE
+        while len(self.jobs) < count and time.monotonic() < deadline:
+            missing = count - len(self.jobs)
+            clients = min(8, missing)
+            self.jobs += measure(self.url, "raw HTTP", clients, "SubmitJob", [], 10, -(-missing // clients)).ids
+        return len(self.jobs)
+
+    def stop(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        self.process.wait(60)
+
+
+class Muster(Server):
+    """``muster serve`` that has too little for any job."""
+
+    name = "Muster"
+
+    def __init__(self, home: Path) -> None:
+        super().__init__()
+        self.home = home
+        self.start()
+        call = raw(self.url)
+        call("CreateJobQueue", {"jobQueueName": "bench", "priority": 1, "computeEnvironmentOrder": [_order("local")]})
+        call("RegisterJobDefinition", definition())
+
+    def start(self) -> float:
+        """Returns the seconds until the first request is answered."""
+        begin = time.perf_counter()
+        self.process = subprocess.Popen(
+            [MUSTER, "serve", "--port", "0", "--cpus", "0.1", "--rate-limit", "0"],
+            env={**os.environ, "MUSTER_HOME": str(self.home)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().split()[2]
+        raw(self.url)("DescribeJobQueues", {})
+        return time.perf_counter() - begin
+
+    def memory(self) -> float:
+        """Resident set [MB]."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(status.partition("VmRSS:")[2].split()[0]) / 1024
+
+    def cpu(self) -> float:
+        """Seconds of CPU time so far."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def settle(self, array: str) -> float:
+        """Wait until every child of the array waits for room; returns the seconds."""
+        begin = time.perf_counter()
+        call = raw(self.url)
+        while True:
+            summary = call("DescribeJobs", {"jobs": [array]})["jobs"][0]["arrayProperties"]["statusSummary"]
+            if summary["RUNNABLE"] == CHILDREN:
+                return time.perf_counter() - begin
+            time.sleep(0.2)
+
+
+class Moto(Server):
+    """moto's server with its ``batch_simple`` backend."""
+
+    name = "moto"
+
+    def __init__(self) -> None:
+        super().__init__()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{port}"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "moto.server", "-p", str(port)],
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            text=True,
+        )
+        while True:
+            try:
+                connection = http.client.HTTPConnection(f"127.0.0.1:{port}", timeout=60)
+                connection.request("POST", "/moto-api/config", json.dumps({"batch": {"use_docker": False}}))
+                assert connection.getresponse().status == 201
+                break
+            except OSError:
+                time.sleep(0.2)
+        role = boto3.client("iam", endpoint_url=self.url, **_KEYS).create_role(
+            RoleName="r", AssumeRolePolicyDocument="{}"
+        )
+        batch = boto3.client("batch", endpoint_url=self.url, **_KEYS)
+        batch.create_compute_environment(
+            computeEnvironmentName="bench", type="UNMANAGED", state="ENABLED", serviceRole=role["Role"]["Arn"]
+        )
+        batch.create_job_queue(
+            jobQueueName="bench", state="ENABLED", priority=1, computeEnvironmentOrder=[_order("bench")]
+        )
+        batch.register_job_definition(**definition())
+
+
+def _order(environment: str) -> dict[str, Any]:
+    return {"order": 1, "computeEnvironment": environment}
+
+
+def definition() -> dict[str, Any]:
+    resources = [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "128"}]
+    environment = [{"name": f"VARIABLE_{i}", "value": "value" * 4} for i in range(5)]
+    container = {"image": "any", "command": ["train"], "resourceRequirements": resources, "environment": environment}
+    return {"jobDefinitionName": "bench", "type": "container", "containerProperties": container}
+
+
+# -- the tables -------------------------------------------------------------------------------------------------------
+
+
+def rates(muster: Muster, moto: Moto) -> Iterator[list[str]]:
+    """Rows: operation, client, clients at once, existing jobs; of both servers rate, p50, p99; ratio of the rates."""
+    for existing in EXISTING:
+        there = {server: server.fill(existing) for server in (muster, moto)}
+        for operation in ("SubmitJob", "DescribeJobs"):
+            for kind in CLIENTS:
+                for clients in (1, 8):
+                    found = []
+                    for server in (muster, moto):
+                        result = measure(server.url, kind, clients, operation, server.jobs, SECONDS)
+                        server.jobs += result.ids
+                        found.append(result)
+                    short = f" (moto {there[moto]:,})" if there[moto] < existing else ""
+                    cells = [f"{r.per_second:,.0f} | {r.p50:.1f} | {r.p99:.1f}" for r in found]
+                    ratio = found[0].per_second / found[1].per_second
+                    yield [operation, kind, str(clients), f"{existing:,}{short}", *cells, f"{ratio:.1f}"]
+
+
+def at_scale(muster: Muster) -> Iterator[tuple[str, str]]:
+    """What 100,000 waiting jobs cost: nine arrays of 10,000 and 10,000 plain jobs."""
+    call = raw(muster.url)
+    yield "memory (RSS) of the controller, no job", f"{muster.memory():.0f} MB"
+    arrays: list[str] = []
+    for number in range(WAITING // CHILDREN - 1):
+        begin = time.perf_counter()
+        arrays.append(call("SubmitJob", {**SUBMISSION, "arrayProperties": {"size": CHILDREN}})["jobId"])
+        submitted = time.perf_counter() - begin
+        settled = muster.settle(arrays[-1])
+        if number == 0:
+            yield "SubmitJob of an array of 10,000", f"{submitted:.1f} s"
+            yield "until its children wait for room", f"{settled:.1f} s"
+            yield "memory, 10,000 waiting", f"{muster.memory():.0f} MB"
+    begin = time.perf_counter()
+    muster.fill(CHILDREN)
+    yield "10,000 plain jobs by 8 clients, with 90,000 waiting", f"{time.perf_counter() - begin:.1f} s"
+    time.sleep(5)
+    yield "memory, 100,000 waiting", f"{muster.memory():.0f} MB"
+    muster.stop()
+    size = sum(path.stat().st_size for path in muster.home.glob("muster.db*")) / 1e6
+    yield "size of the database", f"{size:.0f} MB"
+    yield "restart until the first request is answered", f"{muster.start():.1f} s"
+    time.sleep(5)
+    yield "memory after the restart", f"{muster.memory():.0f} MB"
+    before, begin = muster.cpu(), time.perf_counter()
+    time.sleep(10)
+    yield (
+        "CPU of the idle controller",
+        f"{100 * (muster.cpu() - before) / (time.perf_counter() - begin):.0f} % of a core",
     )
-    shown = timed(lambda: batch.describe_jobs(jobs=[last]), 50)
-    rows.append(f"| DescribeJobs, p50 / p99 | {shown[1]:.1f} / {shown[2]:.1f} ms |")
-    page = timed(lambda: batch.list_jobs(arrayJobId=jobs[-1], jobStatus="RUNNABLE", maxResults=100), 50)
-    rows.append(f"| ListJobs, a page of 100, p50 / p99 | {page[1]:.1f} / {page[2]:.1f} ms |")
-    server.kill()
-    started = time.perf_counter()
-    server.start()
-    rows.append(f"| kill -9 → serves again | {time.perf_counter() - started:.1f} s |")
-    return rows
+    yield from _latencies(muster, arrays)
 
 
-def main() -> int:
-    """Measure, print, write the page."""
-    server = Serving(Path(tempfile.mkdtemp(prefix="muster-bench-")), "--cpus", "0.1", "--rate-limit", "0")
-    try:
-        ours = compare("Muster", server.url)
-        with moto() as url:
-            theirs = compare("moto", url)
-        many = crowd(server)
-    finally:
-        server.close()
-    page = f"""# The API
+def _latencies(muster: Muster, arrays: list[str]) -> Iterator[tuple[str, str]]:
+    call = raw(muster.url)
+    children = [f"{array}:{index}" for array in arrays for index in range(CHILDREN)]
+    for name, jobs in (("one plain job", muster.jobs), ("one child of an array", children), ("an array", arrays)):
+        result = measure(muster.url, "raw HTTP", 1, "DescribeJobs", jobs, SECONDS)
+        yield f"DescribeJobs, {name}, p50 / p99", f"{result.p50:.1f} / {result.p99:.1f} ms"
+    result = measure(muster.url, "raw HTTP", 1, "SubmitJob", [], SECONDS)
+    yield (
+        "SubmitJob, one client: per second, p50 / p99",
+        f"{result.per_second:.0f}, {result.p50:.1f} / {result.p99:.1f} ms",
+    )
+    for name, query in (
+        ("of the queue", {"jobQueue": "bench", "jobStatus": "RUNNABLE"}),
+        ("of an array", {"arrayJobId": arrays[-1]}),
+    ):
+        pages, token = [], {}
+        while True:
+            begin = time.perf_counter()
+            page = call("ListJobs", {**query, **token})
+            pages.append(1000 * (time.perf_counter() - begin))
+            if "nextToken" not in page:
+                break
+            token = {"nextToken": page["nextToken"]}
+        yield f"ListJobs {name}, page of 1,000: first / last of {len(pages)}", f"{pages[0]:.0f} / {pages[-1]:.0f} ms"
 
-`make bench-api`, {os.cpu_count()} cores (load {os.getloadavg()[0]:.1f} at the end, shared machine), Python {platform.python_version()}, SQLite with
-`synchronous=FULL`: what was acknowledged survives a power cut. moto keeps everything in memory. One client, one connection.
 
-| server | jobs there | operation | per second | p50 [ms] | p99 [ms] |
-|---|--:|---|--:|--:|--:|
-{chr(10).join(ours + theirs)}
+def fsync_milliseconds(directory: Path) -> float:
+    """What a power-safe append costs here, median."""
+    taken = []
+    with open(directory / "probe", "wb", buffering=0) as file:
+        for _ in range(200):
+            file.write(b"x" * 4096)
+            begin = time.perf_counter()
+            os.fdatasync(file.fileno())
+            taken.append(time.perf_counter() - begin)
+    return 1000 * statistics.median(taken)
 
-| 100,000 waiting jobs | |
-|---|--:|
-{chr(10).join(many)}
-"""
-    print(page)
-    (Path(__file__).parent / "api.md").write_text(page)
-    return 0
+
+def table(header: str, rows: list[str]) -> list[str]:
+    return [f"| {header} |", "|---|" + "---:|" * header.count("|"), *rows, ""]
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        fsync = fsync_milliseconds(Path(directory))
+        muster, moto = Muster(Path(directory) / "rates"), Moto()
+        compared = []
+        try:
+            for row in rates(muster, moto):
+                compared.append(f"| {' | '.join(row)} |")
+                print(compared[-1], flush=True)
+            plain = f"| memory with {len(muster.jobs):,} plain jobs, at the end of the first table | {muster.memory():.0f} MB |"
+        finally:
+            muster.stop()
+            moto.stop()
+        muster = Muster(Path(directory) / "scale")
+        scale = []
+        try:
+            for name, value in at_scale(muster):
+                scale.append(f"| {name} | {value} |")
+                print(scale[-1], flush=True)
+        finally:
+            muster.stop()
+    scale.append(plain)
+    head = [
+        "# The API",
+        "",
+        f"`make bench-api` on {os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, load average "
+        f"{os.getloadavg()[1]:.1f}; an fdatasync takes {fsync:.1f} ms. Latencies in ms. Muster commits every acknowledged job to the "
+        "disk (`synchronous=FULL`) and decides its place in the queue; moto keeps jobs in memory and calls them finished.",
+        "",
+    ]
+    columns = "operation | client | clients | existing jobs | Muster per s | p50 | p99 | moto per s | p50 | p99 | ratio"
+    text = "\n".join(
+        [*head, *table(columns, compared), "## 100,000 waiting jobs", "", *table("what | measured", scale)]
+    )
+    (REPOSITORY / "benchmarks" / "api.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -28,6 +28,8 @@ from shared_store.layout import Store
 
 _SETTLED_AT_ONCE = 200
 """Jobs a commit, of those that only change their state."""
+_GATHERING = 0.02
+"""Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
 _PASS_INTERVAL = 1.0
 """Seconds between scheduling passes while nothing changes: shares decay and limits run out by themselves."""
 _PASS_SHARE = 0.2
@@ -88,7 +90,8 @@ class Controller:
                 self.tick()
             except Exception:
                 log.exception("reconciling failed; trying again")
-            self._wake.wait(self.interval)
+            if self._wake.wait(self.interval):
+                self._ending.wait(_GATHERING)
             self._wake.clear()
 
     def tick(self) -> None:

@@ -44,6 +44,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     else:
         for dependency in _dependencies(context, request, None):
             job.dependencies.append(dependency)
+        _release(job)
     context.session.add(job)
     return answer(job)
 
@@ -147,6 +148,13 @@ def _check_run(context: Context, run: str, is_array: bool) -> None:
         )
 
 
+def _release(job: Job) -> None:
+    """A job that waits for nobody is RUNNABLE with the commit that stores it: a second commit would cost as much again."""
+    job.status = Status.SUBMITTED
+    if not job.dependencies:
+        job.move(Status.RUNNABLE, "waiting for the scheduler")
+
+
 def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> None:
     """The children of an array: jobs of their own, by index."""
     size = request["arrayProperties"].get("size", 0)
@@ -180,6 +188,7 @@ def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> Non
                     continue
                 on = f"{parent.id}:{index - 1}"
             child.dependencies.append(Dependency(on_id=on, kind=each.kind))
+        _release(child)
         context.session.add(child)
     parent.dependencies.extend(each for each in waits if each.kind != "SEQUENTIAL")
 
