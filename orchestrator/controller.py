@@ -82,7 +82,6 @@ class Controller:
         self._ending.set()
         self._wake.set()
         self._thread.join()
-        self.gangs.close()
 
     def _loop(self) -> None:
         while not self._ending.is_set():

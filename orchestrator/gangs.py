@@ -6,9 +6,10 @@ its ending before the gang is stopped. A controller that starts on the database 
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any
 
 from sqlalchemy import select
@@ -48,11 +49,6 @@ class Gangs:
         self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
         self._stops: dict[tuple[str, int], Future[None]] = {}
         self._finished: dict[tuple[str, int], float] = {}
-        self._stoppers = ThreadPoolExecutor(max_workers=16, thread_name_prefix="stop")
-
-    def close(self) -> None:
-        """Leave running gangs alone; the next controller finds them."""
-        self._stoppers.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
         """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
@@ -164,6 +160,21 @@ class Gangs:
         since = self._finished.setdefault((job.id, attempt.number), time.monotonic())
         return any(node.running for node in status) and time.monotonic() - since < _FINISHING
 
+    def _stop(self, handle: str, grace: float) -> Future[None]:
+        """Stop a gang in a thread of its own: a daemon, since a controller that leaves must not wait for a grace time."""
+        done: Future[None] = Future()
+
+        def stop() -> None:
+            try:
+                self.engine.stop(handle, grace)
+                done.set_result(None)
+            except BaseException as error:
+                done.set_exception(error)
+            self.changed()
+
+        threading.Thread(target=stop, name="stop", daemon=True).start()
+        return done
+
     def _verdict(self, job: Job, attempt: Attempt, ends: list[NodeEnd | None], main: int) -> Verdict | None:
         needs = gang_needs(job.node_properties)
         if needs.is_native:
@@ -219,8 +230,7 @@ class Gangs:
         if key not in self._stops:
             grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
             assert attempt.handle is not None
-            self._stops[key] = self._stoppers.submit(self.engine.stop, attempt.handle, grace)
-            self._stops[key].add_done_callback(lambda _: self.changed())
+            self._stops[key] = self._stop(attempt.handle, grace)
         if not self._stops[key].done():
             return False
         self._finished.pop(key, None)

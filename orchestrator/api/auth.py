@@ -12,6 +12,7 @@ import hmac
 import ipaddress
 import re
 import secrets
+import uuid
 from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from urllib.parse import SplitResult, quote, urlsplit
 
 from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import Body, RateLimit
@@ -127,7 +128,7 @@ class Guard:
         scope.setdefault("state", {})["identity"] = identity
         before = current_identity.set(identity)
         try:
-            await self.app(scope, body.receive, send)
+            await self.app(scope, body.receive, _with_request_id(send))
         finally:
             current_identity.reset(before)
 
@@ -368,6 +369,18 @@ def _canonical_request(request: _Request, signed: tuple[str, ...], payload: str)
 def kind_of(error: ClientError) -> str:
     """AWS's name of an error."""
     return error.kind if isinstance(error, Refusal) else "ClientException"
+
+
+def _with_request_id(send: Send) -> Send:
+    """Every answer has the id that AWS's have; some clients read it unasked."""
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            identifier = (b"x-amzn-requestid", str(uuid.uuid4()).encode())
+            message["headers"] = [*message.get("headers", []), identifier]
+        await send(message)
+
+    return sending
 
 
 def error_response(message: str, status: int, kind: str = "ClientException") -> JSONResponse:
