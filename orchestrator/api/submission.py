@@ -15,7 +15,7 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
-from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue
+from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, now
 from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
@@ -115,6 +115,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
         priority=request.get("schedulingPriorityOverride", document.get("schedulingPriority", 0)),
         parameters=parameters,
         tags=request.get("tags") or {},
+        created_at=now(),
     )
 
 
@@ -165,7 +166,7 @@ def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> Non
     parent.array_size = size
     shared = (
         *("name", "queue", "definition", "node_properties", "attempts_allowed", "evaluate_on_exit"),
-        *("timeout", "share", "priority", "parameters", "tags", "array_size"),
+        *("timeout", "share", "priority", "parameters", "tags", "array_size", "created_at"),
     )
     values = {key: getattr(parent, key) for key in shared}
     waits = _dependencies(context, request, size)

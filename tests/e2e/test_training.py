@@ -123,7 +123,9 @@ def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Servin
     assert server.muster("stop", job["id"]).returncode == 0
     detail = server.detail(job["id"])
     first, second = detail["attempts"]
-    assert "rank 1 was killed by SIGKILL" in first["statusReason"] and first["spent"]
+    # under load the main node's broken collective may be seen before the end that broke it
+    reasons = [node["reason"] for node in first["nodes"]]
+    assert any("rank 1 was killed by SIGKILL" in reason for reason in reasons) and first["spent"]
     assert second["number"] == 2 and second["epoch"] == first["epoch"] + 1
     log = "\n".join(server.log(job["id"], attempt=2))
     start = int(re.search(r"resumed from checkpoint (\d{8})-e\d+", log)[1])  # type: ignore[index]
