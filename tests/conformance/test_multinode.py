@@ -217,8 +217,9 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
     wait_for(lambda: batch.wait(job, "RUNNING") and "attempt 1" in batch.lines(f"{job}#1"), what="the first attempt")
     batch.api.update_compute_environment(computeEnvironment=queue, state="DISABLED")
     gate(tmp_path, "go")
-    between = batch.wait(job, "RUNNABLE")
-    assert between["statusReason"] == "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
+    batch.wait(job, "RUNNABLE")
+    batch.reason(job, "ACTION_REQUIRED - CE(s) associated with the job queue are invalid.")
+    between = batch.describe(job)
     assert [attempt["container"]["exitCode"] for attempt in between["attempts"]] == [1]
     assert {each["status"] for each in children(batch, job).values()} == {"RUNNABLE"}, "no node of it runs or has ended"
     batch.api.update_compute_environment(computeEnvironment=queue, state="ENABLED")

@@ -108,7 +108,7 @@ def test_a_queue_from_its_creation_to_its_end(batch: Batch, parked: str) -> None
     assert (shown["priority"], shown["state"], shown["jobStateTimeLimitActions"]) == (8, "DISABLED", [limit])
     with refused("q-lives is DISABLED"):
         batch.submit(definition, queue="q-lives")
-    assert batch.wait(waiting, "RUNNABLE")["statusReason"] == INVALID, "a disabled queue keeps what it has"
+    assert batch.reason(waiting, INVALID) == INVALID, "a disabled queue keeps what it has"
     batch.api.delete_job_queue(jobQueue="q-lives")
     assert "q-lives" in batch.wait(waiting)["statusReason"], "its jobs end with it"
     with refused("q-lives does not exist"):
