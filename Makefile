@@ -1,13 +1,13 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the whole test suite
 # make torture N=300   kill everything at random moments; every run must end with the same bits
+# make fuzz N=10000    malformed requests, drawn at random; none may be answered with a 500
 PYTHON ?= python3
-N      ?= 300
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-scheduling bench-logs bench-resume torture env clean
+.PHONY: run test lint format bench bench-api bench-scheduling bench-logs bench-resume fuzz torture env clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -37,8 +37,14 @@ bench-logs: $(READY)
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume
 
+bench-api: $(READY)
+	$(BIN)/python -m benchmarks.api
+
 torture: $(READY)
-	$(BIN)/python -m tests.faults.torture --kills $(N)
+	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300)
+
+fuzz: $(READY)
+	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py
 
 env: $(READY)
 

@@ -125,6 +125,16 @@ class Serving:
                 pass
 
 
+MAIN_LAST = """
+import os, pathlib, time
+_here = pathlib.Path(os.environ["MUSTER_STORE"]).parent / "ends" / os.environ["AWS_BATCH_JOB_ID"].split("#")[0]
+_here.mkdir(parents=True, exist_ok=True)
+(_here / os.environ["RANK"]).touch()
+while os.environ["RANK"] == "0" and len(list(_here.iterdir())) < int(os.environ["WORLD_SIZE"]): time.sleep(0.01)
+"""
+"""Last lines of a gang's script: the main node, whose end ends the others wherever they are, waits for them to come here too."""
+
+
 def submit_gang(
     client: Client,
     script: str,

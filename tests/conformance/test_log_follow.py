@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, stream_of, write
-from tests.conftest import PATIENCE, Serving, wait_for
+from tests.conftest import MAIN_LAST, PATIENCE, Serving, wait_for
 
 
 class CliTail(threading.Thread):
@@ -181,7 +181,7 @@ def test_a_live_tail_takes_up_jobs_that_begin_and_end_later_and_filters(shared_s
     everything = watch()
     filtered = watch(logStreamNamePrefixes=["newcomer/", "x"], logEventFilterPattern='%^[02]:% -":1"')
     script = "import os\nfor i in range(5): print(os.environ['AWS_BATCH_JOB_NODE_INDEX'], i, sep=':')"
-    job = finished(shared_server, script, 3, "newcomer")
+    job = finished(shared_server, script + MAIN_LAST, 3, "newcomer")
     own = [stream_of(shared_server, job, node) for node in range(3)]
     named = watch(logStreamNames=own)
     wait_for(lambda: len([r for r in everything.results if r["logStreamName"] in own]) >= 18)

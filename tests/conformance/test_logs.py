@@ -10,7 +10,7 @@ from botocore.exceptions import ClientError
 
 from shared_store.logs import format_line
 from tests.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, messages, stream_of
-from tests.conftest import Serving
+from tests.conftest import MAIN_LAST, Serving
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def trio(shared_server: Serving) -> str:
 import os, time
 for i in range(60): print(os.environ["AWS_BATCH_JOB_NODE_INDEX"], i, sep=":"); time.sleep(0.005)
 """
-    return finished(shared_server, script, 3, "trio")
+    return finished(shared_server, script + MAIN_LAST, 3, "trio")
 
 
 def test_streams_are_merged_by_time_and_pages_are_the_same_as_one(shared_server: Serving, logs: Any, trio: str) -> None:

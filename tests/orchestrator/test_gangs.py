@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import MUSTER, Serving, processes_of, wait_for
+from tests.conftest import MAIN_LAST, MUSTER, Serving, processes_of, wait_for
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
 
@@ -32,7 +32,7 @@ print('attempt', os.environ['AWS_BATCH_JOB_ATTEMPT'], 'done')
 
 
 def test_every_node_gets_the_contract_of_aws_and_of_torch(shared_server: Serving) -> None:
-    job = shared_server.gang(PRINT_CONTRACT, nodes=3)
+    job = shared_server.gang(PRINT_CONTRACT + MAIN_LAST, nodes=3)
     shared_server.wait(job)
     nodes = [json.loads(shared_server.log(job, node=k, rank=k)[0]) for k in range(3)]
     main, first, second = nodes
@@ -48,8 +48,8 @@ def test_every_node_gets_the_contract_of_aws_and_of_torch(shared_server: Serving
 
 
 def test_through_the_batch_api_a_childs_death_changes_nothing(shared_server: Serving) -> None:
-    script = "import os, sys, time; time.sleep(1.5) if os.environ['RANK'] == '0' else sys.exit(3)"
-    job = shared_server.gang(script, nodes=2)
+    script = "import os, sys; time.sleep(1.5) if os.environ['RANK'] == '0' else sys.exit(3)"
+    job = shared_server.gang(MAIN_LAST + script, nodes=2)
     detail = shared_server.wait(job)
     assert detail["status"] == "SUCCEEDED"
     assert detail["attempts"][0]["nodes"][1]["exitCode"] == 3
