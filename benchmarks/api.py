@@ -31,7 +31,7 @@ from botocore.config import Config
 from benchmarks.spine import MUSTER, REPOSITORY
 
 EXISTING = (0, 1_000, 10_000)
-SECONDS = float(os.environ.get("MUSTER_BENCH_SECONDS", "3"))
+SECONDS = float(os.environ.get("MUSTER_BENCH_SECONDS", "2"))
 """Of each measurement."""
 PATIENCE = 180.0
 """Seconds within which a server must have got its existing jobs, else the number that it has got counts."""

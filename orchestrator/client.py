@@ -21,9 +21,10 @@ from orchestrator.home import local_url
 
 DEFAULT_URL = "http://127.0.0.1:8080"
 
-
 _SUBMISSIONS = ("/submitjob", "/resume")
 """Paths of requests that must not be carried out twice."""
+_PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
+"""Seconds after each refusal for too many requests; the last one is told."""
 
 
 class ApiError(Exception):
@@ -118,14 +119,23 @@ class Client:
         self, method: str, path: str, body: Any = None, query: dict[str, Any] | None = None, seconds: float = 30
     ) -> Any:
         headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if path.endswith(_SUBMISSIONS) else {}
+
+        def send() -> httpx.Response:
+            for pause in _PAUSES:
+                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
+                if answer.status_code != 429:
+                    break
+                time.sleep(pause)  # refused before anything was done
+            return answer
+
         try:
             try:
-                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
+                answer = send()
             except (httpx.ReadError, httpx.RemoteProtocolError):
                 if not headers:
                     raise
                 self.await_return(30)  # the answer was lost; with its key the same request submits nothing twice
-                answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
+                answer = send()
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
         if answer.is_error:

@@ -21,10 +21,10 @@ class Context:
     controller: Controller
     idempotency_key: str | None = None
 
-    def queue(self, reference: str) -> JobQueue:
-        """The queue of this name or ARN. Raises ClientError."""
+    def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
+        """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference))
-        if queue is None or queue.deleting:
+        if queue is None or (queue.deleting and not deleting):
             there = (
                 ", ".join(self.session.scalars(select(JobQueue.name).order_by(JobQueue.name).limit(5))) or "none yet"
             )

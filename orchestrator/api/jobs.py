@@ -59,7 +59,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
             context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
         )
     else:
-        queue = context.queue(request["jobQueue"])
+        queue = context.queue(request["jobQueue"], deleting=True)
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
         query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))

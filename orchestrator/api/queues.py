@@ -82,7 +82,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and what is in use."""
-    queue = context.queue(request["jobQueue"])
+    queue = context.queue(request["jobQueue"], deleting=True)
     order, times = context.controller.front(queue.name, 100)
     jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
     return {
