@@ -24,6 +24,7 @@ from orchestrator.jobs import Ending, Status
 from orchestrator.roster import Roster
 from orchestrator.scheduling import Board, Decisions, decide
 from orchestrator.tables import Job, JobQueue, now
+from orchestrator.together import Together
 from shared_store.layout import Store
 
 _SETTLED_AT_ONCE = 200
@@ -59,6 +60,7 @@ class Controller:
         self.gangs = Gangs(engine, store, bus, self.wake)
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
+        self.submissions = Together(database, self.writing)
         bus.changed = self.wake
         database.committed = self._committed
         self._board: Board | None = None

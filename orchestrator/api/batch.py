@@ -13,6 +13,7 @@ from typing import Any
 import botocore.session
 from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
 
 from orchestrator.api import definitions, environments, jobs, queues, submission, tags
 from orchestrator.api.context import Context
@@ -92,9 +93,16 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
     if operation.startswith(_READS):
         with controller.database.session() as session:
             return handler(Context(session, controller), checked)
+
+    def carry_out(session: Session) -> dict[str, Any]:
+        return handler(Context(session, controller, idempotency_key), checked)
+
     try:
-        with controller.writing, controller.database.session() as session:
-            response = handler(Context(session, controller, idempotency_key), checked)
+        if operation == "SubmitJob":
+            response = controller.submissions.call(carry_out)
+        else:
+            with controller.writing, controller.database.session() as session:
+                response = carry_out(session)
     except IntegrityError as error:  # a zero byte, which PostgreSQL can't store, or two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
     controller.wake()

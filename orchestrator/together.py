@@ -1,0 +1,80 @@
+"""Many submissions, one commit: those that come while another one is being written to the disk are written together.
+
+A commit costs a trip to the disk, whatever it holds. Nobody waits for company: a call that finds the database free is written at
+once, by itself.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from orchestrator.api.errors import ClientError
+from orchestrator.database import Database
+
+Body = Callable[[Session], dict[str, Any]]
+
+
+@dataclass(eq=False)
+class _Call:
+    body: Body
+    context: contextvars.Context = field(default_factory=contextvars.copy_context)
+    """The caller's: who it is."""
+    answer: dict[str, Any] | None = None
+    error: Exception | None = None
+
+
+class Together:
+    """Carries out calls that only add to the database. Any thread may call."""
+
+    def __init__(self, database: Database, writing: threading.Lock) -> None:
+        """``writing``: held by whoever writes to the database."""
+        self._database, self._writing = database, writing
+        self._waiting: deque[_Call] = deque()
+
+    def call(self, body: Body) -> dict[str, Any]:
+        """What ``body`` answers, once that is committed. Raises ClientError, or what the database says of it.
+
+        Args:
+            body: First looks, and raises ClientError where it refuses; then adds to the session.
+        """
+        mine = _Call(body)
+        self._waiting.append(mine)
+        with self._writing:
+            if mine.answer is None and mine.error is None:  # else whoever had the lock before has seen to it
+                calls = [self._waiting.popleft() for _ in range(len(self._waiting))]
+                self._carry_out(calls)
+        if mine.error is not None:
+            raise mine.error
+        assert mine.answer is not None
+        return mine.answer
+
+    def _carry_out(self, calls: list[_Call]) -> None:
+        try:
+            with self._database.session() as session:
+                answers = [self._answer(session, call) for call in calls]
+        except Exception as error:
+            if len(calls) == 1:
+                calls[0].error = error
+                return
+            for call in calls:  # nothing is stored yet, and one of them is to blame
+                call.error = None
+                self._carry_out([call])
+            return
+        for call, answer in zip(calls, answers, strict=True):
+            call.answer = answer
+
+    @staticmethod
+    def _answer(session: Session, call: _Call) -> dict[str, Any] | None:
+        """None where it is refused, which leaves nothing in the session and stops nobody else."""
+        try:
+            return call.context.run(call.body, session)
+        except ClientError as error:
+            call.error = error
+            return None
