@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
@@ -112,9 +112,11 @@ class Controller:
         name = ids[0]
         try:
             with self.database.session() as session:
+                query = select(Job).where(Job.id.in_(ids)).options(selectinload(Job.attempts))
+                jobs = {job.id: job for job in session.scalars(query)}
                 for job_id in ids:
-                    if (job := session.get(Job, job_id)) is not None:
-                        body(session, job)
+                    if job_id in jobs:
+                        body(session, jobs[job_id])
             self._troubles.pop(name, None)
         except OSError as error:
             if self._troubles.get(name) != str(error):  # said once, not at every look
