@@ -160,6 +160,8 @@ def connect(placement: Placement, *, device: str | None = None, report_seconds: 
     device = device or placement.device
     if device.startswith("cuda"):
         torch.cuda.set_device(device)
+        torch.cuda.set_stream(torch.cuda.Stream())  # the default stream can't be recorded
+        torch.set_float32_matmul_precision("high")  # TF32 products, sums in float32, as Isaac Lab trains
     if placement.world_size == 1:
         return Gang(placement, device, None, ["here"])
     store = dist.PrefixStore(f"muster/{placement.epoch}", _open_store(placement, report_seconds))

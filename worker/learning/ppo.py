@@ -7,7 +7,8 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
 - A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl takes the one before the step.
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws a new permutation (rsl-rl draws one and repeats the same minibatches in all epochs).
-- The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device.
+- The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device, and on CUDA all of
+  :meth:`PPO.learn` is one graph.
 - Action noise depends on (seed, iteration, step, global world index) alone: not on the number of ranks, nor on a restart.
 """
 
@@ -23,6 +24,7 @@ from rsl_rl.storage.rollout_storage import RolloutStorage
 from worker.distributed import Gang
 from worker.learning.models import GROUP, build_models, example_observations
 from worker.learning.randomness import mix_seed
+from worker.learning.recording import Recorded
 
 if TYPE_CHECKING:
     from worker.tasks.task import PPOConfig
@@ -51,7 +53,7 @@ class Share:
 
 
 class PPO(RslPPO):
-    """Collects with :meth:`act` and :meth:`process_env_step`, then :meth:`compute_returns`, then :meth:`update`."""
+    """Collects with :meth:`act` and :meth:`process_env_step`, then :meth:`learn`."""
 
     def __init__(
         self,
@@ -108,8 +110,9 @@ class PPO(RslPPO):
         self._allocate_rollout(worlds, steps, observation_size, action_size, extras)
         self._allocate_gradients()
         counts = [Share.of(r, gang.size, share.total).count * steps // config.minibatches for r in range(gang.size)]
-        self._batch = counts[gang.rank]
+        self._batch = share.count * steps // config.minibatches
         self._weight = self._batch / sum(counts)
+        self._allocate_minibatches()
 
     def _allocate_rollout(self, worlds: int, steps: int, observations: int, actions: int, extras: int) -> None:
         def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -122,11 +125,12 @@ class PPO(RslPPO):
         self._std = empty(actions)
         mean = empty(steps, worlds, actions)
         self.storage.distribution_params = (mean, self._std.expand_as(mean))
-        self._noise = empty(self.share.total, actions)
+        self._noise = empty(steps, self.share.total, actions)
         self._noise_source = torch.Generator(self.device)
         self._order_source = torch.Generator(self.device)
         self._columns = [observations, actions, actions, 1, 1, 1, 1]
         self._samples = empty(steps * worlds, sum(self._columns))
+        self._last_observations = empty(worlds, observations)
         self._sums = empty(3 + 2 * observations + extras, dtype=torch.float64)
         self.extra = self._sums[3 + 2 * observations :]
         """The caller's own numbers, shape (extras,), float64: :meth:`compute_returns` sums them over the ranks."""
@@ -147,6 +151,14 @@ class PPO(RslPPO):
         self.optimizer = torch.optim.Adam(
             actor + critic, lr=self._rate, fused=True, **({"capturable": True} if cuda else {})
         )
+
+    def _allocate_minibatches(self) -> None:
+        """Which samples each minibatch has; and what of learning the device replays as graphs."""
+        count = self.num_learning_epochs * self.num_mini_batches
+        self._orders = torch.zeros(count, self._batch, dtype=torch.long, device=self.device)
+        self._losses_mean = torch.zeros(len(LOSSES), device=self.device)
+        self.recordings = [Recorded(self._learn, self.device, "learning")]
+        """What is recorded, for the run's log."""
 
     @property
     def learning_rate(self) -> float:
@@ -170,9 +182,14 @@ class PPO(RslPPO):
     # -- collecting ---------------------------------------------------------------------------------------------------
 
     def begin_iteration(self, iteration: int) -> None:
-        """Seed this iteration's noise (the same on all ranks) and minibatch order (a rank's own)."""
+        """Draw this iteration's noise (the same on all ranks) and minibatches (a rank's own)."""
         self._noise_source.manual_seed(mix_seed(self.seed, iteration, 0))
         self._order_source.manual_seed(mix_seed(self.seed, iteration, 1, self.gang.rank))
+        torch.randn(self._noise.shape, generator=self._noise_source, out=self._noise)
+        for epoch in self._orders.view(self.num_learning_epochs, -1):
+            order = torch.randperm(len(self._samples), generator=self._order_source, device=self.device)
+            epoch.copy_(order[: len(epoch)])
+        self.storage.clear()
         distribution = self.actor.distribution
         with torch.no_grad():
             distribution.update(self.storage.distribution_params[0][0])
@@ -185,8 +202,7 @@ class PPO(RslPPO):
         self._observations[step].copy_(observations)
         latent = self._latents[step].copy_(self.actor.get_latent({GROUP: observations}))
         mean = self.storage.distribution_params[0][step].copy_(self.actor.mlp(latent))
-        torch.randn(self._noise.shape, generator=self._noise_source, out=self._noise)
-        noise = self._noise[self.share.first : self.share.first + self.share.count]
+        noise = self._noise[step, self.share.first : self.share.first + self.share.count]
         return torch.addcmul(mean, self._std, noise, out=self.storage.actions[step])
 
     @torch.no_grad()
@@ -213,6 +229,16 @@ class PPO(RslPPO):
         self.storage.step += 1
 
     # -- learning -----------------------------------------------------------------------------------------------------
+
+    def learn(self, observations: torch.Tensor) -> torch.Tensor:
+        """:meth:`compute_returns`, then :meth:`update`, as one recording; returns the mean :data:`LOSSES`, shape (4,)."""
+        self._last_observations.copy_(observations)
+        self.recordings[0]()
+        return self._losses_mean
+
+    def _learn(self) -> None:
+        self.compute_returns(self._last_observations)
+        self.update()
 
     @torch.no_grad()
     def compute_returns(self, observations: torch.Tensor) -> None:
@@ -272,17 +298,13 @@ class PPO(RslPPO):
         """All epochs and minibatches; returns the mean :data:`LOSSES`, shape (4,), on the device."""
         self._loss_sums.zero_()
         self._pack_samples()
-        for _ in range(self.num_learning_epochs):
-            order = torch.randperm(len(self._samples), generator=self._order_source, device=self.device)
-            samples = self._samples[order]
-            for i in range(self.num_mini_batches):
-                self._update_minibatch(samples[i * self._batch : (i + 1) * self._batch])
+        for rows in self._orders:
+            self._update_minibatch(self._samples[rows])
         self._update_normalizer()
-        self.storage.clear()
-        return self._loss_sums / (self.num_learning_epochs * self.num_mini_batches)
+        return torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
 
     def _pack_samples(self) -> None:
-        """Rows of everything that a minibatch reads: one gather an epoch, and each minibatch is a slice."""
+        """Rows of everything that a minibatch reads, so that it takes one gather."""
         st = self.storage
         columns = (
             self._latents,

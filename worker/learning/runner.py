@@ -21,6 +21,7 @@ from worker.learning.faults import die, kill_at
 from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
 from worker.learning.ppo import LOSSES, PPO, Share
 from worker.learning.randomness import seed_generators
+from worker.learning.recording import HostCopy, Recorded
 from worker.learning.report import Report, Stopwatch
 from worker.learning.state import TrainingState
 
@@ -77,6 +78,10 @@ class Runner:
             self.task.set_random_episode_length()
         self.task.clear_statistics()
         self._stopwatch = Stopwatch(gang.device)
+        self._collecting = Recorded(self._collect, gang.device, "rollout")
+        self._numbers = HostCopy(gang.device)
+        self._own_signals = torch.zeros(len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
+        self._told_captured = False
         self._iteration_seconds = self._stall_seconds = 0.0
         self.fence = Fence(job.run, job.epoch)
         self.beacon = Beacon()
@@ -99,6 +104,7 @@ class Runner:
                 self.fence.check()
                 if report:
                     report.iteration(record)
+                self._tell_captured()
                 self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
                 if self._handle(signals):
                     self._say(f"asked to stop: left after iteration {progress.iteration} of {self.iterations}")
@@ -108,6 +114,16 @@ class Runner:
                 report.close()
         self._finish()
         return 0
+
+    def _tell_captured(self) -> None:
+        """Say once, when it has come to that, which parts of an iteration the device replays by itself."""
+        parts = [self._collecting, *self.ppo.recordings]
+        if not self._told_captured and all(part.captured for part in parts):
+            self._told_captured = True
+            self._say(
+                "captured as CUDA graphs: "
+                + ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in parts)
+            )
 
     def _handle(self, signals: dict[str, float]) -> bool:
         """Save when it is time, tell of earlier saves; True where the gang is to leave (then everything is saved)."""
@@ -144,19 +160,19 @@ class Runner:
         progress, ppo = self.state.progress, self.ppo
         self._stopwatch.start()
         ppo.begin_iteration(progress.iteration)
-        self._collect()
+        self._collecting()
         self._stopwatch.mark()
         ppo.extra[: -len(SIGNALS)].copy_(self.task.statistics)
-        ppo.extra[-len(SIGNALS) :].copy_(self._signals())
+        ppo.extra[-len(SIGNALS) :].copy_(self._signals(), non_blocking=True)
         self.task.clear_statistics()
-        ppo.compute_returns(self.task.observations)
-        losses = ppo.update()
+        losses = ppo.learn(self.task.observations)
         self._stopwatch.mark()
         # the one transfer of the iteration: from here on the host knows
-        numbers = torch.cat(
-            [losses.double(), ppo.learning_rate_tensor.double().view(1), ppo.action_std.double().view(1), ppo.extra]
+        known = self._numbers.read(
+            torch.cat(
+                [losses.double(), ppo.learning_rate_tensor.double().view(1), ppo.action_std.double().view(1), ppo.extra]
+            )
         )
-        known = numbers.tolist()
         values, rate, std = known[: len(LOSSES)], known[len(LOSSES)], known[len(LOSSES) + 1]
         statistics, signals = known[len(LOSSES) + 2 : -len(SIGNALS)], known[-len(SIGNALS) :]
         progress.iteration += 1
@@ -177,7 +193,7 @@ class Runner:
         save_now, stop.save_requested = stop.save_requested, False
         failures, saver.failures = saver.failures, 0
         own = (float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds)
-        return torch.tensor(own, dtype=torch.float64)
+        return self._own_signals.copy_(torch.tensor(own, dtype=torch.float64))
 
     def _collect(self) -> None:
         task, ppo = self.task, self.ppo
