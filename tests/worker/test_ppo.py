@@ -103,7 +103,10 @@ def test_noise_belongs_to_worlds_not_to_ranks() -> None:
         torch.manual_seed(5)
         ppo = PPO(PointPPO(), Share(first, count, 6), 2, 1, alone(), seed=1)
         ppo.begin_iteration(iteration)
-        return torch.stack([ppo.act(torch.zeros(count, 2)).clone() for _ in range(3)])
+        drawn = []
+        for ppo.storage.step in range(3):
+            drawn.append(ppo.act(torch.zeros(count, 2)).clone())
+        return torch.stack(drawn)
 
     whole = actions(0, 6, 4)
     torch.testing.assert_close(whole, torch.cat((actions(0, 2, 4), actions(2, 4, 4)), 1))
