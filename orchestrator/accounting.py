@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sqlalchemy import delete, select
+from sqlalchemy import delete, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator.jobs import Ending, Status
@@ -83,11 +83,13 @@ def usage_now(
 def forget_before(session: Session, moment: int, most: int = 500) -> int:
     """Delete the history of jobs that were over before ``moment`` [ms], at most so many; returns how many were.
 
-    What a job that is not over waits for is kept, and an array as long as one of its children is.
+    What a job that is not over waits for is kept, and an array with its children until the last of them is over.
     """
     open_jobs = select(Job.id).where(Job.status.not_in([Status.SUCCEEDED, Status.FAILED]))
     needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))
-    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed)).order_by(Job.stopped_at).limit(most)
+    alone = or_(Job.parent.is_(None), Job.parent.not_in(open_jobs))
+    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone)
+    query = query.order_by(Job.stopped_at).limit(most)
     ids = list(session.scalars(query))
     for table, column in ((Attempt, Attempt.job_id), (Dependency, Dependency.job_id), (Job, Job.id)):
         session.execute(delete(table).where(column.in_(ids)))

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from orchestrator.accounting import usage_now
 from orchestrator.definition import gang_needs
 from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling import FairShare, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
+from orchestrator.scheduling import FairShare, Leading, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
 from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
 
 HOSTS_TAG = "muster:hosts"
@@ -21,7 +21,11 @@ DEFAULT_DECAY = 600
 
 
 def take_snapshot(
-    session: Session, hosts: Sequence[Host], waiting: Sequence[Waiting], active: Sequence[str]
+    session: Session,
+    hosts: Sequence[Host],
+    waiting: Sequence[Waiting],
+    active: Sequence[str],
+    leading: Mapping[str, Leading] | None = None,
 ) -> Snapshot:
     """Everything that the pass depends on, as it is now.
 
@@ -30,6 +34,7 @@ def take_snapshot(
         hosts: All that the engine has.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
+        leading: What the last pass found at the head of each queue.
     """
     policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
     queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
@@ -44,6 +49,7 @@ def take_snapshot(
         waiting=waiting,
         running=[_running(job, attempt) for job, attempt in holding],
         usage=usage_now(session, decays, holding),
+        leading=leading or {},
     )
 
 

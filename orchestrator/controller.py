@@ -17,12 +17,12 @@ from sqlalchemy.orm import Session, selectinload
 from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.bus import Bus
-from orchestrator.database import Database
+from orchestrator.database import Database, DatabaseError
 from orchestrator.engines.base import Engine
 from orchestrator.gangs import Gangs
 from orchestrator.jobs import Ending, Status
 from orchestrator.roster import Roster
-from orchestrator.scheduling import Board, Decisions, decide
+from orchestrator.scheduling import Board, Decisions, Leading, decide
 from orchestrator.tables import Job, JobQueue, now
 from orchestrator.together import Together
 from shared_store.layout import Store
@@ -64,8 +64,9 @@ class Controller:
         bus.changed = self.wake
         database.committed = self._committed
         self._board: Board | None = None
+        self._leading: Mapping[str, Leading] = {}
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
-        self._swept = 0.0
+        self._swept = self._kept = 0.0
         self._wake, self._ending = threading.Event(), threading.Event()
         self._troubles: dict[str, str] = {}
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
@@ -89,6 +90,10 @@ class Controller:
         while not self._ending.is_set():
             try:
                 self.tick()
+            except DatabaseError as error:
+                if self._troubles.get("") != str(error):
+                    log.error("%s; doing nothing until it is free", error)
+                self._troubles[""] = str(error)
             except Exception:
                 log.exception("reconciling failed; trying again")
             if self._wake.wait(self.interval):
@@ -96,7 +101,11 @@ class Controller:
             self._wake.clear()
 
     def tick(self) -> None:
-        """One pass over every job that needs a look; one that can't be handled now does not hold up the others."""
+        """One pass over every job that needs a look; one that can't be handled now does not hold up the others.
+
+        Raises DatabaseError where another controller has taken the database over.
+        """
+        self._keep_database()
         with self.database.session() as session:
             self.roster.take_dependents(session)
         due = self.roster.take_due()
@@ -106,6 +115,11 @@ class Controller:
             self._guarded([job_id], self._advance)
         self._admit()
         self._sweep()
+
+    def _keep_database(self) -> None:
+        if time.monotonic() - self._kept > _SWEEP_INTERVAL:
+            self.database.keep_lock()
+            self._kept = time.monotonic()
 
     def _guarded(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
         """Look at these jobs in one commit; where that fails, at each by itself."""
@@ -200,9 +214,9 @@ class Controller:
             self._board, self._passed = None, (version, started, 0.0)
             return
         with self.database.session() as session:
-            snapshot = take_snapshot(session, self.engine.capacity(), waiting, self.roster.active())
+            snapshot = take_snapshot(session, self.engine.capacity(), waiting, self.roster.active(), self._leading)
         decisions = decide(snapshot)
-        self._board = decisions.board
+        self._board, self._leading = decisions.board, decisions.leading
         self._passed = (version, started, time.monotonic() - started)
         self._carry_out(decisions)
 
@@ -224,6 +238,8 @@ class Controller:
                 # a request may have ended the job since the snapshot was taken
                 if job.status == Status.RUNNABLE and job.stop_reason is None:
                     self.gangs.begin(session, job, start)
+                else:
+                    self.roster.look_again([job.id])
 
     # -- what the API asks --------------------------------------------------------------------------------------------
 
@@ -238,21 +254,28 @@ class Controller:
             return None  # submitted since the last pass
 
     def front(self, queue: str, count: int) -> tuple[Sequence[str], Mapping[str, int]]:
-        """The first waiting jobs of a queue in the order in which they will start, and since when each waits [ms]."""
-        board = self._board
-        order = [job for job in (board.order(queue)[:count] if board else []) if self.roster.since(job) is not None]
-        return order, {job: since for job in order if (since := self.roster.since(job)) is not None}
+        """The first waiting jobs of a queue in the order in which they will start, and since when each waits [ms].
 
-    def utilization(self, queue: str) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
+        Of the first one: since when it is the first.
+        """
+        board, leading = self._board, self._leading.get(queue)
+        order = [job for job in (board.order(queue)[:count] if board else []) if self.roster.since(job) is not None]
+        times = {job: since for job in order if (since := self.roster.since(job)) is not None}
+        if leading is not None and leading.job in times:
+            times[leading.job] = leading.since
+        return order, times
+
+    def utilization(
+        self, session: Session, queue: str
+    ) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
         """What the gangs of a queue hold just now, by unit (``VCPU``, ``GPU``): in all, and by share."""
         total: dict[str, float] = defaultdict(float)
         shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-        with self.database.session() as session:
-            for job, attempt in open_attempts(session, self.roster.active()):
-                for node in attempt.nodes if job.queue == queue else []:
-                    for unit, amount in (("VCPU", node["cpus"]), ("GPU", len(node["gpus"]))):
-                        total[unit] += amount
-                        shares[job.share or ""][unit] += amount
+        for job, attempt in open_attempts(session, self.roster.active()):
+            for node in attempt.nodes if job.queue == queue else []:
+                for unit, amount in (("VCPU", node["cpus"]), ("GPU", len(node["gpus"]))):
+                    total[unit] += amount
+                    shares[job.share or ""][unit] += amount
         return total, shares
 
     def drain(self, session: Session, queue: JobQueue) -> None:
@@ -265,9 +288,17 @@ class Controller:
         """Remove deleted queues that are empty, and history that is older than it is kept."""
         if time.monotonic() - self._swept < _SWEEP_INTERVAL:
             return
-        self._swept = time.monotonic()
+        if not self.writing.acquire(blocking=False):
+            return  # somebody writes: gangs must not wait for that
+        try:
+            self._swept = time.monotonic()
+            self._clear_away()
+        finally:
+            self.writing.release()
+
+    def _clear_away(self) -> None:
         over = [Status.SUCCEEDED, Status.FAILED]
-        with self.writing, self.database.session() as session:
+        with self.database.session() as session:
             for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
                 busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(over)).limit(1)
                 if session.scalars(busy).first() is None:

@@ -61,6 +61,19 @@ class Database:
             yield session
             session.commit()
 
+    def keep_lock(self) -> None:
+        """Make sure that this controller is still the database's only one (PostgreSQL forgets it with the connection).
+
+        Raises DatabaseError where another has it by now.
+        """
+        if self._lock is None:
+            return
+        try:
+            self._lock.scalar(text("SELECT 1"))
+        except SQLAlchemyError:
+            self._lock.close()
+            self._lock = self._take_lock()
+
     def close(self) -> None:
         if self._lock is not None:
             self._lock.close()

@@ -186,6 +186,8 @@ class Gangs:
         if job.stop_reason is not None:
             return Verdict(Ending.STOPPED, job.stop_reason)
         for index, end in enumerate(ends):
+            if index != main and not needs.is_native:
+                continue  # on AWS a child's death changes nothing
             silence = self.bus.silence(job.id, attempt.number, index, bool(attempt.nodes[index].get("met")))
             if end is None and silence is not None and silence > LOST:
                 reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"

@@ -49,7 +49,8 @@ class Roster:
 
     def _note(self, job: Job) -> None:
         before = (job.id in self._waiting, job.id in self._active)
-        for group in (self._waiting, self._active, self._due):
+        # not out of _due: whoever asked for another look may know of a change that came after this one was read
+        for group in (self._waiting, self._active):
             group.pop(job.id, None)
         if job.is_over:
             self._ended[job.id] = None
@@ -80,9 +81,14 @@ class Roster:
         """Have those looked at that wait for jobs which ended since the last call."""
         with self._lock:
             ended, self._ended = list(self._ended), {}
-        for start in range(0, len(ended), _LOADED_AT_ONCE):
-            some = ended[start : start + _LOADED_AT_ONCE]
-            self.look_again(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
+        try:
+            for start in range(0, len(ended), _LOADED_AT_ONCE):
+                some = ended[start : start + _LOADED_AT_ONCE]
+                self.look_again(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
+        except BaseException:
+            with self._lock:
+                self._ended.update(dict.fromkeys(ended))
+            raise
 
     def active(self) -> Sequence[str]:
         """The jobs whose gang starts, runs or is being stopped."""

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from orchestrator.api.errors import ClientError
@@ -28,6 +29,10 @@ class _Call:
     """The caller's: who it is."""
     answer: dict[str, Any] | None = None
     error: Exception | None = None
+
+
+class _OneIsToBlame(Exception):
+    """One of several calls broke the group."""
 
 
 class Together:
@@ -58,14 +63,23 @@ class Together:
     def _carry_out(self, calls: list[_Call]) -> None:
         try:
             with self._database.session() as session:
-                answers = [self._answer(session, call) for call in calls]
-        except Exception as error:
-            if len(calls) == 1:
-                calls[0].error = error
-                return
-            for call in calls:  # nothing is stored yet, and one of them is to blame
+                try:
+                    answers = [self._answer(session, call) for call in calls]
+                    session.flush()
+                except OperationalError:
+                    raise
+                except Exception as error:
+                    if len(calls) == 1:
+                        raise
+                    raise _OneIsToBlame from error
+        except _OneIsToBlame:  # nothing was committed
+            for call in calls:
                 call.error = None
                 self._carry_out([call])
+            return
+        except Exception as error:  # of the commit too, after which nobody knows what is stored
+            for call in calls:
+                call.error = call.error or error
             return
         for call, answer in zip(calls, answers, strict=True):
             call.answer = answer

@@ -10,6 +10,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
@@ -35,6 +36,7 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
     app.add_exception_handler(ClientError, _client_error)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(DataError, _refused_by_database)
     app.add_exception_handler(Exception, _server_error)
 
     @app.get("/healthz")
@@ -96,6 +98,12 @@ async def _invalid(request: Request, error: Exception) -> JSONResponse:
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     return error_response(f"{request.method} {request.url.path}: {error.detail}", error.status_code)
+
+
+async def _refused_by_database(request: Request, error: Exception) -> JSONResponse:
+    """A zero byte, say, which PostgreSQL can't store nor look for."""
+    assert isinstance(error, DataError)
+    return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
 
 
 async def _server_error(request: Request, error: Exception) -> JSONResponse:

@@ -63,6 +63,15 @@ class Identity:
                 f"{self.name} may not use job queue {name}; it may use {', '.join(sorted(self.queues)) or 'none'}",
             )
 
+    def check_all_queues(self, operation: str) -> None:
+        """Raise :class:`Refusal` (403, AccessDeniedException) where it is kept to some queues, and ``operation`` concerns all."""
+        if self.queues is not None:
+            raise Refusal(
+                "AccessDeniedException",
+                f"{self.name} may use job queue {', '.join(sorted(self.queues)) or 'none'} only: {operation} is refused, since "
+                "it concerns others too",
+            )
+
     def check_write(self, operation: str) -> None:
         """Raise :class:`Refusal` (403, AccessDeniedException) where it may only look."""
         if self.read_only:

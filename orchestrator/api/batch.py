@@ -15,7 +15,7 @@ from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from orchestrator.api import definitions, environments, jobs, queues, submission, tags
+from orchestrator.api import auth, definitions, environments, jobs, queues, submission, tags
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
@@ -55,6 +55,11 @@ _INSTEAD = {
 }
 """What to use for operations that are not here, by a part of their names."""
 _READS = ("Describe", "List", "Get")
+_FOR_ALL_QUEUES = (
+    *("CreateComputeEnvironment", "UpdateComputeEnvironment", "DeleteComputeEnvironment"),
+    *("CreateSchedulingPolicy", "UpdateSchedulingPolicy", "DeleteSchedulingPolicy", "DeregisterJobDefinition"),
+)
+"""Not for a key that may use some queues only."""
 
 
 @cache
@@ -97,13 +102,15 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
     def carry_out(session: Session) -> dict[str, Any]:
         return handler(Context(session, controller, idempotency_key), checked)
 
+    if operation in _FOR_ALL_QUEUES:
+        auth.current_identity.get().check_all_queues(operation)
     try:
         if operation == "SubmitJob":
             response = controller.submissions.call(carry_out)
         else:
             with controller.writing, controller.database.session() as session:
                 response = carry_out(session)
-    except IntegrityError as error:  # a zero byte, which PostgreSQL can't store, or two calls at the same instant
+    except IntegrityError as error:  # two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
     controller.wake()
     return response

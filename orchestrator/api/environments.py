@@ -94,7 +94,9 @@ def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
         raise ClientError("quotaSharePolicy is for service jobs, which are not supported; use fairsharePolicy")
     if context.session.get(SchedulingPolicy, name):
         raise ClientError(f"Scheduling policy {name} exists already; UpdateSchedulingPolicy changes it")
-    fairshare = request.get("fairsharePolicy") or {}
+    fairshare = request.get("fairsharePolicy")
+    if fairshare is None:
+        raise ClientError(f"Scheduling policy {name}: give a fairsharePolicy; {{}} is one with the defaults")
     _check_fairshare(fairshare)
     context.session.add(SchedulingPolicy(name=name, fairshare=fairshare, tags=request.get("tags") or {}))
     return {"name": name, "arn": policy_arn(name)}

@@ -47,6 +47,8 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     given = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
     if len(given) != 1:
         raise ClientError("ListJobs: give exactly one of jobQueue, arrayJobId, multiNodeJobId")
+    if (status := request.get("jobStatus")) and status not in list(Status):
+        raise ClientError(f"jobStatus is {status[:50]!r}; it is one of {', '.join(Status)}")
     if request.get("multiNodeJobId"):
         return _list_nodes(context, request)
     if array := request.get("arrayJobId"):

@@ -61,7 +61,7 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
         .join(Job, Attempt.job_id == Job.id)
         .options(load_only(Job.name, Job.run), load_only(Attempt.created_at, Attempt.stopped_at, Attempt.nodes))
         .where(or_(Attempt.stopped_at.is_(None), Attempt.stopped_at >= since))
-        .order_by(Job.created_at.desc(), Job.id, Attempt.number)
+        .order_by(Attempt.stopped_at.is_(None).desc(), Job.created_at.desc(), Job.id, Attempt.number)
         .limit(MOST_STREAMS)
     )
     name, slash, rest = prefix.partition("/")

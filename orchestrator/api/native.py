@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -14,6 +15,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.api import auth, runs
 from orchestrator.api.errors import ClientError
@@ -125,6 +127,7 @@ def job_logs(
         follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt)
         job_id = job.id
     closing: threading.Event = request.app.state.closing
+    lines: AsyncIterator[str] | Iterator[str]
     lines = _follow(controller, job_id, follower, closing) if follow else _stored(follower)
     return StreamingResponse(lines, media_type="application/x-ndjson")
 
@@ -253,19 +256,28 @@ def _stored(follower: LogFollower) -> Iterator[str]:
         yield json.dumps(asdict(line)) + "\n"
 
 
-def _follow(controller: Controller, job_id: str, follower: LogFollower, closing: threading.Event) -> Iterator[str]:
-    spoken = time.monotonic()
-    while not closing.is_set():
+async def _follow(
+    controller: Controller, job_id: str, follower: LogFollower, closing: threading.Event
+) -> AsyncIterator[str]:
+    """Lines as they come; a thread is taken only for each look, since any number of people may follow."""
+
+    def look() -> tuple[list[str], bool]:
         with controller.database.session() as session:
             job = session.get(Job, job_id)
             over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
-        for line in follower.poll():
-            yield json.dumps(asdict(line)) + "\n"
+        return [json.dumps(asdict(line)) + "\n" for line in follower.poll()], over
+
+    spoken = time.monotonic()
+    while not closing.is_set():
+        lines, over = await run_in_threadpool(look)
+        if lines:
+            yield "".join(lines)
             spoken = time.monotonic()
         if over:
-            yield from _stored(follower)
+            async for line in iterate_in_threadpool(_stored(follower)):
+                yield line
             return
         if time.monotonic() - spoken > _HEARTBEAT:
             yield "\n"
             spoken = time.monotonic()
-        closing.wait(_POLL)
+        await asyncio.sleep(_POLL)

@@ -92,7 +92,7 @@ def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[st
 
 
 def _utilization(context: Context, queue: JobQueue) -> dict[str, Any]:
-    used, by_share = context.controller.utilization(queue.name)
+    used, by_share = context.controller.utilization(context.session, queue.name)
     detail: dict[str, Any] = {
         "totalCapacityUsage": [{"capacityUnit": unit, "quantity": amount} for unit, amount in used.items()],
         "lastUpdatedAt": now(),

@@ -73,8 +73,8 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any]) -> None:
-    """``nodeProperties`` of a definition, or with a submission's overrides applied."""
+def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> None:
+    """``nodeProperties`` of a definition or, ``complete``, of a job, with the submission's overrides applied."""
     count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
     if not 1 <= count <= _MOST_NODES:
         raise ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
@@ -87,6 +87,10 @@ def check_nodes(properties: Mapping[str, Any]) -> None:
         if entry.get("container") is None:
             raise ClientError(f"node range {target[:20]}: only container properties are supported")
         check_container(entry["container"], f"node range {target[:20]}")
+        if complete and not entry["container"].get("command"):
+            raise ClientError(
+                f"node range {target[:20]}: has no command; give one in the definition or in the overrides"
+            )
         _check_target(target, count)
     try:
         needs = gang_needs(properties)
@@ -139,9 +143,7 @@ def check_container(container: Mapping[str, Any], where: str) -> None:
             raise ClientError(
                 f"environment variable {name[:100]!r}: neither '=' in the name nor a zero byte is possible"
             )
-    if not container.get("command"):
-        raise ClientError(f"{where}: has no command")
-    if any("\0" in part for part in container["command"]):
+    if any("\0" in part for part in container.get("command") or []):
         raise ClientError(f"{where}: a zero byte in the command")
     resources = container.get("resourceRequirements") or []
     kinds = [entry["type"] for entry in resources]
@@ -188,7 +190,8 @@ def substitute(properties: Mapping[str, Any], parameters: Mapping[str, str]) -> 
 
     result = copy.deepcopy(dict(properties))
     for entry in result["nodeRangeProperties"]:
-        entry["container"]["command"] = [_REFERENCE.sub(replace, part) for part in entry["container"]["command"]]
+        command = entry["container"].get("command") or []
+        entry["container"]["command"] = [_REFERENCE.sub(replace, part) for part in command]
     return result
 
 

@@ -108,17 +108,14 @@ def resume(
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
+    with controller.database.session() as session:
+        if earlier := _resumed(Context(session, controller, idempotency_key), run):
+            return earlier
+    chosen = _choose(run, checkpoint)  # reads all of a checkpoint: before anybody has to wait for it
     with controller.writing, controller.database.session() as session:
         context = Context(session, controller, idempotency_key)
-        if (earlier := submission.answered(context)) is not None:
-            kind = "train" if (spec_of(session, run) or {}).get("train") else "command"
-            began = _choose(run, checkpoint)
-            return {
-                **submission.answer(earlier),
-                "run": run.name,
-                "iteration": began.iteration if began else 0,
-                "kind": kind,
-            }
+        if earlier := _resumed(context, run):
+            return earlier
         document = spec_of(session, run)
         if document is None:
             raise ClientError(
@@ -133,7 +130,6 @@ def resume(
         except (ValueError, AttributeError, RecursionError):  # PyYAML's, for what only looks like a date or a number
             raise ClientError(f"run {run.name}: the value of a change is not valid YAML") from None
         _check_changes(run, before, spec)
-        chosen = _choose(run, checkpoint)
         environment = {"MUSTER_RUN": run.name}
         if spec.train:
             if chosen:
@@ -149,6 +145,23 @@ def resume(
         submitted = submission.submit_job(context, batch.validate("SubmitJob", request))
     controller.wake()
     return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
+
+
+def _resumed(context: Context, run: Run) -> dict[str, Any] | None:
+    """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
+    job = submission.answered(context)
+    if job is None:
+        return None
+    if job.run != run.name:
+        raise ClientError(f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", 409)
+    saved = list_checkpoints(run)
+    kind = "train" if (spec_of(context.session, run) or {}).get("train") else "command"
+    return {
+        **submission.answer(job),
+        "run": run.name,
+        "iteration": saved[-1].iteration if saved else 0,
+        "kind": kind,
+    }
 
 
 def last_metrics(run: Run) -> dict[str, Any] | None:

@@ -92,7 +92,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
-    rules.check_nodes(properties)
+    rules.check_nodes(properties, complete=True)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     job_id = str(uuid.uuid4())

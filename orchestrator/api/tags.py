@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api import rules
+from orchestrator.api import auth, rules
 from orchestrator.api.arns import split_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
@@ -20,7 +20,7 @@ _TABLES = {
 
 def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Add tags, or replace their values."""
-    resource = _resource(context, request["resourceArn"])
+    resource = _changeable(context, request["resourceArn"], "TagResource")
     tags = {**resource.tags, **request["tags"]}
     rules.check_tags(tags)
     resource.tags = tags
@@ -29,7 +29,7 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def untag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Remove tags; those that are not there are passed over."""
-    resource = _resource(context, request["resourceArn"])
+    resource = _changeable(context, request["resourceArn"], "UntagResource")
     resource.tags = {key: value for key, value in resource.tags.items() if key not in request["tagKeys"]}
     return {}
 
@@ -37,6 +37,18 @@ def untag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 def list_tags_for_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """The resource's tags."""
     return {"tags": _resource(context, request["resourceArn"]).tags}
+
+
+def _changeable(context: Context, arn: str, operation: str) -> Any:
+    """The resource, where the caller may change it. Raises ClientError."""
+    resource, identity = _resource(context, arn), auth.current_identity.get()
+    if isinstance(resource, Job):
+        identity.check_queue(resource.queue)
+    elif isinstance(resource, JobQueue):
+        identity.check_queue(resource.name)
+    else:
+        identity.check_all_queues(operation)
+    return resource
 
 
 def _resource(context: Context, arn: str) -> Any:

@@ -25,7 +25,7 @@ from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
 
 _FIRST_PORT = 29500
-_PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT")
+_PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE")
 """Variables of the controller that a job does not get."""
 
 
@@ -91,10 +91,14 @@ class LocalEngine:
         port = found[0][2] if found else _free_port(master)
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
-        for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
-            ended = index not in running and read_outcome(run, gang.job, gang.attempt, index) is not None
-            pid = 0 if ended else running.get(index) or self._start(plan, index, port)
-            nodes[index] = {"pid": pid, "start": _start_time(pid), "address": plan.nodes[index].contract.address}
+        try:
+            for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
+                ended = index not in running and read_outcome(run, gang.job, gang.attempt, index) is not None
+                pid = 0 if ended else running.get(index) or self._start(plan, index, port)
+                nodes[index] = {"pid": pid, "start": _start_time(pid), "address": plan.nodes[index].contract.address}
+        except BaseException:
+            _end(gang.name)  # never half a gang
+            raise
         return json.dumps({"gang": gang.name, "nodes": [nodes[index] for index in range(len(nodes))]})
 
     def observe(self, handle: str) -> GangStatus:
@@ -110,10 +114,7 @@ class LocalEngine:
         while any(_alive(node["pid"], node["start"]) for node in state["nodes"]) and time.monotonic() < deadline:
             time.sleep(0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
-        while pids := _processes(state["gang"]):
-            for pid in pids:
-                _signal(pid, signal.SIGKILL)
-            time.sleep(0.02)
+        _end(state["gang"])
 
     def _start(self, plan: Plan, index: int, port: int) -> int:
         node = plan.nodes[index]
@@ -199,6 +200,13 @@ def _processes(gang: str) -> list[int]:
     return [pid for pid, _ in _scan(gang)]
 
 
+def _end(gang: str) -> None:
+    while pids := _processes(gang):
+        for pid in pids:
+            _signal(pid, signal.SIGKILL)
+        time.sleep(0.02)
+
+
 def _supervisors(gang: str) -> list[tuple[int, int, int]]:
     """Pid, node index and master port of the gang's supervisors."""
     found = []
@@ -208,8 +216,8 @@ def _supervisors(gang: str) -> list[tuple[int, int, int]]:
         except OSError:
             continue
         index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0")  # a single-node job has none
-        # its ranks have a RANK; a supervisor that is still being given its mounts has another command in front
-        if b"worker.supervisor" in command and b"RANK" not in environment and index.isdigit():
+        # its ranks are children of it; a supervisor that is still being given its mounts has another command in front
+        if b"worker.supervisor" in command and b"TORCHELASTIC_ERROR_FILE" not in environment and index.isdigit():
             found.append((pid, int(index), int(environment[b"MASTER_PORT"])))
     return found
 

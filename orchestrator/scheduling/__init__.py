@@ -6,6 +6,7 @@ from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.scheduling.reasons import Board
 from orchestrator.scheduling.snapshot import (
     FairShare,
+    Leading,
     NodeShape,
     Pool,
     Queue,
@@ -21,6 +22,7 @@ __all__ = [
     "Cancel",
     "Decisions",
     "FairShare",
+    "Leading",
     "NodeShape",
     "Pool",
     "Preempt",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 
@@ -14,7 +14,7 @@ from orchestrator.scheduling.order import dispatch_order, turn
 from orchestrator.scheduling.quota import quota_of
 from orchestrator.scheduling.reasons import Board, Line
 from orchestrator.scheduling.room import Room, Seat
-from orchestrator.scheduling.snapshot import Queue, Snapshot, Waiting
+from orchestrator.scheduling.snapshot import Leading, Queue, Snapshot, Waiting
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +50,8 @@ class Decisions:
     preempts: tuple[Preempt, ...]
     cancels: tuple[Cancel, ...]
     board: Board
+    leading: Mapping[str, Leading]
+    """By queue; for the next snapshot."""
 
 
 def decide(snapshot: Snapshot) -> Decisions:
@@ -77,6 +79,7 @@ class _Pass:
         self.starts: list[Start] = []
         self.preempts: list[Preempt] = []
         self.cancels: list[Cancel] = []
+        self.leading: dict[str, Leading] = {}
 
     def run(self) -> Decisions:
         jobs: defaultdict[str, list[Waiting]] = defaultdict(list)
@@ -88,7 +91,7 @@ class _Pass:
         for name in sorted(jobs.keys() - queues.keys()):
             self.lines[name] = Line(dispatch_order(None, jobs[name], {}), None)
         board = Board(self.now, self.lines, self.heads, self.room, self.preempts)
-        return Decisions(tuple(self.starts), tuple(self.preempts), tuple(self.cancels), board)
+        return Decisions(tuple(self.starts), tuple(self.preempts), tuple(self.cancels), board, self.leading)
 
     def _serve(self, queue: Queue, jobs: list[Waiting]) -> None:
         """Offer what is free to the jobs of one queue, in their order."""
@@ -134,10 +137,16 @@ class _Pass:
             lane.quota.take(seat.pool, seat.placements)
 
     def _cancelled(self, queue: Queue, lane: Lane, job: Waiting) -> bool:
-        """Whether one of the queue's time limits ends the job, which is the first in its queue that does not start."""
+        """Whether one of the queue's time limits ends the job, which is the first in its queue that does not start.
+
+        Only the time at the head counts (AWS's API model): jobs behind it are stuck for another's sake.
+        """
         code = (lane.impossible(job.shape) or NO_ROOM).partition(" - ")[0]
+        before = self.snapshot.leading.get(queue.name)
+        since = before.since if before and (before.job, before.reason) == (job.job, code) else self.now
+        self.leading[queue.name] = Leading(job.job, code, since)
         for limit in queue.limits:
-            if limit.reason == code and self.now - job.since > limit.seconds * 1000:
+            if limit.reason == code and self.now - since > limit.seconds * 1000:
                 reason = f"Canceled by JobStateTimeLimit action due to reason: {code}"
                 self.cancels.append(Cancel(job.job, reason))
                 return True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -143,6 +143,17 @@ class Queue:
     limits: tuple[TimeLimit, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Leading:
+    """The first job of a queue that does not start."""
+
+    job: str
+    reason: str
+    """Code of why (``CAPACITY:…``, ``ACTION_REQUIRED…``)."""
+    since: int
+    """Since when it is that, for that reason [ms]."""
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """Everything that a pass depends on."""
@@ -158,3 +169,5 @@ class Snapshot:
     running: Sequence[Running]
     usage: Mapping[tuple[str, str], float]
     """(queue, share) → resource-seconds, decayed to now; a job without a share counts under the share ``""``."""
+    leading: Mapping[str, Leading] = field(default_factory=dict)
+    """By queue, of the last pass."""

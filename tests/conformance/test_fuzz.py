@@ -143,8 +143,9 @@ class Fuzzed(Serving):
             if call.method != "HEAD":
                 message = answer.json()["message"]
                 assert isinstance(message, str) and message, call
-        elif answer.is_success and "json" in answer.headers.get("content-type", "") and call.method != "HEAD":
-            json.loads(answer.content, parse_constant=lambda name: pytest.fail(f"{name} in the answer to {call}"))
+        elif answer.is_success and "json" in (kind := answer.headers.get("content-type", "")) and call.method != "HEAD":
+            for document in answer.content.splitlines() if "ndjson" in kind else [answer.content]:
+                json.loads(document, parse_constant=lambda name: pytest.fail(f"{name} in the answer to {call}"))
 
     def complaints(self) -> str:
         """What the server wrote to its standard error since the last call."""

@@ -261,6 +261,33 @@ def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None
     assert code(caught)[0] == "UnrecognizedClientException"
 
 
+def test_a_key_for_one_queue_changes_nothing_that_others_depend_on(served: Serving, home: Path, key: Key) -> None:
+    robots = KeyStore(home).create("robots", ("robots",))
+    own, all_of = (
+        client(served.url, robots.access_key_id, robots.secret),
+        client(served.url, key.access_key_id, key.secret),
+    )
+    prefix = "arn:aws:batch:us-east-1:000000000000:"
+    fair = {"shareDecaySeconds": 60}
+    policy = all_of.create_scheduling_policy(name="fair", fairsharePolicy=fair)["arn"]
+    all_of.register_job_definition(**definition("theirs"))
+    job = all_of.submit_job(jobName="theirs", jobQueue="default", jobDefinition="theirs")["jobId"]
+    for change in (
+        lambda: own.submit_job(jobName="x", jobQueue="default", jobDefinition="theirs"),
+        lambda: own.terminate_job(jobId=job, reason="x"),
+        lambda: own.update_job_queue(jobQueue="default", state="DISABLED"),
+        lambda: own.update_compute_environment(computeEnvironment="local", state="DISABLED"),
+        lambda: own.tag_resource(resourceArn=f"{prefix}compute-environment/local", tags={"muster:hosts": "nobody"}),
+        lambda: own.tag_resource(resourceArn=f"{prefix}job/{job}", tags={"a": "b"}),
+        lambda: own.untag_resource(resourceArn=f"{prefix}job-queue/default", tagKeys=["a"]),
+        lambda: own.update_scheduling_policy(arn=policy, fairsharePolicy=fair),
+        lambda: own.deregister_job_definition(jobDefinition="theirs:1"),
+    ):
+        with pytest.raises(ClientError, match="key robots may") as caught:
+            change()
+        assert code(caught) == ("AccessDeniedException", 403)
+
+
 def test_no_host_that_a_web_page_can_name_reaches_an_open_server(shared_server: Serving) -> None:
     for host in ("127.evil.example", "evil.example", "[", "127.0.0.1.evil.example", "localhost.evil.example", ""):
         assert httpx.get(f"{shared_server.url}/api/runs", headers={"Host": host}).status_code == 403, host

@@ -358,9 +358,17 @@ def test_a_submission_with_a_key_may_be_sent_twice(batch: Batch, parked: str) ->
     )
 
 
+def test_the_command_may_come_with_the_submission(batch: Batch) -> None:
+    properties = {key: value for key, value in container("true", {}).items() if key != "command"}
+    definition = batch.register("one-open", "container", containerProperties=properties)
+    job = batch.submit(definition, containerOverrides={"command": ["echo", "from the submission"]})
+    assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == ["from the submission"]
+    with refused("has no command; give one in the definition or in the overrides"):
+        batch.submit(definition)
+
+
 def test_a_container_definition_needs_no_image_of_ours_and_refuses_what_is_not_run(batch: Batch) -> None:
     for properties, message in [
-        ({"image": "any"}, "has no command"),
         ({**container("true", {}), "vcpus": 0}, "vcpus is 0"),
         ({**container("true", {}), "memory": 3}, "memory is 3"),
         (container("true", {"env": {"AWS_BATCH_JOB_ID": "x"}}), "are reserved"),

@@ -16,6 +16,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, select, text
 
 from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_now
+from orchestrator.client import ApiError
 from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
 from orchestrator.roster import Roster
 from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, now
@@ -169,6 +170,27 @@ def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) 
         assert sorted(roster.take_due()) == due, "what was pending may have become ready while nobody looked"
 
 
+def test_a_stop_that_comes_while_the_controller_writes_is_looked_at() -> None:
+    roster, stale = Roster(), job("a", status="RUNNABLE")
+    roster.look_again(["a"])  # a request has just ended the job
+    roster.note([stale])  # the controller commits what it had read before
+    assert list(roster.take_due()) == ["a"]
+
+
+def test_an_array_keeps_its_children_until_the_last_is_over(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        session.add_all(
+            [job("p", status="PENDING", kind="array"), job("p:0", status="FAILED", stopped_at=1, parent="p")]
+        )
+        session.add(job("p:1", status="RUNNING", parent="p"))
+        session.commit()
+        assert forget_before(session, 2000) == 0
+        for each in session.scalars(select(Job)):
+            each.status, each.stopped_at = "FAILED", 2
+        session.commit()
+        assert forget_before(session, 2000) == 3
+
+
 def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Database]) -> None:
     over = {"status": "SUCCEEDED", "stopped_at": 1000}
     with opened().session() as session:
@@ -222,12 +244,42 @@ def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) 
     }
 
 
+def test_a_controller_whose_lock_was_lost_takes_it_again_or_says_who_has_it(server: postgres.Server) -> None:
+    url = server.new_database()
+    database, others = Database(url), create_engine(url)
+
+    def cut() -> None:
+        with others.connect() as connection:
+            connection.execute(
+                text(
+                    "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND pid != pg_backend_pid()"
+                )
+            )
+
+    cut()
+    database.keep_lock()
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        Database(url)
+    cut()
+    second = Database(url)
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        database.keep_lock()
+    second.close()
+    database.keep_lock()
+    database.close()
+    others.dispose()
+
+
 def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.Server, tmp_path: Path) -> None:
     url = server.new_database()
     serving = Serving(tmp_path / "home", "--cpus", "2", "--database", url)
     try:
         job = serving.gang("print('hello from', __import__('os').environ['MUSTER_RUN'])", nodes=2, name="on-postgres")
         assert serving.wait(job)["status"] == "SUCCEEDED"
+        for operation, request in (("DescribeJobs", {"jobs": ["a\0"]}), ("ListJobs", {"jobQueue": "a\0"})):
+            with pytest.raises(ApiError, match="the database refuses a value") as refused:
+                serving.client.batch(operation, **request)
+            assert refused.value.status == 400
         serving.kill()
         serving.start()
         detail = serving.detail(job)

@@ -161,7 +161,8 @@ PRINT_ENVIRONMENT = "import json, os; print(json.dumps(dict(os.environ)))"
 
 
 def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("MUSTER_TOKEN", "MUSTER_URL"):
+    own = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD")
+    for name in own:
         monkeypatch.setenv(name, "/the/controller's/own")
     monkeypatch.setenv("INHERITED", "yes")
     gang = bench.gang(
@@ -181,7 +182,7 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, m
         expected = plan.nodes[index].contract.to_env()
         del expected["MASTER_PORT"]
         assert {name: found.get(name) for name in expected} == expected
-        assert not found.keys() & {"MUSTER_TOKEN", "MUSTER_URL"}
+        assert not found.keys() & set(own)
         assert "WARP_CACHE_PATH" in found
     first, second = bench.environments(2)
     assert (first["MINE"], second["MINE"]) == ("first", "second")
@@ -192,6 +193,12 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, m
     assert first["MASTER_PORT"] == second["MASTER_PORT"]
     main = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
     assert (first.get(main), second.get(main)) == (first["MASTER_ADDR"], None)
+
+
+def test_a_gang_that_can_not_be_started_whole_is_not_started_at_all(bench: Bench) -> None:
+    with pytest.raises(ValueError, match="null"):
+        bench.launch(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "a zero byte: \0"]]))
+    assert bench.processes() == []
 
 
 def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: Bench) -> None:

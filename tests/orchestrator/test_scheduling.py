@@ -11,6 +11,7 @@ from orchestrator.engines.base import Host, Placement
 from orchestrator.scheduling import (
     Decisions,
     FairShare,
+    Leading,
     NodeShape,
     Pool,
     Queue,
@@ -109,6 +110,7 @@ def snapshot(
     queues: Sequence[Queue] = (),
     pools: Sequence[Pool] = (),
     usage: Mapping[tuple[str, str], float] | None = None,
+    leading: Mapping[str, Leading] | None = None,
 ) -> Snapshot:
     return Snapshot(
         now=NOW,
@@ -118,7 +120,13 @@ def snapshot(
         waiting=waiting,
         running=held,
         usage=usage or {},
+        leading=leading or {},
     )
+
+
+def leads(name: str, reason: str, seconds: int, queue: str = "default") -> dict[str, Leading]:
+    """That job has been first in its queue for so long, for that reason."""
+    return {queue: Leading(f"{name}-0123456789", reason, NOW - 1000 * seconds)}
 
 
 def names(jobs: Iterable[str]) -> str:

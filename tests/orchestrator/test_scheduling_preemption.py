@@ -10,6 +10,7 @@ from tests.orchestrator.test_scheduling import (
     gang,
     host,
     job,
+    leads,
     line,
     names,
     node,
@@ -153,7 +154,14 @@ def test_a_job_stuck_first_in_its_queue_is_cancelled(code, shape, waited, late) 
     queues = [queue(limits=(*others, TimeLimit(code, 600)))]
     held = [running("cart", on("a", 1))]
     decisions = decide(
-        snapshot([host(cpus=4)], [job("x", shape, runnable=waited)], held, queues, pools=[pool(max_cpus=5)])
+        snapshot(
+            [host(cpus=4)],
+            [job("x", shape, runnable=999)],
+            held,
+            queues,
+            pools=[pool(max_cpus=5)],
+            leading=leads("x", code, waited),
+        )
     )
     if late:
         cancel = Cancel("x-0123456789", f"Canceled by JobStateTimeLimit action due to reason: {code}")
@@ -173,7 +181,7 @@ def test_only_the_first_that_does_not_start_is_cancelled_and_the_next_takes_its_
         job("next", gang(node(4)), runnable=999),
         job("small", runnable=999),
     )
-    decisions = decide(snapshot([host()], waiting, held, queues))
+    decisions = decide(snapshot([host()], waiting, held, queues, leading=leads("stuck", CAPACITY, 601)))
     assert started(decisions) == "runs:a"
     assert names(each.job for each in decisions.cancels) == "stuck"
     assert names(decisions.board.order("default")) == "next small"
@@ -181,24 +189,38 @@ def test_only_the_first_that_does_not_start_is_cancelled_and_the_next_takes_its_
     assert reason(decisions, "small").startswith("2nd in queue default, behind job next (next-012)")
 
 
+def test_only_the_time_at_the_head_counts_and_a_pass_tells_the_next_one_since_when_that_is() -> None:
+    queues = [queue(limits=(TimeLimit(CAPACITY, 600),))]
+    held, waiting = [running("cart", on("a", 4))], line(job("x", runnable=9999), job("y", runnable=9999))
+    first = decide(snapshot([host()], waiting, held, queues))
+    assert first.cancels == () and first.leading == leads("x", CAPACITY, 0)
+    again = decide(snapshot([host()], waiting, held, queues, leading=leads("x", CAPACITY, 500)))
+    assert again.cancels == () and again.leading == leads("x", CAPACITY, 500)
+    for before in (leads("y", CAPACITY, 999), leads("x", MAXIMUM, 999)):  # another job, another reason: from now on
+        assert decide(snapshot([host()], waiting, held, queues, leading=before)).leading == leads("x", CAPACITY, 0)
+
+
 def test_a_job_that_is_cancelled_preempts_nobody() -> None:
     queues = [queue("high", 9, limits=(TimeLimit(CAPACITY, 600),)), queue("low")]
     held = [running("cart", on("a", 4), queue="low", preemptible=True)]
-    decisions = decide(snapshot([host()], [job("ant", queue="high", runnable=601)], held, queues))
+    leading = leads("ant", CAPACITY, 601, "high")
+    decisions = decide(snapshot([host()], [job("ant", queue="high")], held, queues, leading=leading))
     assert (len(decisions.cancels), decisions.preempts) == (1, ())
 
 
 def test_the_first_of_a_queue_behind_the_head_of_another_is_stuck_too() -> None:
     queues = [queue("high", 9), queue("low", limits=(TimeLimit(CAPACITY, 600),))]
     held = [running("cart", on("a", 2))]
-    waiting = [job("ant", gang(node(4)), queue="high"), job("small", queue="low", runnable=601)]
-    assert names(each.job for each in decide(snapshot([host()], waiting, held, queues)).cancels) == "small"
+    waiting = [job("ant", gang(node(4)), queue="high"), job("small", queue="low")]
+    decisions = decide(snapshot([host()], waiting, held, queues, leading=leads("small", CAPACITY, 601, "low")))
+    assert names(each.job for each in decisions.cancels) == "small"
 
 
 def test_the_first_of_a_queue_is_stuck_too_where_an_equal_job_of_another_queue_was_tried_before() -> None:
     queues = [queue("high", 9), queue("low", limits=(TimeLimit(CAPACITY, 600),))]
-    waiting = [job("ant", gang(node(4)), queue="high"), job("cart", gang(node(4)), queue="low", runnable=601)]
-    decisions = decide(snapshot([host()], waiting, [running("held", on("a", 2))], queues))
+    waiting = [job("ant", gang(node(4)), queue="high"), job("cart", gang(node(4)), queue="low")]
+    leading = leads("cart", CAPACITY, 601, "low")
+    decisions = decide(snapshot([host()], waiting, [running("held", on("a", 2))], queues, leading=leading))
     assert names(each.job for each in decisions.cancels) == "cart"
 
 
