@@ -378,6 +378,10 @@ def main() -> None:
         f"{os.getloadavg()[1]:.1f}; an fdatasync takes {fsync:.1f} ms. Latencies in ms. Muster commits every acknowledged job to the "
         "disk (`synchronous=FULL`) and decides its place in the queue; moto keeps jobs in memory and calls them finished.",
         "",
+        "The goal of ten times moto's SubmitJob at 10,000 jobs is missed: moto's does not slow down with the number of jobs, and its "
+        "2.5 ms are those of an HTTP request in Python, which nothing in Python does in a tenth. Ours is as fast at 100,000 jobs; "
+        "DescribeJobs is several times moto's at 10,000.",
+        "",
     ]
     columns = "operation | client | clients | existing jobs | Muster per s | p50 | p99 | moto per s | p50 | p99 | ratio"
     text = "\n".join(

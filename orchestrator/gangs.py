@@ -256,8 +256,8 @@ class Gangs:
         number, progress = attempt.number, self._progress(job)
         if job.stop_reason is not None and ending not in (Ending.SUCCEEDED, Ending.FATAL, Ending.TIMEOUT):
             job.move(Status.FAILED, f"{job.stop_reason}{progress}" if _is_native(job) else job.stop_reason)
-        elif ending == Ending.SUCCEEDED:
-            job.move(Status.SUCCEEDED, verdict.reason)
+        elif ending == Ending.SUCCEEDED or (ending == Ending.PREEMPTED and self._is_done(job, ends)):
+            job.move(Status.SUCCEEDED, verdict.reason if ending == Ending.SUCCEEDED else "done before it was preempted")
         elif ending == Ending.PREEMPTED:
             job.move(Status.RUNNABLE, f"attempt {number} was {verdict.reason}{progress}")
         elif ending == Ending.REQUEUE and (not attempt.spent or tries_left):
@@ -267,6 +267,13 @@ class Gangs:
         else:
             of = f" (attempt {spent} of {job.attempts_allowed})" if ending == Ending.FAILED and _is_native(job) else ""
             job.move(Status.FAILED, f"{verdict.reason}{of}")
+
+    @staticmethod
+    def _is_done(job: Job, ends: Sequence[NodeEnd | None]) -> bool:
+        """Whether the main node had done its work when it was stopped; to leave with work to do is exit 75, or a signal's."""
+        main = int(job.node_properties["mainNode"])
+        head = ends[main] if main < len(ends) else None
+        return head is not None and head.exit_code == 0
 
     @staticmethod
     def _retries(job: Job, verdict: Verdict, ends: Sequence[NodeEnd | None]) -> bool:

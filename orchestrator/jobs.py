@@ -53,7 +53,7 @@ class Ending(StrEnum):
     FATAL = "fatal"
     """A failure after which the job is not tried again."""
     PREEMPTED = "preempted"
-    """Stopped in favour of another job: started again without spending an attempt, whatever it exited with."""
+    """Stopped in favour of another job: started again without spending an attempt, unless it was done (exit 0)."""
     REQUEUE = "requeue"
     """Checkpointed and left on request (exit 75): started again without spending an attempt."""
     STOPPED = "stopped"

@@ -166,7 +166,7 @@ def test_every_reason_of_a_time_limit_is_taken(batch: Batch, parked: str) -> Non
 
 
 def test_a_job_that_is_stuck_at_the_head_is_cancelled_by_its_queues_limit(server: Serving) -> None:
-    """The API takes no limit below ten minutes, so the start of the wait is set back in the database of a stopped server."""
+    """The API takes no limit below ten minutes, so a shorter one is written to the database of a stopped server."""
     batch = Batch(server)
     limit = {"reason": NO_ROOM, "state": "RUNNABLE", "maxTimeSeconds": 600, "action": "CANCEL"}
     batch.queue("q-limited", batch.pool("q-limited", cpus=1), jobStateTimeLimitActions=[limit])
@@ -176,15 +176,15 @@ def test_a_job_that_is_stuck_at_the_head_is_cancelled_by_its_queues_limit(server
     batch.reason(stuck, NO_ROOM)
     server.kill()
     with sqlite3.connect(server.home / "muster.db", timeout=30) as database:
-        changed = "UPDATE jobs SET runnable_at = runnable_at - 601000 WHERE id = ?"
-        assert database.execute(changed, [stuck]).rowcount == 1
+        changed = "UPDATE job_queues SET limits = replace(limits, '600', '2') WHERE name = 'q-limited'"
+        assert database.execute(changed).rowcount == 1
     server.start()
     batch = Batch(server)
     detail = batch.wait(stuck)
     assert detail["statusReason"] == f"Canceled by JobStateTimeLimit action due to reason: {NO_ROOM}"
     assert (detail["status"], detail["isCancelled"], detail["isTerminated"]) == ("FAILED", True, False)
     assert batch.describe(running)["status"] == "RUNNING"
-    assert batch.reason(behind, NO_ROOM) and batch.describe(behind)["status"] == "RUNNABLE"
+    assert batch.wait(behind)["stoppedAt"] >= detail["stoppedAt"] + 2000, "its time began when it came to the head"
 
 
 def test_a_scheduling_policy_can_be_replaced_but_not_taken_away(batch: Batch, parked: str) -> None:

@@ -185,7 +185,7 @@ def test_a_preemptible_job_makes_way_and_runs_again_without_spending_an_attempt(
     script = f"""
 trap 'echo checkpointed; exit 75' TERM
 echo attempt $AWS_BATCH_JOB_ATTEMPT
-case $AWS_BATCH_JOB_ATTEMPT in 1) {UNTIL.format("never")};; 2) exit 1;; esac
+case $AWS_BATCH_JOB_ATTEMPT in 1) {UNTIL.format("never")};; 2) [ $AWS_BATCH_JOB_NODE_INDEX = 0 ] && exit 1; {UNTIL.format("never")};; esac
 """
     native = {"MUSTER_ON_CHILD_FAILURE": "restart", "MUSTER_PREEMPTIBLE": "1", "GATE": str(tmp_path)}
     definition = batch.multinode("q-preempted", script, 2, env=native, cpus="0.5", retryStrategy={"attempts": 2})
