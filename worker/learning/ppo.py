@@ -25,7 +25,7 @@ from worker.learning.models import GROUP, build_models, example_observations
 from worker.learning.randomness import mix_seed
 
 if TYPE_CHECKING:
-    from worker.tasks.task import PPOConfig
+    from worker.tasks.config import PPOConfig
 
 LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
 """What :meth:`PPO.update` returns, in order; all are means over the samples of all ranks."""
