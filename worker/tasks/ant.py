@@ -20,7 +20,7 @@ from worker.simulation.episodes import (
     is_finite,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays
+from worker.simulation.worlds import WorldArrays, root_rotation
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
 from worker.tasks.task import Task
 
@@ -110,14 +110,6 @@ def scaled_position(worlds: WorldArrays, world: int, joint: int) -> float:
     return (2.0 * worlds.joint_q[world, FIRST_COORDINATE + joint] - ends[0] - ends[1]) / (ends[1] - ends[0])
 
 
-@wp.func
-def torso_rotation(worlds: WorldArrays, world: int) -> wp.quat:
-    """Rotation from torso to world."""
-    return wp.quat(
-        worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
-    )
-
-
 @wp.kernel
 def act(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArrays):
     """The action is each motor's share of its full torque, clipped to [-1, 1]."""
@@ -138,7 +130,7 @@ def write_observation(
     first_step: bool,
 ):
     """Torso height, velocities in the torso frame, attitude, then joints, then the action that led here."""
-    rotation = torso_rotation(worlds, world)
+    rotation = root_rotation(worlds, world)
     linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
     angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
     linear = wp.quat_rotate_inv(rotation, linear)
@@ -186,7 +178,7 @@ def place(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArray
 @wp.func
 def add_rewards(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
     """Every reward term of a step without a fall."""
-    rotation = torso_rotation(worlds, world)
+    rotation = root_rotation(worlds, world)
     heading = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))[0]
     upright = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))[2]
     effort = 0.0

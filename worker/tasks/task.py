@@ -110,6 +110,7 @@ class Task:
         for item in fields(config):
             if hasattr(self._parameters, item.name):
                 setattr(self._parameters, item.name, getattr(config, item.name))
+        self.read_model(self._parameters)
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
         with on_torch_stream(self.device):
@@ -125,6 +126,9 @@ class Task:
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
         raise NotImplementedError
+
+    def read_model(self, parameters: Any) -> None:
+        """Fill the fields of the kernels' parameters that the built model (``self.worlds``) tells; by default none."""
 
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
