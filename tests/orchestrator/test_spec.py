@@ -41,7 +41,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
 
 LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
-TASKS = "(known: Ant, Cartpole; your own: module:Class)"
+TASKS = "(known: Ant, Cartpole, Humanoid; your own: module:Class)"
 TOP = (
     "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, retry, "
     "on_child_failure, timeout, stall_timeout"
@@ -350,7 +350,7 @@ def test_lines_are_known_for_every_key(tmp_path: Path) -> None:
 
 
 def test_the_ppo_section_has_the_fields_of_the_worker_s_configuration() -> None:
-    module = ast.parse((REPOSITORY / "worker" / "tasks" / "task.py").read_text())  # importing it takes seconds
+    module = ast.parse((REPOSITORY / "worker" / "tasks" / "config.py").read_text())  # importing it takes seconds
     [theirs] = [each for each in module.body if isinstance(each, ast.ClassDef) and each.name == "PPOConfig"]
     fields = {
         each.target.id: ast.unparse(each.annotation)

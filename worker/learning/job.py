@@ -24,7 +24,8 @@ from shared_store.layout import Run, Store, StoreError
 from worker.errors import GangError, TrainingError, UserError
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task, TaskConfig
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
 
 EX_ERROR, EX_USAGE = 1, 2
 
@@ -134,6 +135,10 @@ def _as_type_of(default: Any, value: Any, where: str) -> Any:
         return value
     if isinstance(default, tuple) and isinstance(value, list | tuple):
         return tuple(_as_type_of(default[0], item, where) for item in value) if default else tuple(value)
+    if isinstance(default, Mapping):
+        if not isinstance(value, Mapping):
+            raise UserError(f"{where}: expected a mapping of {', '.join(default)}; got {value!r}")
+        return value
     if isinstance(default, float) and not isinstance(default, bool) and number:
         return float(value)
     if type(value) is type(default):

@@ -10,7 +10,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
 if TYPE_CHECKING:
-    from worker.tasks.task import PPOConfig
+    from worker.tasks.config import PPOConfig
 
 GROUP = "policy"
 """Name of the one observation group."""

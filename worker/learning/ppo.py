@@ -27,7 +27,7 @@ from worker.learning.randomness import mix_seed
 from worker.learning.recording import Recorded
 
 if TYPE_CHECKING:
-    from worker.tasks.task import PPOConfig
+    from worker.tasks.config import PPOConfig
 
 LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
 """What :meth:`PPO.update` returns, in order; all are means over the samples of all ranks."""

@@ -26,7 +26,8 @@ from worker.learning.report import Report, Stopwatch
 from worker.learning.state import TrainingState
 
 if TYPE_CHECKING:
-    from worker.tasks.task import Task, TaskConfig
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
 
 
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")

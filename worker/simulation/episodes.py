@@ -35,6 +35,7 @@ class EpisodeArrays:
         ages: Steps on the clock of the running episode, shape ``(worlds,)``.
         sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
+        weights: Weight of each reward term, shape ``(terms,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
             a reward term, worlds reset because of NaN, control steps with a solver overflow; shape ``(5 + terms,)``.
     """
@@ -48,6 +49,7 @@ class EpisodeArrays:
     ages: wp.array(dtype=wp.int32)
     sums: wp.array2d(dtype=wp.float32)
     random: wp.array2d(dtype=wp.int32)
+    weights: wp.array(dtype=wp.float32)
     statistics: wp.array(dtype=wp.float64)
 
 
@@ -78,9 +80,10 @@ def random_stream(episodes: EpisodeArrays, world: int) -> wp.uint32:
 
 @wp.func
 def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
-    """Add one reward term to the step's reward and to the episode's sums (``rewards`` was set to zero before)."""
-    episodes.rewards[world] = episodes.rewards[world] + value
-    episodes.sums[world, TERMS + term] = episodes.sums[world, TERMS + term] + value
+    """Add ``value`` times the term's weight to the step's reward and to the episode's sums (``rewards`` was set to zero)."""
+    weighted = episodes.weights[term] * value
+    episodes.rewards[world] = episodes.rewards[world] + weighted
+    episodes.sums[world, TERMS + term] = episodes.sums[world, TERMS + term] + weighted
 
 
 @wp.func

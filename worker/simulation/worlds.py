@@ -33,6 +33,14 @@ class WorldArrays:
     overflow: wp.array(dtype=wp.int32)
 
 
+@wp.func
+def root_rotation(worlds: WorldArrays, world: int) -> wp.quat:
+    """Rotation from a world's first body, which hangs on a free joint, to the world frame."""
+    return wp.quat(
+        worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
+    )
+
+
 # Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
 # constraints were dropped.
 _CAPACITY_BITS = wp.constant(

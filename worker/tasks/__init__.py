@@ -12,7 +12,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from worker.tasks.task import Task
 
-BUILT_IN = {"Cartpole": "worker.tasks.cartpole:Cartpole", "Ant": "worker.tasks.ant:Ant"}
+BUILT_IN = {
+    "Cartpole": "worker.tasks.cartpole:Cartpole",
+    "Ant": "worker.tasks.ant:Ant",
+    "Humanoid": "worker.tasks.humanoid:Humanoid",
+}
 """Tasks that are there even where the distribution's metadata is not (a source tree on the path)."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -19,8 +20,9 @@ from worker.simulation.episodes import (
     is_finite,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays
-from worker.tasks.task import PPOConfig, Task, TaskConfig
+from worker.simulation.worlds import WorldArrays, root_rotation
+from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,22 +56,13 @@ class AntConfig(TaskConfig):
     """Factor on joint velocities in observations and in the energy cost [s/rad]."""
     angular_velocity_scale: float = 0.25
     """Factor on the torso's angular velocity in observations [s/rad]."""
-    forward_weight: float = 1.0
-    """Reward of the torso's velocity along +x [s/m]."""
-    heading_weight: float = 0.5
-    """Reward of facing +x: whole where the cosine is above 0.8, in proportion below."""
-    up_weight: float = 0.1
-    """Reward of an upright torso (cosine to vertical above 0.93)."""
-    alive_reward: float = 0.5
-    """Reward of each step that does not end in a fall."""
-    action_cost: float = 0.005
-    """Cost of the sum of squared actions."""
-    energy_cost: float = 0.05
-    """Cost of the sum over joints of |action x scaled joint velocity|."""
-    limit_cost: float = 0.1
-    """Cost of each joint within 1 % of an end of its range."""
-    fall_cost: float = 2.0
-    """Cost of a fall, which replaces every other term of that step."""
+    rewards: Mapping[str, float] = reward_weights(
+        forward=1.0, heading=0.5, up=0.1, alive=0.5, action=-0.005, energy=-0.05, limits=-0.1, fall=-2.0
+    )
+    """Weights of: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion
+    below); an upright torso (cosine to vertical above 0.93); each step that does not end in a fall; the sum of squared
+    actions; the sum over joints of |action x scaled joint velocity|; each joint within 1 % of an end of its range; a fall,
+    which replaces every other term of that step."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=32,
@@ -94,14 +87,6 @@ class AntParameters:
     start_velocity_noise: float
     velocity_scale: float
     angular_velocity_scale: float
-    forward_weight: float
-    heading_weight: float
-    up_weight: float
-    alive_reward: float
-    action_cost: float
-    energy_cost: float
-    limit_cost: float
-    fall_cost: float
 
 
 @wp.func
@@ -125,14 +110,6 @@ def scaled_position(worlds: WorldArrays, world: int, joint: int) -> float:
     return (2.0 * worlds.joint_q[world, FIRST_COORDINATE + joint] - ends[0] - ends[1]) / (ends[1] - ends[0])
 
 
-@wp.func
-def torso_rotation(worlds: WorldArrays, world: int) -> wp.quat:
-    """Rotation from torso to world."""
-    return wp.quat(
-        worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
-    )
-
-
 @wp.kernel
 def act(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArrays):
     """The action is each motor's share of its full torque, clipped to [-1, 1]."""
@@ -153,7 +130,7 @@ def write_observation(
     first_step: bool,
 ):
     """Torso height, velocities in the torso frame, attitude, then joints, then the action that led here."""
-    rotation = torso_rotation(worlds, world)
+    rotation = root_rotation(worlds, world)
     linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
     angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
     linear = wp.quat_rotate_inv(rotation, linear)
@@ -201,7 +178,7 @@ def place(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArray
 @wp.func
 def add_rewards(parameters: AntParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
     """Every reward term of a step without a fall."""
-    rotation = torso_rotation(worlds, world)
+    rotation = root_rotation(worlds, world)
     heading = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))[0]
     upright = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))[2]
     effort = 0.0
@@ -214,14 +191,14 @@ def add_rewards(parameters: AntParameters, worlds: WorldArrays, episodes: Episod
         energy += wp.abs(action * velocity)
         if wp.abs(scaled_position(worlds, world, joint)) > 0.99:
             limits += 1.0
-    add_reward(episodes, world, 0, parameters.forward_weight * worlds.joint_qd[world, 0])
-    add_reward(episodes, world, 1, parameters.heading_weight * wp.min(heading / 0.8, 1.0))
+    add_reward(episodes, world, 0, worlds.joint_qd[world, 0])
+    add_reward(episodes, world, 1, wp.min(heading / 0.8, 1.0))
     if upright > 0.93:
-        add_reward(episodes, world, 2, parameters.up_weight)
-    add_reward(episodes, world, 3, parameters.alive_reward)
-    add_reward(episodes, world, 4, -parameters.action_cost * effort)
-    add_reward(episodes, world, 5, -parameters.energy_cost * energy)
-    add_reward(episodes, world, 6, -parameters.limit_cost * limits)
+        add_reward(episodes, world, 2, 1.0)
+    add_reward(episodes, world, 3, 1.0)
+    add_reward(episodes, world, 4, effort)
+    add_reward(episodes, world, 5, energy)
+    add_reward(episodes, world, 6, limits)
 
 
 @wp.kernel
@@ -234,7 +211,7 @@ def observe(mode: int, max_age: int, parameters: AntParameters, worlds: WorldArr
         fallen = valid and worlds.joint_q[world, 2] < parameters.fall_height
         episodes.rewards[world] = 0.0
         if fallen:
-            add_reward(episodes, world, 7, -parameters.fall_cost)
+            add_reward(episodes, world, 7, 1.0)
         elif valid:
             add_rewards(parameters, worlds, episodes, world)
         restart = end_step(episodes, worlds.overflow, world, fallen, valid, max_age)
@@ -258,7 +235,6 @@ class Ant(Task):
 
     config_type = AntConfig
     parameters_type = AntParameters
-    reward_terms = ("forward", "heading", "up", "alive", "action", "energy", "limits", "fall")
     observation_names = (
         "torso_height",
         *(f"torso_velocity_{axis}" for axis in "xyz"),

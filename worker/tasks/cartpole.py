@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -20,7 +21,8 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import WorldArrays
-from worker.tasks.task import PPOConfig, Task, TaskConfig
+from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,18 +47,12 @@ class CartpoleConfig(TaskConfig):
     """A start is uniform in +- this tilt [rad]."""
     start_velocity: float = 0.3
     """A start is uniform in +- this velocity of the cart [m/s] and of the pole [rad/s]."""
-    alive_reward: float = 0.1
-    """Reward of each step that does not end in a fall."""
-    angle_cost: float = 0.1
-    """Cost of the squared tilt [1/rad^2]."""
-    position_cost: float = 0.05
-    """Cost of the squared distance from the middle [1/m^2]."""
-    velocity_cost: float = 0.05
-    """Cost of the cart's squared velocity [s^2/m^2]: a cart that drifts meets the end of the rail too late to learn why."""
-    effort_cost: float = 0.001
-    """Cost of the squared action."""
-    fall_cost: float = 2.0
-    """Cost of leaving the rail or dropping the pole, once."""
+    rewards: Mapping[str, float] = reward_weights(
+        alive=0.1, angle=-0.1, position=-0.05, velocity=-0.05, effort=-0.001, fall=-2.0
+    )
+    """Weights of: each step that does not end in a fall; the squared tilt [1/rad^2]; the squared distance from the middle
+    [1/m^2]; the cart's squared velocity [s^2/m^2] (a cart that drifts meets the end of the rail too late to learn why); the
+    squared action; leaving the rail or dropping the pole, once."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01
@@ -74,12 +70,6 @@ class CartpoleParameters:
     start_position: float
     start_angle: float
     start_velocity: float
-    alive_reward: float
-    angle_cost: float
-    position_cost: float
-    velocity_cost: float
-    effort_cost: float
-    fall_cost: float
 
 
 @wp.kernel
@@ -124,13 +114,13 @@ def observe(mode: int, max_age: int, parameters: CartpoleParameters, worlds: Wor
 
         episodes.rewards[world] = 0.0
         if fallen:
-            add_reward(episodes, world, 5, -parameters.fall_cost)
+            add_reward(episodes, world, 5, 1.0)
         else:
-            add_reward(episodes, world, 0, parameters.alive_reward)
-        add_reward(episodes, world, 1, -parameters.angle_cost * angle * angle)
-        add_reward(episodes, world, 2, -parameters.position_cost * position * position)
-        add_reward(episodes, world, 3, -parameters.velocity_cost * velocity * velocity)
-        add_reward(episodes, world, 4, -parameters.effort_cost * effort * effort)
+            add_reward(episodes, world, 0, 1.0)
+        add_reward(episodes, world, 1, angle * angle)
+        add_reward(episodes, world, 2, position * position)
+        add_reward(episodes, world, 3, velocity * velocity)
+        add_reward(episodes, world, 4, effort * effort)
 
         restart = end_step(episodes, worlds.overflow, world, fallen, valid, max_age)
         if restart:
@@ -149,7 +139,6 @@ class Cartpole(Task):
 
     config_type = CartpoleConfig
     parameters_type = CartpoleParameters
-    reward_terms = ("alive", "angle", "position", "velocity", "effort", "fall")
     observation_names = ("slider_position", "hinge_position", "slider_velocity", "hinge_velocity")
     action_names = ("slider",)
     act: ClassVar[wp.Kernel] = act

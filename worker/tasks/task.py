@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from typing import Any, ClassVar
 
 import newton
@@ -14,58 +14,7 @@ from newton.solvers import SolverMuJoCo
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import RESET, STEP, EpisodeArrays, randomize_ages
 from worker.simulation.worlds import Worlds
-
-
-@dataclass(frozen=True)
-class PPOConfig:
-    """Proximal policy optimisation for one task."""
-
-    steps: int = 32
-    """Control steps of every world in one iteration."""
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and critic."""
-    activation: str = "elu"
-    """Activation between layers, by torch's lower-case name (``"elu"``, ``"relu"``, ``"tanh"``)."""
-    epochs: int = 5
-    """Passes over the collected batch in one iteration."""
-    minibatches: int = 4
-    """Parts into which each pass splits the batch."""
-    learning_rate: float = 1.0e-3
-    """Step size of Adam (the first one, where the schedule adapts it)."""
-    schedule: str = "adaptive"
-    """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays."""
-    desired_kl: float = 0.01
-    """KL divergence between old and new policy that the adaptive schedule aims at [nat]."""
-    gamma: float = 0.99
-    """Discount of the reward per control step."""
-    lam: float = 0.95
-    """Decay of generalised advantage estimation per control step."""
-    clip: float = 0.2
-    """Clip range of the probability ratio and of the value's change."""
-    entropy_coef: float = 0.0
-    """Weight of the entropy bonus in the loss."""
-    value_loss_coef: float = 1.0
-    """Weight of the value loss in the loss."""
-    max_grad_norm: float = 1.0
-    """Norm to which gradients are clipped."""
-    init_std: float = 1.0
-    """Initial standard deviation of the actions [unit of the action]."""
-    normalize_observations: bool = True
-    """Whether observations are normalised by their running mean and variance."""
-
-
-@dataclass(frozen=True)
-class TaskConfig:
-    """What every task has; a task adds its own fields."""
-
-    control_hz: float = 60.0
-    """Control steps per simulated second [Hz]."""
-    substeps: int = 2
-    """Physics steps of one control step."""
-    episode_seconds: float = 10.0
-    """Simulated time after which the clock ends an episode [s]."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """How the task is trained."""
+from worker.tasks.config import TaskConfig, default_rewards
 
 
 class Task:
@@ -106,7 +55,7 @@ class Task:
     parameters_type: ClassVar[Any]
     """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels."""
     reward_terms: ClassVar[tuple[str, ...]]
-    """Names of the reward terms, in the order of the kernel's indices."""
+    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
     observation_names: ClassVar[tuple[str, ...]]
     """Name of each observation, in order."""
     action_names: ClassVar[tuple[str, ...]]
@@ -119,6 +68,11 @@ class Task:
     """Whether the worlds stand on a ground plane."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if hasattr(cls, "config_type"):
+            cls.reward_terms = tuple(default_rewards(cls.config_type))
 
     def __init__(
         self, config: TaskConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
@@ -156,6 +110,7 @@ class Task:
         for item in fields(config):
             if hasattr(self._parameters, item.name):
                 setattr(self._parameters, item.name, getattr(config, item.name))
+        self.read_model(self._parameters)
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
         with on_torch_stream(self.device):
@@ -171,6 +126,9 @@ class Task:
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
         raise NotImplementedError
+
+    def read_model(self, parameters: Any) -> None:
+        """Fill the fields of the kernels' parameters that the built model (``self.worlds``) tells; by default none."""
 
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
@@ -291,6 +249,7 @@ class Task:
         self.episode_length = buffer("ages", (count,), wp.int32)
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
+        buffer("weights", (len(self.reward_terms),), wp.float32).copy_(torch.tensor(list(self.config.rewards.values())))
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
     def _state_tensors(self) -> dict[str, torch.Tensor]:

@@ -1,0 +1,98 @@
+"""What can be set of a task from its job's YAML: times, reward weights, training."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation for one task."""
+
+    steps: int = 32
+    """Control steps of every world in one iteration."""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actor and critic."""
+    activation: str = "elu"
+    """Activation between layers, by torch's lower-case name (``"elu"``, ``"relu"``, ``"tanh"``)."""
+    epochs: int = 5
+    """Passes over the collected batch in one iteration."""
+    minibatches: int = 4
+    """Parts into which each pass splits the batch."""
+    learning_rate: float = 1.0e-3
+    """Step size of Adam (the first one, where the schedule adapts it)."""
+    schedule: str = "adaptive"
+    """``"adaptive"``: the learning rate follows the KL divergence; ``"fixed"``: it stays."""
+    desired_kl: float = 0.01
+    """KL divergence between old and new policy that the adaptive schedule aims at [nat]."""
+    gamma: float = 0.99
+    """Discount of the reward per control step."""
+    lam: float = 0.95
+    """Decay of generalised advantage estimation per control step."""
+    clip: float = 0.2
+    """Clip range of the probability ratio and of the value's change."""
+    entropy_coef: float = 0.0
+    """Weight of the entropy bonus in the loss."""
+    value_loss_coef: float = 1.0
+    """Weight of the value loss in the loss."""
+    max_grad_norm: float = 1.0
+    """Norm to which gradients are clipped."""
+    init_std: float = 1.0
+    """Initial standard deviation of the actions [unit of the action]."""
+    normalize_observations: bool = True
+    """Whether observations are normalised by their running mean and variance."""
+
+
+def reward_weights(**weights: float) -> Any:
+    """The ``rewards`` field of a task's configuration: its terms in the order of the kernel's indices, with their weights.
+
+    Args:
+        **weights: Default weight of each term; that of a cost is negative.
+    """
+    return field(default_factory=lambda: MappingProxyType(weights))
+
+
+def default_rewards(config_type: type[TaskConfig]) -> Mapping[str, float]:
+    """Terms and weights as ``config_type`` defines them, in the order of the kernel's indices."""
+    factory: Any = next(item.default_factory for item in fields(config_type) if item.name == "rewards")
+    weights: Mapping[str, float] = factory()
+    return weights
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """What every task has; a task adds its own fields.
+
+    Raises:
+        ValueError: ``rewards`` names a term that the task does not have, or a weight is not a finite number.
+    """
+
+    control_hz: float = 60.0
+    """Control steps per simulated second [Hz]."""
+    substeps: int = 2
+    """Physics steps of one control step."""
+    episode_seconds: float = 10.0
+    """Simulated time after which the clock ends an episode [s]."""
+    rewards: Mapping[str, float] = reward_weights()
+    """Weight of each reward term. Who gives some names changes those; the others keep the task's defaults."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """How the task is trained."""
+
+    def __post_init__(self) -> None:
+        known = default_rewards(type(self))
+        for name, weight in self.rewards.items():
+            if name not in known:
+                near = difflib.get_close_matches(str(name), known, n=1)
+                hint = f"did you mean {near[0]}? " if near else ""
+                raise ValueError(
+                    f"rewards: {type(self).__name__} has no term {name!r}; {hint}its terms are {', '.join(known)}"
+                )
+            if isinstance(weight, bool) or not isinstance(weight, int | float) or not math.isfinite(weight):
+                raise ValueError(f"rewards.{name}: expected a finite number as the weight, got {weight!r}")
+        weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
+        object.__setattr__(self, "rewards", MappingProxyType(weights))
