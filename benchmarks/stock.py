@@ -12,7 +12,8 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from worker.tasks.task import PPOConfig, Task
+from worker.tasks.config import PPOConfig
+from worker.tasks.task import Task
 
 
 class StockEnv(VecEnv):

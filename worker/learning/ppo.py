@@ -284,7 +284,7 @@ class PPO(RslPPO):
     def _share_moments(self) -> None:
         """Count, sum and sum of squares of advantages and of observations, with the caller's extras: one collective."""
         advantages, size = self.storage.advantages, self._observations.shape[-1]
-        self._sums[0] = advantages.numel()
+        self._sums[0].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
         self._sums[1] = advantages.sum(dtype=torch.float64)
         self._sums[2] = advantages.double().square().sum()
         if self.actor.obs_normalization:

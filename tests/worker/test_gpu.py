@@ -1,0 +1,46 @@
+"""What only a GPU shows: capture, silence of the host, and that a graph does what the same code does eagerly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+def runner(store: Path, task: str, worlds: int = 256):  # type: ignore[no-untyped-def]
+    from benchmarks.gpu import build
+
+    return build(task, worlds, store)
+
+
+@pytest.mark.parametrize("task", ["Cartpole", "Ant"])
+def test_an_iteration_is_two_graphs_and_never_waits_for_the_device(tmp_path: Path, task: str) -> None:
+    training = runner(tmp_path, task)
+    for _ in range(3):
+        training._iterate()
+    parts = [training._collecting, *training.ppo.recordings]
+    assert all(part.captured for part in parts) and training.task.captured
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(3):
+            training._iterate()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert training.state.progress.iteration == 6
+
+
+def test_a_graph_computes_what_the_same_code_computes_eagerly(tmp_path: Path) -> None:
+    found = []
+    for eager in (False, True):
+        training = runner(tmp_path / str(eager), "Cartpole")
+        if eager:
+            for part in (training._collecting, *training.ppo.recordings):
+                part._cuda = False
+        records = [training._iterate()[0] for _ in range(5)]
+        weights = torch.cat([p.detach().flatten() for p in training.ppo.actor.parameters()])
+        found.append((torch.tensor([[r["surrogate_loss"], r["value_loss"], r["kl"]] for r in records]), weights))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=2e-3, atol=1e-5)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=2e-3, atol=1e-4)
