@@ -14,6 +14,7 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from rsl_rl.algorithms.ppo import PPO as RslPPO
 from rsl_rl.storage.rollout_storage import RolloutStorage
 
 from worker.distributed import Gang
+from worker.learning import linear
 from worker.learning.models import GROUP, build_models, example_observations
 from worker.learning.randomness import mix_seed
 from worker.learning.recording import Recorded
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
 """What :meth:`PPO.update` returns, in order; all are means over the samples of all ranks."""
 
+COLLECTIVES_IN_GRAPH = True
+"""Whether a gang's collectives are part of the graph of learning, or stand between smaller graphs."""
 RATE_LIMITS = (1e-5, 1e-2)
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within these limits."""
@@ -156,9 +160,23 @@ class PPO(RslPPO):
         """Which samples each minibatch has; and what of learning the device replays as graphs."""
         count = self.num_learning_epochs * self.num_mini_batches
         self._orders = torch.zeros(count, self._batch, dtype=torch.long, device=self.device)
+        self._rows = torch.zeros(self._batch, dtype=torch.long, device=self.device)
         self._losses_mean = torch.zeros(len(LOSSES), device=self.device)
-        self.recordings = [Recorded(self._learn, self.device, "learning")]
+        parts = (
+            self._estimate,
+            self._normalize_advantages,
+            self._compute_gradients,
+            self._apply_gradients,
+            self._close,
+        )
+        if COLLECTIVES_IN_GRAPH or self.gang.size == 1:
+            self.recordings = [Recorded(self._learn, self.device, "learning")]
+        else:
+            self.recordings = [
+                Recorded(part, self.device, part.__name__.strip("_").replace("_", " ")) for part in parts
+            ]
         """What is recorded, for the run's log."""
+        self._parts: Sequence[Callable[[], None]] = parts if len(self.recordings) == 1 else self.recordings
 
     @property
     def learning_rate(self) -> float:
@@ -233,23 +251,35 @@ class PPO(RslPPO):
     def learn(self, observations: torch.Tensor) -> torch.Tensor:
         """:meth:`compute_returns`, then :meth:`update`, as one recording; returns the mean :data:`LOSSES`, shape (4,)."""
         self._last_observations.copy_(observations)
-        self.recordings[0]()
+        if len(self.recordings) == 1:
+            self.recordings[0]()
+        else:
+            self._learn()
         return self._losses_mean
 
     def _learn(self) -> None:
         self.compute_returns(self._last_observations)
         self.update()
 
-    @torch.no_grad()
     def compute_returns(self, observations: torch.Tensor) -> None:
         """Values, GAE (Schulman et al. 2015, arXiv:1506.02438, eq. 16) and advantages normalised over all ranks' samples.
 
         Args:
             observations: After the last step, shape (worlds, observations).
         """
+        if observations is not self._last_observations:
+            self._last_observations.copy_(observations)
+        estimate, normalize, *_ = self._parts
+        estimate()
+        self.gang.sum(self._sums)
+        normalize()
+
+    @torch.no_grad()
+    def _estimate(self) -> None:
+        """Values and advantages of this rank's samples, and their moments."""
         st = self.storage
         st.values.copy_(self.critic.mlp(self._latents))
-        last = self.critic.mlp(self.critic.get_latent({GROUP: observations}))
+        last = self.critic.mlp(self.critic.get_latent({GROUP: self._last_observations}))
         self._bootstrap()
         self.actor.distribution.update(st.distribution_params[0])
         st.actions_log_prob[..., 0].copy_(self.actor.distribution.log_prob(st.actions))
@@ -261,11 +291,18 @@ class PPO(RslPPO):
         for step in range(st.num_transitions_per_env - 2, -1, -1):
             torch.addcmul(delta[step], decay[step], st.advantages[step + 1], out=st.advantages[step])
         torch.add(st.advantages, st.values, out=st.returns)
-        self._share_moments()
+        self._gather_moments()
+
+    @torch.no_grad()
+    def _normalize_advantages(self) -> None:
+        """By the moments over all ranks; then all is ready for the minibatches."""
+        st = self.storage
         count, total, squares = self._sums[0], self._sums[1], self._sums[2]
         mean = total / count
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
         st.advantages.sub_(mean).div_(deviation + 1e-8)
+        self._loss_sums.zero_()
+        self._pack_samples()
 
     def _bootstrap(self) -> None:
         """Where an episode was cut by the clock, its future is the value of the observation at which it was cut."""
@@ -281,8 +318,8 @@ class PPO(RslPPO):
         )  # the other rows may hold anything, NaN too
         self.storage.rewards.add_(future, alpha=self.gamma)
 
-    def _share_moments(self) -> None:
-        """Count, sum and sum of squares of advantages and of observations, with the caller's extras: one collective."""
+    def _gather_moments(self) -> None:
+        """Count, sum and sum of squares of advantages and of observations, beside the caller's extras, to be summed over the ranks."""
         advantages, size = self.storage.advantages, self._observations.shape[-1]
         self._sums[0].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
         self._sums[1] = advantages.sum(dtype=torch.float64)
@@ -292,16 +329,17 @@ class PPO(RslPPO):
             offsets = (self._observations - self.actor.obs_normalizer._mean).flatten(0, 1)
             self._sums[3 : 3 + size] = offsets.sum(0, dtype=torch.float64)
             self._sums[3 + size : 3 + 2 * size] = offsets.square_().sum(0, dtype=torch.float64)
-        self.gang.sum(self._sums)
 
     def update(self) -> torch.Tensor:
         """All epochs and minibatches; returns the mean :data:`LOSSES`, shape (4,), on the device."""
-        self._loss_sums.zero_()
-        self._pack_samples()
+        *_, compute, apply, close = self._parts
         for rows in self._orders:
-            self._update_minibatch(self._samples[rows])
-        self._update_normalizer()
-        return torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
+            self._rows.copy_(rows)
+            compute()
+            self.gang.sum(self._shared)
+            apply()
+        close()
+        return self._losses_mean
 
     def _pack_samples(self) -> None:
         """Rows of everything that a minibatch reads, so that it takes one gather."""
@@ -317,24 +355,28 @@ class PPO(RslPPO):
         )
         torch.cat([column.flatten(0, 1) for column in columns], dim=1, out=self._samples)
 
-    def _update_minibatch(self, samples: torch.Tensor) -> None:
-        """One step of Adam on ``samples``, shape (minibatch, columns), and on the other ranks' samples."""
-        self._shared.zero_()
-        self._compute_gradients(samples)
-        self.gang.sum(self._shared)
+    def _apply_gradients(self) -> None:
+        """One step of Adam with the gradients and losses of all ranks."""
         self._loss_sums.add_(self._losses)
         self._adapt_learning_rate(self._losses[LOSSES.index("kl")])
         for gradient in self._gradients:
-            norm = torch.linalg.vector_norm(gradient)
+            norm = torch.dot(gradient, gradient).sqrt()
             gradient.mul_((self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0))
         self.optimizer.step()
 
-    def _compute_gradients(self, samples: torch.Tensor) -> None:
+    def _close(self) -> None:
+        """After the last minibatch."""
+        self._update_normalizer()
+        torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
+
+    def _compute_gradients(self) -> None:
         """The clipped objective (arXiv:1707.06347, eq. 7 and 9), as rsl-rl has it, weighted by this rank's part of the samples."""
+        self._shared.zero_()
+        samples = self._samples[self._rows]
         latents, actions, old_mean, old_log_prob, advantages, returns, old_values = samples.split(self._columns, dim=1)
         distribution = self.actor.distribution
-        distribution.update(self.actor.mlp(latents))
-        values = self.critic.mlp(latents)
+        distribution.update(linear.forward(self.actor.mlp, latents))
+        values = linear.forward(self.critic.mlp, latents)
         ratio = torch.exp(distribution.log_prob(actions) - old_log_prob[:, 0])
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages[:, 0] * ratio, -advantages[:, 0] * clipped).mean()
