@@ -53,7 +53,9 @@ class Task:
     config_type: ClassVar[type[TaskConfig]]
     """Type of the configuration."""
     parameters_type: ClassVar[Any]
-    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels."""
+    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels.
+
+    A pair of numbers becomes a ``wp.vec2``."""
     reward_terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
     observation_names: ClassVar[tuple[str, ...]]
@@ -66,6 +68,8 @@ class Task:
     """Kernel ``(mode, max_age, parameters, worlds, episodes)`` over worlds; see :mod:`worker.simulation.episodes`."""
     ground: ClassVar[bool] = False
     """Whether the worlds stand on a ground plane."""
+    memory_size: ClassVar[int] = 0
+    """Numbers that the kernels keep of each world in ``episodes.memory``, such as commands; they are part of the state."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
 
@@ -109,7 +113,8 @@ class Task:
         self._parameters = self.parameters_type()
         for item in fields(config):
             if hasattr(self._parameters, item.name):
-                setattr(self._parameters, item.name, getattr(config, item.name))
+                value = getattr(config, item.name)
+                setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
         self.read_model(self._parameters)
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
@@ -249,13 +254,16 @@ class Task:
         self.episode_length = buffer("ages", (count,), wp.int32)
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
+        self._memory = buffer("memory", (count, self.memory_size), wp.float32)
         buffer("weights", (len(self.reward_terms),), wp.float32).copy_(torch.tensor(list(self.config.rewards.values())))
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
     def _state_tensors(self) -> dict[str, torch.Tensor]:
         """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
         arrays = self.worlds.arrays
+        memory = {"memory": self._memory} if self.memory_size else {}
         return {
+            **memory,
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
