@@ -13,6 +13,7 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import RESET, STEP, EpisodeArrays, randomize_ages
+from worker.simulation.randomization import Randomizer
 from worker.simulation.worlds import Worlds
 from worker.tasks.config import TaskConfig, default_rewards
 
@@ -47,6 +48,7 @@ class Task:
         episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
+        randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
     """
 
@@ -118,7 +120,9 @@ class Task:
         self.read_model(self._parameters)
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
+        self.seed(seed)
         with on_torch_stream(self.device):
+            self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz)
             self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
         self._graph = CapturedStep(self._launch_step, self.device)
         self._assert_captured()
@@ -194,7 +198,8 @@ class Task:
             state: As returned by :meth:`state_dict` of the same task with as many worlds.
 
         Raises:
-            ValueError: A tensor is missing, unknown, or of another shape or type; nothing was changed.
+            ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn
+                otherwise; nothing was changed.
         """
         tensors = self._state_tensors()
         task = type(self).__name__
@@ -208,6 +213,11 @@ class Task:
                 raise ValueError(
                     f"the saved state of task {task} does not fit: {name} is {tuple(saved.shape)} {saved.dtype}, "
                     f"expected {tuple(tensor.shape)} {tensor.dtype}"
+                )
+            if name == "world_factors" and not torch.equal(saved, tensor.cpu()):
+                raise ValueError(
+                    f"the saved state of task {task} does not fit: its worlds have other physics; use the same seed, "
+                    "first world and randomize"
                 )
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
@@ -255,7 +265,7 @@ class Task:
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
         self._memory = buffer("memory", (count, self.memory_size), wp.float32)
-        buffer("weights", (len(self.reward_terms),), wp.float32).copy_(torch.tensor(list(self.config.rewards.values())))
+        self._episodes.weights = wp.array(list(self.config.rewards.values()), dtype=wp.float32, device=device)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
     def _state_tensors(self) -> dict[str, torch.Tensor]:
@@ -264,6 +274,7 @@ class Task:
         memory = {"memory": self._memory} if self.memory_size else {}
         return {
             **memory,
+            **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
@@ -288,12 +299,14 @@ class Task:
 
     def _launch_step(self) -> None:
         """The whole control step, as launches: what the graph holds."""
+        self.randomizer.push()
         wp.launch(
             self.act,
             dim=self.world_count,
             inputs=[self._parameters, self.worlds.arrays, self._episodes],
             device=self.device,
         )
+        self.randomizer.delay()
         self.worlds.simulate()
         self._launch_observe(STEP)
 
@@ -304,3 +317,4 @@ class Task:
             inputs=[int(mode), self.max_episode_length, self._parameters, self.worlds.arrays, self._episodes],
             device=self.device,
         )
+        self.randomizer.add_noise(int(mode))
