@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import mujoco
@@ -22,7 +19,6 @@ from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.task import Task
 
 torch.set_num_threads(1)
-REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -222,42 +218,6 @@ def test_worlds_are_the_same_however_they_are_dealt_out(cartpole: Cartpole) -> N
     assert len(set(ages.tolist())) > 4 and (ages >= 0).all() and (ages < 300).all()
     other = Cartpole(CartpoleConfig(), 4, seed=2, first_world=0)
     assert not torch.equal(other.observations, parts[0][0][0])
-
-
-RESUME = """
-import sys, torch
-from worker.tasks.ant import Ant, AntConfig
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from tests.worker.test_tasks import play
-saved = torch.load(sys.argv[1], weights_only=True)
-tasks = {"Cartpole": Cartpole(CartpoleConfig(), 8, seed=99), "Ant": Ant(AntConfig(episode_seconds=0.5), 8, seed=99)}
-for name, task in tasks.items():
-    task.load_state_dict(saved[name])
-torch.save({name: [list(step) for step in play(task, 80, seed=8)] for name, task in tasks.items()}, sys.argv[2])
-"""
-
-
-def test_a_fresh_process_goes_on_bit_for_bit(cartpole: Cartpole, ant: Ant, tmp_path: Path) -> None:
-    tasks = {"Cartpole": cartpole, "Ant": ant}
-    saved = {}
-    for name, task in tasks.items():
-        put(task)
-        play(task, 20, seed=7)
-        saved[name] = task.state_dict()
-        assert all(len(tensor) == 8 for tensor in saved[name].values())
-    torch.save(saved, tmp_path / "saved.pt")
-    subprocess.run(
-        [sys.executable, "-c", RESUME, str(tmp_path / "saved.pt"), str(tmp_path / "out.pt")],
-        check=True,
-        cwd=REPOSITORY,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        timeout=300,
-    )
-    resumed = torch.load(tmp_path / "out.pt", weights_only=True)
-    for name, task in tasks.items():
-        going_on = play(task, 80, seed=8)
-        assert same(going_on, resumed[name])
-        assert sum(int(step[2].sum()) for step in going_on) > 8, "resets were compared, too"
 
 
 def test_the_warm_start_belongs_to_the_state(ant: Ant) -> None:

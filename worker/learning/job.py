@@ -135,6 +135,12 @@ def _as_type_of(default: Any, value: Any, where: str) -> Any:
         return value
     if isinstance(default, tuple) and isinstance(value, list | tuple):
         return tuple(_as_type_of(default[0], item, where) for item in value) if default else tuple(value)
+    if dataclasses.is_dataclass(default):
+        if not isinstance(value, Mapping):
+            raise UserError(
+                f"{where}: expected a mapping of keys such as {dataclasses.fields(default)[0].name}; got {value!r}"
+            )
+        return _override(default, value, where)
     if isinstance(default, Mapping):
         if not isinstance(value, Mapping):
             raise UserError(f"{where}: expected a mapping of {', '.join(default)}; got {value!r}")
@@ -143,6 +149,8 @@ def _as_type_of(default: Any, value: Any, where: str) -> Any:
         return float(value)
     if type(value) is type(default):
         return value
+    if isinstance(default, tuple):
+        raise UserError(f"{where}: expected a list, as in {list(default)}; got {value!r}")
     raise UserError(f"{where}: expected {type(default).__name__}, as in {default!r}; got {value!r}")
 
 

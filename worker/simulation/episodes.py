@@ -36,6 +36,7 @@ class EpisodeArrays:
         sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
         weights: Weight of each reward term, shape ``(terms,)``.
+        memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
             a reward term, worlds reset because of NaN, control steps with a solver overflow; shape ``(5 + terms,)``.
     """
@@ -50,6 +51,7 @@ class EpisodeArrays:
     sums: wp.array2d(dtype=wp.float32)
     random: wp.array2d(dtype=wp.int32)
     weights: wp.array(dtype=wp.float32)
+    memory: wp.array2d(dtype=wp.float32)
     statistics: wp.array(dtype=wp.float64)
 
 
@@ -88,9 +90,10 @@ def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
 
 @wp.func
 def begin_episode(episodes: EpisodeArrays, world: int):
-    """Clear a world's clock and sums."""
+    """Clear a world's clock, sums and memory."""
     episodes.ages[world] = 0
     clear_row(episodes.sums, world)
+    clear_row(episodes.memory, world)
 
 
 @wp.func

@@ -22,6 +22,7 @@ class WorldArrays:
         joint_qd: Joint velocities [m/s, rad/s], shape ``(worlds, dofs)``. A free joint holds the linear velocity of its
             body's centre of mass and then the angular velocity, both in the world frame.
         controls: Actuator inputs in the order of the model file [actuator's own unit], shape ``(worlds, actuators)``.
+        drives: Forces of the actuators on the joints in the last physics step [N, N m], shape ``(worlds, dofs)``.
         warm_start: Accelerations [m/s^2, rad/s^2] from which the constraint solver starts, shape ``(worlds, dofs)``.
         overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
     """
@@ -29,6 +30,7 @@ class WorldArrays:
     joint_q: wp.array2d(dtype=wp.float32)
     joint_qd: wp.array2d(dtype=wp.float32)
     controls: wp.array2d(dtype=wp.float32)
+    drives: wp.array2d(dtype=wp.float32)
     warm_start: wp.array2d(dtype=wp.float32)
     overflow: wp.array(dtype=wp.int32)
 
@@ -106,6 +108,7 @@ class Worlds:
         self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
         self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
         self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
+        self.arrays.drives = self.solver.mjw_data.qfrc_actuator
         self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
         self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
 

@@ -16,6 +16,7 @@ BUILT_IN = {
     "Cartpole": "worker.tasks.cartpole:Cartpole",
     "Ant": "worker.tasks.ant:Ant",
     "Humanoid": "worker.tasks.humanoid:Humanoid",
+    "Quadruped": "worker.tasks.quadruped:Quadruped",
 }
 """Tasks that are there even where the distribution's metadata is not (a source tree on the path)."""
 

@@ -48,6 +48,58 @@ class PPOConfig:
     """Whether observations are normalised by their running mean and variance."""
 
 
+@dataclass(frozen=True)
+class Randomization:
+    """How the worlds of a task differ from one another. Factors are uniform in ``[least, greatest]``, one for each world.
+
+    Raises:
+        ValueError: A range is no range, or a number is out of range.
+    """
+
+    mass: tuple[float, float] = (1.0, 1.0)
+    """Factor on masses and inertias."""
+    friction: tuple[float, float] = (1.0, 1.0)
+    """Factor on the friction of everything that touches."""
+    damping: tuple[float, float] = (1.0, 1.0)
+    """Factor on the damping of the joints."""
+    gains: tuple[float, float] = (1.0, 1.0)
+    """Factor on the strength of the actuators: a motor's torque, a servo's stiffness and damping."""
+    gravity: tuple[float, float] = (1.0, 1.0)
+    """Factor on gravity."""
+    push_interval: float = 0.0
+    """Mean simulated time between two pushes of a world, which come at random [s]; 0: none."""
+    push_velocity: float = 0.0
+    """A push adds velocities uniform in +- this to the robot's, along the world's x and y [m/s]."""
+    observation_noise: float = 0.0
+    """Standard deviation of the normal noise on every observation [the observation's own unit]."""
+    action_latency: int = 0
+    """Greatest number of control steps by which controls reach the actuators late; each episode draws its own, from 0."""
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "friction", "damping", "gains", "gravity"):
+            ends = getattr(self, name)
+            pair = isinstance(ends, list | tuple) and len(ends) == 2 and all(_is_finite(end) for end in ends)
+            if not pair or not 0.0 <= ends[0] <= ends[1] or (name == "mass" and ends[0] == 0.0):
+                least = "above 0" if name == "mass" else "of 0 or more"
+                shown = list(ends) if isinstance(ends, tuple) else ends
+                raise ValueError(f"{name}: expected [least, greatest], two factors {least}; got {shown!r}")
+            object.__setattr__(self, name, (float(ends[0]), float(ends[1])))
+        for name in ("push_interval", "push_velocity", "observation_noise"):
+            value = getattr(self, name)
+            if not _is_finite(value) or value < 0.0:
+                raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
+        if not isinstance(self.action_latency, int) or not 0 <= self.action_latency <= 64:
+            raise ValueError(
+                f"action_latency: expected a whole number of steps from 0 to 64, got {self.action_latency!r}"
+            )
+        if bool(self.push_interval) != bool(self.push_velocity):
+            raise ValueError("push_interval and push_velocity: give both, or none")
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def reward_weights(**weights: float) -> Any:
     """The ``rewards`` field of a task's configuration: its terms in the order of the kernel's indices, with their weights.
 
@@ -69,7 +121,8 @@ class TaskConfig:
     """What every task has; a task adds its own fields.
 
     Raises:
-        ValueError: ``rewards`` names a term that the task does not have, or a weight is not a finite number.
+        ValueError: ``rewards`` names a term that the task does not have, a weight is not a finite number, or ``randomize``
+            is not a mapping of its fields.
     """
 
     control_hz: float = 60.0
@@ -80,6 +133,8 @@ class TaskConfig:
     """Simulated time after which the clock ends an episode [s]."""
     rewards: Mapping[str, float] = reward_weights()
     """Weight of each reward term. Who gives some names changes those; the others keep the task's defaults."""
+    randomize: Randomization = Randomization()
+    """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How the task is trained."""
 
@@ -92,7 +147,12 @@ class TaskConfig:
                 raise ValueError(
                     f"rewards: {type(self).__name__} has no term {name!r}; {hint}its terms are {', '.join(known)}"
                 )
-            if isinstance(weight, bool) or not isinstance(weight, int | float) or not math.isfinite(weight):
+            if not _is_finite(weight):
                 raise ValueError(f"rewards.{name}: expected a finite number as the weight, got {weight!r}")
         weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
+        if isinstance(self.randomize, Mapping):
+            try:
+                object.__setattr__(self, "randomize", Randomization(**self.randomize))
+            except TypeError as error:
+                raise ValueError(f"randomize: {error}") from error

@@ -13,6 +13,7 @@ from newton.solvers import SolverMuJoCo
 
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import RESET, STEP, EpisodeArrays, randomize_ages
+from worker.simulation.randomization import Randomizer
 from worker.simulation.worlds import Worlds
 from worker.tasks.config import TaskConfig, default_rewards
 
@@ -47,13 +48,16 @@ class Task:
         episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
+        randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
     """
 
     config_type: ClassVar[type[TaskConfig]]
     """Type of the configuration."""
     parameters_type: ClassVar[Any]
-    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels."""
+    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels.
+
+    A pair of numbers becomes a ``wp.vec2``."""
     reward_terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
     observation_names: ClassVar[tuple[str, ...]]
@@ -66,6 +70,8 @@ class Task:
     """Kernel ``(mode, max_age, parameters, worlds, episodes)`` over worlds; see :mod:`worker.simulation.episodes`."""
     ground: ClassVar[bool] = False
     """Whether the worlds stand on a ground plane."""
+    memory_size: ClassVar[int] = 0
+    """Numbers that the kernels keep of each world in ``episodes.memory``, such as commands; they are part of the state."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
 
@@ -109,11 +115,14 @@ class Task:
         self._parameters = self.parameters_type()
         for item in fields(config):
             if hasattr(self._parameters, item.name):
-                setattr(self._parameters, item.name, getattr(config, item.name))
+                value = getattr(config, item.name)
+                setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
         self.read_model(self._parameters)
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
+        self.seed(seed)
         with on_torch_stream(self.device):
+            self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz)
             self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
         self._graph = CapturedStep(self._launch_step, self.device)
         self._assert_captured()
@@ -189,7 +198,8 @@ class Task:
             state: As returned by :meth:`state_dict` of the same task with as many worlds.
 
         Raises:
-            ValueError: A tensor is missing, unknown, or of another shape or type; nothing was changed.
+            ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn
+                otherwise; nothing was changed.
         """
         tensors = self._state_tensors()
         task = type(self).__name__
@@ -203,6 +213,11 @@ class Task:
                 raise ValueError(
                     f"the saved state of task {task} does not fit: {name} is {tuple(saved.shape)} {saved.dtype}, "
                     f"expected {tuple(tensor.shape)} {tensor.dtype}"
+                )
+            if name == "world_factors" and not torch.equal(saved, tensor.cpu()):
+                raise ValueError(
+                    f"the saved state of task {task} does not fit: its worlds have other physics; use the same seed, "
+                    "first world and randomize"
                 )
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
@@ -249,13 +264,17 @@ class Task:
         self.episode_length = buffer("ages", (count,), wp.int32)
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
-        buffer("weights", (len(self.reward_terms),), wp.float32).copy_(torch.tensor(list(self.config.rewards.values())))
+        self._memory = buffer("memory", (count, self.memory_size), wp.float32)
+        self._episodes.weights = wp.array(list(self.config.rewards.values()), dtype=wp.float32, device=device)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
     def _state_tensors(self) -> dict[str, torch.Tensor]:
         """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
         arrays = self.worlds.arrays
+        memory = {"memory": self._memory} if self.memory_size else {}
         return {
+            **memory,
+            **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
@@ -280,12 +299,14 @@ class Task:
 
     def _launch_step(self) -> None:
         """The whole control step, as launches: what the graph holds."""
+        self.randomizer.push()
         wp.launch(
             self.act,
             dim=self.world_count,
             inputs=[self._parameters, self.worlds.arrays, self._episodes],
             device=self.device,
         )
+        self.randomizer.delay()
         self.worlds.simulate()
         self._launch_observe(STEP)
 
@@ -296,3 +317,4 @@ class Task:
             inputs=[int(mode), self.max_episode_length, self._parameters, self.worlds.arrays, self._episodes],
             device=self.device,
         )
+        self.randomizer.add_noise(int(mode))

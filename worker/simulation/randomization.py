@@ -1,0 +1,180 @@
+"""Domain randomisation: physics that differs from world to world, pushes, noise and late actions, for any task.
+
+What a world is like is drawn once, from the seed and the world's global index alone. What happens to it comes from its own
+random stream, so that a run goes on bit for bit and its worlds are the same on any number of ranks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import newton
+import torch
+import warp as wp
+
+from worker.simulation.episodes import STEP, STEPS, EpisodeArrays, random_stream
+from worker.simulation.worlds import WorldArrays, Worlds
+
+if TYPE_CHECKING:
+    from worker.tasks.config import Randomization
+
+wp.set_module_options({"enable_backward": False})
+
+FACTORS = ("mass", "friction", "damping", "gains", "gravity")
+"""What is drawn once a world, in the order of the columns of :attr:`Randomizer.factors`."""
+
+
+@wp.kernel
+def _draw_factors(episodes: EpisodeArrays, ends: wp.array(dtype=wp.vec2), factors: wp.array2d(dtype=wp.float32)):
+    """Uniform factors of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
+    world, factor = wp.tid()
+    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
+    # episodes draw from the streams 0, 1, 2, … of the same key
+    stream = wp.rand_init(int(key), -1 - factor)
+    factors[world, factor] = wp.randf(stream, ends[factor][0], ends[factor][1])
+
+
+@wp.kernel
+def _push(probability: float, velocity: float, worlds: WorldArrays, episodes: EpisodeArrays):
+    """Now and then, change a world's first body's horizontal velocity at once."""
+    world = wp.tid()
+    stream = random_stream(episodes, world)
+    if wp.randf(stream) < probability:
+        for axis in range(2):
+            worlds.joint_qd[world, axis] = worlds.joint_qd[world, axis] + velocity * wp.randf(stream, -1.0, 1.0)
+
+
+@wp.kernel
+def _delay(
+    latency: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    delays: wp.array(dtype=wp.int32),
+    history: wp.array2d(dtype=wp.float32),
+):
+    """Give the actuators the controls of some steps ago; until there are such, the first ones of the episode."""
+    world = wp.tid()
+    actuators = worlds.controls.shape[1]
+    first_step = episodes.sums[world, STEPS] == 0.0
+    if first_step:
+        delays[world] = wp.randi(random_stream(episodes, world), 0, latency + 1)
+    for actuator in range(actuators):
+        control = worlds.controls[world, actuator]
+        for back in range(latency):
+            slot = (latency - back) * actuators + actuator
+            if first_step:
+                history[world, slot] = control
+            else:
+                history[world, slot] = history[world, slot - actuators]
+        history[world, actuator] = control
+        worlds.controls[world, actuator] = history[world, delays[world] * actuators + actuator]
+
+
+@wp.kernel
+def _add_noise(mode: int, deviation: float, episodes: EpisodeArrays):
+    """Normal noise on what the policy sees, and on the last observation of an episode that ended."""
+    world = wp.tid()
+    stream = random_stream(episodes, world)
+    for column in range(episodes.observations.shape[1]):
+        episodes.observations[world, column] = episodes.observations[world, column] + deviation * wp.randn(stream)
+    if mode == STEP and episodes.dones[world]:
+        for column in range(episodes.observations.shape[1]):
+            terminal = episodes.terminal_observations[world, column]
+            episodes.terminal_observations[world, column] = terminal + deviation * wp.randn(stream)
+
+
+class Randomizer:
+    """What makes the worlds of one task differ. Everything that is off costs nothing and draws no random numbers.
+
+    Args:
+        config: What is on, and how much.
+        worlds: The task's worlds; their model is changed here, so this must come before a capture.
+        episodes: The task's buffers; ``random`` holds seed and global indices already.
+        control_hz: Control steps per simulated second [Hz].
+
+    Raises:
+        ValueError: Pushes are on and the first body of the worlds is not free to move.
+
+    Attributes:
+        factors: Factors on the physics of each world, columns as in :data:`FACTORS`, shape ``(worlds, 5)``, float32; 1
+            where the configuration leaves it.
+    """
+
+    def __init__(self, config: Randomization, worlds: Worlds, episodes: EpisodeArrays, control_hz: float) -> None:
+        self._config, self._worlds, self._episodes = config, worlds, episodes
+        self._device = worlds.model.device
+        if config.push_velocity and worlds.model.joint_type.numpy()[0] != int(newton.JointType.FREE):
+            raise ValueError("randomize.push_velocity: the robot is fixed to the world, so that it can't be pushed")
+        self._push_probability = min(1.0, 1.0 / (config.push_interval * control_hz)) if config.push_interval else 0.0
+        count, actuators = worlds.arrays.controls.shape
+        self._delays = wp.zeros(count, dtype=wp.int32, device=self._device)
+        slots = config.action_latency + 1 if config.action_latency else 0
+        self._history = wp.zeros((count, slots * actuators), dtype=wp.float32, device=self._device)
+        ends = wp.array([getattr(config, name) for name in FACTORS], dtype=wp.vec2, device=self._device)
+        factors = wp.zeros((count, len(FACTORS)), dtype=wp.float32, device=self._device)
+        wp.launch(_draw_factors, dim=factors.shape, inputs=[episodes, ends], outputs=[factors], device=self._device)
+        self.factors = wp.to_torch(factors)
+        self._drawn = {
+            name: column
+            for name, column in zip(FACTORS, self.factors.unbind(1), strict=True)
+            if getattr(config, name) != (1.0, 1.0)
+        }
+        self._apply()
+
+    def push(self) -> None:
+        """Before a control step: push some worlds."""
+        if self._push_probability:
+            inputs = [self._push_probability, self._config.push_velocity, self._worlds.arrays, self._episodes]
+            wp.launch(_push, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+
+    def delay(self) -> None:
+        """After ``act``: hold the controls back."""
+        if self._config.action_latency:
+            inputs = [self._config.action_latency, self._worlds.arrays, self._episodes, self._delays, self._history]
+            wp.launch(_delay, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+
+    def add_noise(self, mode: int) -> None:
+        """After ``observe`` in ``mode``: blur what the policy sees."""
+        if self._config.observation_noise:
+            inputs = [mode, self._config.observation_noise, self._episodes]
+            wp.launch(_add_noise, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Live views of what outlasts a control step, each with leading dimension ``worlds``.
+
+        ``world_factors`` is there to be compared: the model was changed already, before it was captured.
+        """
+        tensors = {"world_factors": self.factors} if self._drawn else {}
+        if self._config.action_latency:
+            tensors |= {"control_delays": wp.to_torch(self._delays), "control_history": wp.to_torch(self._history)}
+        return tensors
+
+    def _apply(self) -> None:
+        """Scale the physics of every world."""
+        model, solver, drawn = self._worlds.model, self._worlds.solver, self._drawn
+
+        def scale(array: wp.array, factor: torch.Tensor) -> None:
+            rows = wp.to_torch(array).view(len(factor), -1)
+            rows.mul_(factor[:, None])
+
+        if "mass" in drawn:
+            scale(model.body_mass, drawn["mass"])
+            scale(model.body_inertia, drawn["mass"])
+            scale(model.body_inv_mass, 1.0 / drawn["mass"])
+            scale(model.body_inv_inertia, 1.0 / drawn["mass"])
+            solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+        if "damping" in drawn:
+            scale(model.joint_damping, drawn["damping"])
+            solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
+        if "gravity" in drawn:
+            # the last row is that of what belongs to no world
+            scale(model.gravity[: self._worlds.world_count], drawn["gravity"])
+            solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+        # Newton has one ground for all worlds, the solver one for each. Of two surfaces in contact the greater friction
+        # counts, so that the ground has to be as slippery as the feet.
+        if "friction" in drawn:
+            scale(solver.mjw_model.geom_friction, drawn["friction"])
+        # A motor's force is gain x control, a servo's gain x target plus bias x (1, angle, velocity).
+        if "gains" in drawn:
+            scale(solver.mjw_model.actuator_gainprm, drawn["gains"])
+            scale(solver.mjw_model.actuator_biasprm, drawn["gains"])
