@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import tempfile
 import time
@@ -34,13 +35,15 @@ STRETCHES, SECONDS = 3, 1.5
 
 def build(task: str, worlds: int, store: Path) -> Runner:
     """A runner of the real training loop, on a store of its own, that never saves."""
+    placement = Placement.from_env(os.environ)
     run = Store(store).open().run(f"bench-{task}-{worlds}".lower())
-    run.create({"run": run.name})
-    raise_epoch(run, 1)
+    if placement.rank == 0:
+        run.create({"run": run.name})
+        raise_epoch(run, 1)
     section = {"task": task, "worlds": worlds, "iterations": 10**9}
     spec = {"train": section, "checkpoint": {"every": 10**9}}
     job = Job(spec, Store(store), run, 1, 1, "bench", None, section)
-    return Runner(job, connect(Placement()), find_task(task), StopRequest())
+    return Runner(job, connect(placement), find_task(task), StopRequest())
 
 
 def rate(step: Callable[[], Any], steps: int) -> float:

@@ -123,7 +123,7 @@ def _timeless(record: dict[str, Any]) -> dict[str, Any]:
     return {
         key: value
         for key, value in record.items()
-        if not key.endswith("_seconds") and key not in ("steps_per_second", "time")
+        if not key.endswith("_seconds") and key not in ("steps_per_second", "time", "slowest_rank", "slowest_excess")
     }
 
 

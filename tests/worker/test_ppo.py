@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from tests.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
+from worker.learning import linear
 from worker.learning.ppo import LOSSES, PPO, Share
 from worker.learning.randomness import mix_seed
 
@@ -198,18 +199,22 @@ def test_losses_ignore_what_terminal_observations_hold_where_nothing_ended() -> 
     assert torch.isfinite(ppo.update()).all()
 
 
-def test_every_epoch_has_its_own_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_epoch_has_its_own_order() -> None:
     ppo = make(epochs=3, minibatches=2)
-    seen: list[torch.Tensor] = []
-    monkeypatch.setattr(ppo, "_update_minibatch", lambda samples: seen.append(samples.clone()))
-    task = Point(PointConfig(), 4)
     ppo.begin_iteration(0)
-    for _ in range(8):
-        task.step(ppo.act(task.observations))
-        ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
-    ppo.compute_returns(task.observations)
-    ppo.update()
-    epochs = [torch.cat(seen[i : i + 2]) for i in (0, 2, 4)]
-    assert not torch.equal(epochs[0], epochs[1])
-    for epoch in epochs:  # each sample once
-        assert torch.equal(epoch.sort(0).values, ppo._samples.sort(0).values)
+    first, second, third = ppo._orders.view(3, -1).clone()
+    assert not torch.equal(first, second) and not torch.equal(second, third)
+    for epoch in (first, second, third):  # each sample once
+        assert torch.equal(epoch.sort().values, torch.arange(len(ppo._samples)))
+    ppo.begin_iteration(1)
+    assert not torch.equal(first, ppo._orders.view(3, -1)[0])
+
+
+def test_gradients_of_a_layer_are_those_of_torch() -> None:
+    x, weight, bias = torch.randn(7, 3), torch.randn(4, 3), torch.randn(4)
+    found = []
+    for layer in (linear._Linear.apply, torch.nn.functional.linear):
+        leaves = [each.clone().requires_grad_() for each in (x, weight, bias)]
+        (layer(*leaves).tanh() ** 2).sum().backward()
+        found.append([each.grad for each in leaves])
+    torch.testing.assert_close(*found)

@@ -62,7 +62,7 @@ class Report:
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
             f"length {_text(record['episode_length'], '.1f')}  steps/s {record['steps_per_second']:.0f}  "
-            f"lr {record['learning_rate']:.1e}  kl {record['kl']:.3f}{mishaps}",
+            f"lr {record['learning_rate']:.1e}  kl {record['kl']:.3f}{mishaps}{_slow(record)}",
             flush=True,
         )
         finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
@@ -85,6 +85,13 @@ class Report:
             print(f"warning: metrics can't be written ({error})", flush=True)
 
 
+def _slow(record: dict[str, float | int | None]) -> str:
+    """The rank for which the others wait, where it takes a tenth longer than usual."""
+    excess = record.get("slowest_excess") or 0.0
+    return f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)" if excess > _SLOW else ""
+
+
+_SLOW = 0.1
 _TAGS = {
     "reward": "episode/reward",
     "episode_length": "episode/length",

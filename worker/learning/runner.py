@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import statistics
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,7 +62,7 @@ class Runner:
                 self.task.action_size,
                 gang,
                 seed=self.seed,
-                extras=len(self.task.statistic_names) + len(SIGNALS),
+                extras=gang.size + len(self.task.statistic_names) + len(SIGNALS),
             )
         self.ppo.broadcast_parameters()
         seed_generators(self.seed, gang.rank)
@@ -81,9 +82,9 @@ class Runner:
         self._stopwatch = Stopwatch(gang.device)
         self._collecting = Recorded(self._collect, gang.device, "rollout")
         self._numbers = HostCopy(gang.device)
-        self._own_signals = torch.zeros(len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
+        self._own_signals = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
         self._told_captured = False
-        self._iteration_seconds = self._stall_seconds = 0.0
+        self._iteration_seconds = self._collect_seconds = self._stall_seconds = 0.0
         self.fence = Fence(job.run, job.epoch)
         self.beacon = Beacon()
         self.state.saver.start()
@@ -163,8 +164,11 @@ class Runner:
         ppo.begin_iteration(progress.iteration)
         self._collecting()
         self._stopwatch.mark()
-        ppo.extra[: -len(SIGNALS)].copy_(self.task.statistics)
-        ppo.extra[-len(SIGNALS) :].copy_(self._signals(), non_blocking=True)
+        ppo.extra.zero_()
+        ppo.extra[self.gang.size : -len(SIGNALS)].copy_(self.task.statistics)
+        self._own_signals.copy_(torch.tensor([self._collect_seconds, *self._signals()], dtype=torch.float64))
+        ppo.extra[self.gang.rank].copy_(self._own_signals[0], non_blocking=True)
+        ppo.extra[-len(SIGNALS) :].copy_(self._own_signals[1:], non_blocking=True)
         self.task.clear_statistics()
         losses = ppo.learn(self.task.observations)
         self._stopwatch.mark()
@@ -175,7 +179,9 @@ class Runner:
             )
         )
         values, rate, std = known[: len(LOSSES)], known[len(LOSSES)], known[len(LOSSES) + 1]
-        statistics, signals = known[len(LOSSES) + 2 : -len(SIGNALS)], known[-len(SIGNALS) :]
+        first = len(LOSSES) + 2
+        ranks, totals = known[first : first + self.gang.size], known[first + self.gang.size : -len(SIGNALS)]
+        signals = known[-len(SIGNALS) :]
         progress.iteration += 1
         if not all(map(math.isfinite, values)):
             self._tell_saved(self.state.finish())  # the losses are those of the gang: every rank is here
@@ -184,17 +190,17 @@ class Runner:
             raise TrainingError(
                 f"iteration {progress.iteration}: the loss is not finite ({worst}); {last}. Try a smaller learning_rate"
             )
-        record = self._count(statistics)
+        record = self._count(totals)
         record |= {**dict(zip(LOSSES, values, strict=True)), "learning_rate": rate, "action_std": std}
+        record |= straggler(ranks)
         return record, dict(zip(SIGNALS, signals, strict=True))
 
-    def _signals(self) -> torch.Tensor:
-        """This rank's :data:`SIGNALS`, shape (5,), float64."""
+    def _signals(self) -> tuple[float, ...]:
+        """This rank's :data:`SIGNALS`."""
         saver, stop = self.state.saver, self.stop
         save_now, stop.save_requested = stop.save_requested, False
         failures, saver.failures = saver.failures, 0
-        own = (float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds)
-        return self._own_signals.copy_(torch.tensor(own, dtype=torch.float64))
+        return float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds
 
     def _collect(self) -> None:
         task, ppo = self.task, self.ppo
@@ -202,16 +208,16 @@ class Runner:
             task.step(ppo.act(task.observations))
             ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
 
-    def _count(self, statistics: list[float]) -> dict[str, Any]:
-        """Bring the progress up to date with the ``statistics`` of all ranks; the iteration's record without the losses."""
+    def _count(self, totals: list[float]) -> dict[str, Any]:
+        """Bring the progress up to date with the ``totals`` of all ranks; the iteration's record without the losses."""
         progress = self.state.progress
         collect, learn = self._stopwatch.parts()
         steps = self.ppo.share.total * self.config.ppo.steps
         progress.env_steps += steps
         self.state.seconds += collect + learn
-        self._iteration_seconds = collect + learn
+        self._iteration_seconds, self._collect_seconds = collect + learn, collect
         stall, self._stall_seconds = self._stall_seconds, 0.0
-        finished, returns, lengths, *others = statistics
+        finished, returns, lengths, *others = totals
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
         return {
@@ -287,6 +293,19 @@ def total_worlds(job: Job, gang: Gang) -> int:
     nodes = job.spec.get("nodes")
     full = nodes["max"] * gang.placement.local_world_size if isinstance(nodes, dict) else gang.size
     return job.setting("worlds", 256) * max(full, gang.size)
+
+
+def straggler(seconds: list[float]) -> dict[str, float]:
+    """Which rank collected the longest in the iteration before, and how much longer than the median: all others wait for it.
+
+    Args:
+        seconds: By rank; empty figures for a gang of one.
+    """
+    if len(seconds) == 1:
+        return {}
+    slowest = max(range(len(seconds)), key=seconds.__getitem__)
+    usual = statistics.median(seconds)
+    return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
 
 
 def _figure(name: str, total: float, episodes: float) -> float | None:

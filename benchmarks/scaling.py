@@ -1,0 +1,120 @@
+"""Several GPUs of one host: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives inside and between the graphs.
+
+    python -m benchmarks.scaling [--task Ant] [--worlds 4096] [--gpus 1 2 4] [--out DIRECTORY]
+
+Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun and meet as under Muster's supervisor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ITERATIONS = 60
+
+
+def rank(task: str, worlds: int, store: Path, result: Path) -> None:
+    """One rank: train, and (rank 0) write down how long an iteration took."""
+    import torch
+
+    from benchmarks.gpu import build
+
+    runner = build(task, worlds, store)
+    slowest = []
+    for _ in range(6):
+        runner._iterate()
+    torch.cuda.synchronize()
+    started = time.perf_counter()
+    for _ in range(ITERATIONS):
+        slowest.append(runner._iterate()[0].get("slowest_excess", 0.0))
+    torch.cuda.synchronize()
+    seconds = (time.perf_counter() - started) / ITERATIONS
+    record = runner._iterate()[0]
+    if runner.gang.is_main:
+        found = {
+            "seconds": seconds,
+            "collect": record["collect_seconds"],
+            "learn": record["learn_seconds"],
+            "excess": statistics.median(slowest),
+            "rate": runner.gang.size * worlds * runner.config.ppo.steps / seconds,
+            "captured": [part.name for part in runner.ppo.recordings if part.captured],
+        }
+        result.write_text(json.dumps(found))
+    runner.gang.close()
+    os._exit(0)
+
+
+def launch(gpus: int, inside: bool, options: argparse.Namespace) -> dict[str, Any]:
+    """Train on ``gpus`` GPUs."""
+    with tempfile.TemporaryDirectory() as directory:
+        result = Path(directory) / "result.json"
+        command = [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={gpus}", "-m"),
+            *("benchmarks.scaling", "--rank", directory, "--task", options.task, "--worlds", str(options.worlds)),
+        ]
+        env = {**os.environ, "MUSTER_BENCH_INSIDE": "1" if inside else "0", "OMP_NUM_THREADS": "4"}
+        subprocess.run(command, env=env, check=True, timeout=300)
+        return {"gpus": gpus, "inside": inside, **json.loads(result.read_text())}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="Ant")
+    parser.add_argument("--worlds", type=int, default=4096, help="of each GPU")
+    parser.add_argument("--gpus", nargs="+", type=int, default=[1, 2, 4])
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.rank:
+        from worker.learning import ppo
+
+        ppo.COLLECTIVES_IN_GRAPH = os.environ["MUSTER_BENCH_INSIDE"] == "1"
+        rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")
+    rows = []
+    for gpus in options.gpus:
+        for inside in (True, False) if gpus > 1 else (True,):
+            try:
+                rows.append(launch(gpus, inside, options))
+            except (subprocess.SubprocessError, OSError) as error:
+                rows.append({"gpus": gpus, "inside": inside, "error": str(error)[:300]})
+            print(rows[-1], flush=True)
+            (options.out / "scaling.json").write_text(json.dumps(rows, indent=1))
+    (options.out / "scaling.md").write_text(table(options, rows))
+
+
+def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    import torch
+
+    single = next(row["rate"] for row in rows if row["gpus"] == 1)
+    lines = [
+        f"# {options.task} on several {torch.cuda.get_device_name()}",
+        "",
+        f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU.",
+        "",
+        "| GPUs | collectives | training | efficiency | iteration | collect | learn | slowest rank |",
+        "|--:|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        where = "–" if row["gpus"] == 1 else "in the graph" if row["inside"] else "between graphs"
+        if "error" in row:
+            lines.append(f"| {row['gpus']} | {where} | failed | | | | | |")
+            continue
+        lines.append(
+            f"| {row['gpus']} | {where} | **{row['rate'] / 1e6:.2f}** | {100 * row['rate'] / row['gpus'] / single:.1f} % | "
+            f"{1000 * row['seconds']:.1f} ms | {1000 * row['collect']:.1f} ms | {1000 * row['learn']:.1f} ms | "
+            f"+{100 * row['excess']:.1f} % |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
