@@ -19,10 +19,10 @@ from typing import Any
 from benchmarks.gpu import build
 
 
-def train(task: str, worlds: int, iterations: int, store: Path) -> dict[str, Any]:
+def train(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -> dict[str, Any]:
     """Reward, episode length and seconds after each iteration."""
     started = time.perf_counter()
-    runner = build(task, worlds, store)
+    runner = build(task, worlds, store, seed)
     built = time.perf_counter() - started
     started = time.perf_counter()
     curve = []

@@ -33,14 +33,14 @@ from worker.tasks import find_task
 STRETCHES, SECONDS = 3, 1.5
 
 
-def build(task: str, worlds: int, store: Path) -> Runner:
+def build(task: str, worlds: int, store: Path, seed: int = 0) -> Runner:
     """A runner of the real training loop, on a store of its own, that never saves."""
     placement = Placement.from_env(os.environ)
     run = Store(store).open().run(f"bench-{task}-{worlds}".lower())
     if placement.rank == 0:
         run.create({"run": run.name})
         raise_epoch(run, 1)
-    section = {"task": task, "worlds": worlds, "iterations": 10**9}
+    section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed}
     spec = {"train": section, "checkpoint": {"every": 10**9}}
     job = Job(spec, Store(store), run, 1, 1, "bench", None, section)
     return Runner(job, connect(placement), find_task(task), StopRequest())

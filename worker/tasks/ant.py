@@ -256,9 +256,9 @@ class Ant(Task):
         "nconmax": 25,
         "njmax": 108,
         # Falls and heights are those of the file's 50 iterations at 1e-10, for a fraction of the time.
-        "iterations": 4,
-        "ls_iterations": 8,
-        "tolerance": 1.0e-4,
+        "iterations": 3,
+        "ls_iterations": 6,
+        "tolerance": 1.0e-3,
     }
 
     def build(self, builder: newton.ModelBuilder) -> None:
