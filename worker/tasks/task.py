@@ -156,6 +156,8 @@ class Task:
     def seed(self, seed: int) -> None:
         """Start all random streams afresh from another seed; the worlds change at their next reset.
 
+        The physics that ``randomize`` drew for each world stays that of the seed at construction.
+
         Args:
             seed: Any integer >= 0.
 
@@ -229,6 +231,11 @@ class Task:
             raise ValueError(
                 f"task {task} takes a {self.config_type.__name__}, not a {type(config).__name__}; "
                 f"make one with {self.config_type.__name__}(...)"
+            )
+        if not self.reward_terms:
+            raise ValueError(
+                f"task {task} has no reward terms; give {self.config_type.__name__} a field "
+                "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
             )
         if world_count < 1:
             raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")

@@ -1,0 +1,59 @@
+"""``python -m worker.tasks [NAME …]``: what tasks there are, as JSON. ``muster tasks`` runs it, since it imports no torch itself."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from worker.tasks import find_task, task_names
+
+
+def describe(name: str) -> dict[str, Any]:
+    """What a task sees, does and is rewarded for.
+
+    Args:
+        name: As :func:`worker.tasks.find_task` takes it.
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    task = find_task(name)
+    config = task.config_type()
+    return {
+        "name": name,
+        "class": f"{task.__module__}:{task.__qualname__}",
+        "about": (task.__doc__ or "").strip().partition("\n")[0],
+        "observations": list(task.observation_names),
+        "actions": list(task.action_names),
+        "rewards": dict(config.rewards),
+        "control_hz": config.control_hz,
+        "substeps": config.substeps,
+        "episode_seconds": config.episode_seconds,
+    }
+
+
+def main(names: list[str]) -> int:
+    """Print the tasks ``names``, or all; returns the exit code: 2 where a named one is none.
+
+    Without names, one that can't be imported (of a package that is broken) is listed with its ``error``.
+    """
+    found = []
+    for name in names or task_names():
+        try:
+            found.append(describe(name))
+        except ValueError as error:
+            if names:
+                print(error, file=sys.stderr)
+                return 2
+            found.append({"name": name, "error": str(error)})
+        except Exception as error:
+            if names:
+                raise
+            found.append({"name": name, "error": f"{type(error).__name__}: {error}"})
+    print(json.dumps(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
