@@ -44,6 +44,8 @@ class Placement:
     master_port: int = 29500
     epoch: int = 0
     """Fencing number of the attempt: ranks of two attempts never meet in one group."""
+    has_store: bool = False
+    """Whether a launcher (torchrun) keeps the TCP store already, at the master's address and port."""
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Placement:
@@ -57,6 +59,7 @@ class Placement:
                 )
             return int(value)
 
+        has_store = env.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
         placement = cls(
             rank=integer("RANK", 0),
             local_rank=integer("LOCAL_RANK", 0),
@@ -64,7 +67,9 @@ class Placement:
             local_world_size=integer("LOCAL_WORLD_SIZE", 1),
             master_address=env.get("MASTER_ADDR") or "127.0.0.1",
             master_port=integer("MASTER_PORT", 29500),
-            epoch=integer("MUSTER_EPOCH", 0),
+            # torchrun's store outlives its ranks
+            epoch=integer("MUSTER_EPOCH", integer("TORCHELASTIC_RESTART_COUNT", 0) if has_store else 0),
+            has_store=has_store,
         )
         if not 0 <= placement.rank < placement.world_size:
             raise ValueError(f"RANK is {placement.rank} in a WORLD_SIZE of {placement.world_size}; ranks count from 0")
@@ -190,9 +195,9 @@ def connect(placement: Placement, *, device: str | None = None, report_seconds: 
 
 
 def _open_store(placement: Placement, seconds: float) -> dist.TCPStore:
-    """The main rank's TCP store, listening on the main node's address alone."""
+    """The main rank's TCP store, listening on the main node's address alone; or the one that is there."""
     address, port = placement.master_address, placement.master_port
-    if placement.rank == 0:
+    if placement.rank == 0 and not placement.has_store:
         # without a socket of ours torch would listen on every interface
         descriptor = _listen(address, port)
         return dist.TCPStore(

@@ -38,8 +38,8 @@ def test_ant_observation_and_reward_by_hand(ant: Ant) -> None:
     assert seen["hip_2_position"] == pytest.approx(0.5, abs=1e-6)
     assert seen["ankle_2_position"] == pytest.approx(-1, abs=1e-6)
     assert seen["hip_1_velocity"] == pytest.approx(1.0) and seen["hip_1_previous_action"] == 1
-    # forward 0.3, heading 0, up 0.1, alive 0.5, action 0.005, energy 0.05 x |1 x 5 x 0.2|, one joint at its limit
-    assert ant.rewards[0].item() == pytest.approx(0.3 + 0.0 + 0.1 + 0.5 - 0.005 - 0.05 - 0.1, abs=1e-5)
+    # forward 0.3, heading 0, up 0.1, alive 0.5, action 0.005 x 2², energy 0.05 x |1 x 5 x 0.2|, one joint at its limit
+    assert ant.rewards[0].item() == pytest.approx(0.3 + 0.0 + 0.1 + 0.5 - 0.02 - 0.05 - 0.1, abs=1e-5)
 
 
 def test_a_fallen_ant_ends_its_episode_and_earns_only_the_fall(ant: Ant) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -12,7 +14,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from tests.worker.ranks import free_port, run_ranks, start_rank
+from tests.worker.ranks import ROOT, free_port, run_ranks, start_rank
 from worker.distributed import Gang, Placement, _listen, connect, warm_marker
 from worker.errors import GangError
 
@@ -129,6 +131,23 @@ def test_a_port_in_use_is_named() -> None:
         port = other.getsockname()[1]
         with pytest.raises(GangError, match=rf"rank 0 can't listen on 127.0.0.1:{port} .*set MASTER_PORT"):
             _listen("127.0.0.1", port)
+
+
+def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
+    script = tmp_path / "ranks.py"
+    script.write_text(
+        "import os, torch\n"
+        "from worker.distributed import Placement, connect\n"
+        "gang = connect(Placement.from_env(os.environ), device='cpu')\n"
+        "print('sum', gang.sum(torch.tensor([gang.rank + 1.0])).item(), gang.tell('from 0' if gang.is_main else None))\n"
+        "gang.close()\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=180, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("sum 3.0 from 0") == 2
 
 
 def test_the_store_listens_on_the_main_nodes_address_alone() -> None:

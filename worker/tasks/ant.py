@@ -187,7 +187,8 @@ def add_rewards(parameters: AntParameters, worlds: WorldArrays, episodes: Episod
     for joint in range(JOINTS):
         action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
         velocity = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        effort += action * action
+        # of what the policy asked for: beyond the motors' limits nothing else would hold it back from drifting away
+        effort += episodes.actions[world, joint] * episodes.actions[world, joint]
         energy += wp.abs(action * velocity)
         if wp.abs(scaled_position(worlds, world, joint)) > 0.99:
             limits += 1.0
