@@ -7,7 +7,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-api bench-scheduling bench-logs bench-resume fuzz torture env clean
+.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume fuzz torture env clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -36,6 +36,12 @@ bench-logs: $(READY)
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume
+
+# needs CUDA devices: all tables, with as many GPUs as there are
+bench-gpu: $(READY)
+	$(BIN)/python -m benchmarks.gpu --tasks Cartpole Ant Humanoid Quadruped --worlds 4096 16384
+	$(BIN)/python -m benchmarks.curves
+	$(BIN)/python -m benchmarks.scaling
 
 bench-api: $(READY)
 	$(BIN)/python -m benchmarks.api

@@ -65,11 +65,18 @@ def launch(gpus: int, inside: bool, options: argparse.Namespace) -> dict[str, An
         return {"gpus": gpus, "inside": inside, **json.loads(result.read_text())}
 
 
+def _counts() -> list[int]:
+    """1, 2, 4 … as far as there are GPUs."""
+    import torch
+
+    return [count for count in (1, 2, 4, 8) if count <= max(1, torch.cuda.device_count())]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="Ant")
     parser.add_argument("--worlds", type=int, default=4096, help="of each GPU")
-    parser.add_argument("--gpus", nargs="+", type=int, default=[1, 2, 4])
+    parser.add_argument("--gpus", nargs="+", type=int, default=_counts())
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
