@@ -94,12 +94,12 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
     assert seen["front_left_hip_previous_action"] == 1.0
     terms = dict(zip(Quadruped.reward_terms, quadruped.state_dict()["episode_sums"][0, 2:].tolist(), strict=True))
     expected = {
-        "track_linear": math.exp(-4 * (0.2**2 + 0.1**2)),
-        "track_angular": 0.5 * math.exp(-4 * 0.25**2),
+        "track_linear": 2.0 * math.exp(-4 * (0.2**2 + 0.1**2)),
+        "track_angular": math.exp(-4 * 0.25**2),
         "lin_vel_z": -2.0 * 0.2**2,
         "ang_vel_xy": -0.05 * 0.3**2,
         "orientation": 0.0,
-        "torques": -2.0e-4 * (9.0 + 16.0),
+        "torques": -1.0e-4 * (9.0 + 16.0),
         "action_rate": -0.01 * 0.75**2,
         "pose": -0.05 * (0.75**2 + 0.2**2),
         "limits": -5.0 * (-0.85 + 0.885),
@@ -111,7 +111,7 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
 
 
 def test_a_trunk_on_the_ground_or_tilted_ends_the_episode(quadruped: Quadruped) -> None:
-    """The trunk is 0.38 x 0.18 x 0.11 m: level it touches at 0.055 m, pitched by 0.3 rad at 0.109 m, at any yaw."""
+    """The trunk is 0.38 x 0.18 x 0.11 m: level it touches at 0.055 m, pitched by 0.3 rad at 0.109 m, rolled at 0.079."""
 
     def pitched(height: float, angle: float, yaw: float = 0.0) -> list[float]:
         a, b = angle / 2, yaw / 2
@@ -126,10 +126,13 @@ def test_a_trunk_on_the_ground_or_tilted_ends_the_episode(quadruped: Quadruped) 
         pitched(1.0, 1.01),
         pitched(1.0, 0.99),
     ]
+    side = 0.09 * math.sin(0.3) + 0.055 * math.cos(0.3)
+    rolled = [math.sin(0.15), 0.0, 0.0, math.cos(0.15)]
+    poses += [[0.0, 0.0, height, *rolled, *STAND] for height in (side - 1e-3, side + 1e-3)]
     put(quadruped, joint_q=poses)
     observe(quadruped)
-    assert quadruped.dones[:8].tolist() == [True, False] * 4 and not quadruped.time_outs.any()
-    assert statistics(quadruped)["reward_fall"] == -4.0
+    assert quadruped.dones.tolist() == [*[True, False] * 5, False, False] and not quadruped.time_outs.any()
+    assert statistics(quadruped)["reward_fall"] == -10.0
     assert quadruped.terminal_observations[6, 6].item() == pytest.approx(math.sin(1.01), abs=1e-5)
     assert (quadruped.observations[[0, 2, 4, 6], 36:] == 0).all(), "a new episode has no previous action"
 

@@ -36,7 +36,7 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
     assert not (tmp_path / "home").exists(), "a listing needs no controller"
     table = run_muster("tasks", home=tmp_path).stdout
     assert re.search(r"^Ant +35 +8 +60 Hz +16 s +forward 1 +heading 0.5 +up 0.1 +alive 0.5 +action -0.005", table, re.M)
-    assert re.search(r"^Quadruped +48 +12 +50 Hz +20 s +track_linear 1", table, re.M)
+    assert re.search(r"^Quadruped +48 +12 +50 Hz +20 s +track_linear 2", table, re.M)
 
 
 def test_one_task_is_told_by_name_and_a_wrong_name_in_one_line(tmp_path: Path) -> None:

@@ -158,19 +158,25 @@ class Randomizer:
             rows = wp.to_torch(array).view(len(factor), -1)
             rows.mul_(factor[:, None])
 
+        def tell(changed: newton.ModelFlags) -> None:
+            # Torch wrote, the solver reads: on whatever streams they do so, one must be done before the other begins.
+            wp.synchronize_device(self._device)
+            solver.notify_model_changed(changed)
+            wp.synchronize_device(self._device)
+
         if "mass" in drawn:
             scale(model.body_mass, drawn["mass"])
             scale(model.body_inertia, drawn["mass"])
             scale(model.body_inv_mass, 1.0 / drawn["mass"])
             scale(model.body_inv_inertia, 1.0 / drawn["mass"])
-            solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+            tell(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
         if "damping" in drawn:
             scale(model.joint_damping, drawn["damping"])
-            solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
+            tell(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)
         if "gravity" in drawn:
             # the last row is that of what belongs to no world
             scale(model.gravity[: self._worlds.world_count], drawn["gravity"])
-            solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+            tell(newton.ModelFlags.MODEL_PROPERTIES)
         # Newton has one ground for all worlds, the solver one for each. Of two surfaces in contact the greater friction
         # counts, so that the ground has to be as slippery as the feet.
         if "friction" in drawn:

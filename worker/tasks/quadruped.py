@@ -91,22 +91,23 @@ class QuadrupedConfig(TaskConfig):
     velocity_scale: float = 0.05
     """Factor on joint velocities in observations [s/rad]."""
     rewards: Mapping[str, float] = reward_weights(
-        track_linear=1.0,
-        track_angular=0.5,
+        track_linear=2.0,
+        track_angular=1.0,
         lin_vel_z=-2.0,
         ang_vel_xy=-0.05,
         orientation=-2.5,
-        torques=-2.0e-4,
+        torques=-1.0e-4,
         action_rate=-0.01,
         pose=-0.05,
         limits=-5.0,
-        fall=-1.0,
+        fall=-2.0,
     )
     """Weights of, per second: exp(-4 e^2) of the error e of the horizontal velocity [m/s]; exp(-4 e^2) of that of the turning
     velocity [rad/s]; the squared vertical velocity [s^2/m^2]; the squared rolling and pitching velocities [s^2/rad^2]; the
     squared horizontal part of the vertical in the trunk's frame; the sum of squared torques [1/(N m)^2]; the sum of squared
     changes of the action; the sum of squared distances to the standing angles [1/rad^2]; the sum of distances into the last
-    twentieth at the ends of the joints' ranges [1/rad]. And, once: a fall."""
+    twentieth at the ends of the joints' ranges [1/rad]. And, once: a fall, which must not be cheaper than the costs of the
+    first clumsy seconds."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=24,
@@ -117,6 +118,7 @@ class QuadrupedConfig(TaskConfig):
             learning_rate=1.0e-3,
             desired_kl=0.01,
             entropy_coef=0.005,
+            init_std=0.6,
         )
     )
     """How the task is trained."""
