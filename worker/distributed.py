@@ -22,6 +22,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
+from worker.deferred import defer_compiler
 from worker.errors import GangError
 
 REPORT_SECONDS = 60.0
@@ -162,6 +163,7 @@ def connect(placement: Placement, *, device: str | None = None, report_seconds: 
     Raises:
         GangError: Ranks did not report within ``report_seconds``, or can't reach each other.
     """
+    defer_compiler()  # before anything that would import it
     device = device or placement.device
     if device.startswith("cuda"):
         torch.cuda.set_device(device)
