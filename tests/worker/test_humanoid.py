@@ -87,9 +87,9 @@ def test_observation_and_reward_by_hand(humanoid: Humanoid) -> None:
     assert seen["right_hip_y_position"] == pytest.approx(0.5, abs=1e-5)
     assert seen["abdomen_z_position"] == pytest.approx(0.0, abs=1e-6)
     assert seen["left_knee_velocity"] == pytest.approx(0.4) and seen["left_knee_previous_action"] == -1
-    # forward 0.3, heading 0, up 0.1, alive 2, action 0.01, energy 0.05 x |1 x 4 x 0.1| and half of the last hundredth of the
+    # forward 0.3, heading 0, up 0.1, alive 2, action 0.01 x 3², energy 0.05 x |1 x 4 x 0.1| and half of the last hundredth of the
     # range at 0.25, both times the knee's 90 of 135 N m
-    expected = 0.3 + 0.0 + 0.1 + 2.0 - 0.01 - 0.05 * 0.4 * 90 / 135 - 0.25 * 0.5 * 90 / 135
+    expected = 0.3 + 0.0 + 0.1 + 2.0 - 0.09 - 0.05 * 0.4 * 90 / 135 - 0.25 * 0.5 * 90 / 135
     assert humanoid.rewards[0].item() == pytest.approx(expected, abs=1e-4)
 
 

@@ -100,7 +100,7 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
         "ang_vel_xy": -0.05 * 0.3**2,
         "orientation": 0.0,
         "torques": -1.0e-4 * (9.0 + 16.0),
-        "action_rate": -0.01 * 0.75**2,
+        "action_rate": -0.01 * 4.75**2,
         "pose": -0.05 * (0.75**2 + 0.2**2),
         "limits": -5.0 * (-0.85 + 0.885),
         "fall": 0.0,

@@ -184,7 +184,8 @@ def add_rewards(parameters: HumanoidParameters, worlds: WorldArrays, episodes: E
     for joint in range(JOINTS):
         action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
         velocity = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        effort += action * action
+        # of what the policy asked for: beyond the motors' limits nothing else would hold it back from drifting away
+        effort += episodes.actions[world, joint] * episodes.actions[world, joint]
         energy += wp.abs(action * velocity) * parameters.strengths[joint]
         into = (wp.abs(scaled_position(parameters, worlds, world, joint)) - 0.98) / 0.02
         limits += wp.clamp(into, 0.0, 1.0) * parameters.strengths[joint]

@@ -39,7 +39,7 @@ COMMAND = wp.constant(0)
 COUNTDOWN = wp.constant(3)
 """Column of ``memory``: control steps until the next command."""
 LAST_ACTION = wp.constant(4)
-"""First of twelve columns of ``memory``: the action of the last step."""
+"""First of twelve columns of ``memory``: the action of the last step, as it was asked for."""
 
 JOINT_NAMES = tuple(
     f"{leg}_{part}"
@@ -218,7 +218,7 @@ def write_observation(
         angle = worlds.joint_q[world, FIRST_COORDINATE + joint]
         observations[world, 12 + joint] = angle - standing_angle(parameters, joint)
         observations[world, 24 + joint] = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        observations[world, 36 + joint] = episodes.memory[world, LAST_ACTION + joint]
+        observations[world, 36 + joint] = wp.clamp(episodes.memory[world, LAST_ACTION + joint], -1.0, 1.0)
 
 
 @wp.func
@@ -265,7 +265,8 @@ def add_rewards(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: 
     limits = 0.0
     for joint in range(JOINTS):
         torque = worlds.drives[world, FIRST_DOF + joint]
-        difference = wp.clamp(episodes.actions[world, joint], -1.0, 1.0) - episodes.memory[world, LAST_ACTION + joint]
+        # of what the policy asked for: beyond the limits nothing else would hold it back from drifting away
+        difference = episodes.actions[world, joint] - episodes.memory[world, LAST_ACTION + joint]
         angle = worlds.joint_q[world, FIRST_COORDINATE + joint]
         ends = parameters.ranges[joint]
         margin = 0.05 * (ends[1] - ends[0])
@@ -299,7 +300,7 @@ def observe(mode: int, max_age: int, parameters: QuadrupedParameters, worlds: Wo
         if fallen:
             add_reward(episodes, world, 9, 1.0)
         for joint in range(JOINTS):
-            episodes.memory[world, LAST_ACTION + joint] = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
+            episodes.memory[world, LAST_ACTION + joint] = episodes.actions[world, joint]
         restart = end_step(episodes, worlds.overflow, world, fallen, valid, max_age)
         if restart:
             if valid:
