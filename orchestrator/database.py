@@ -92,7 +92,7 @@ class Database:
     def _migrate(self) -> None:
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS))
-        with self.engine.begin() as connection:
+        with self._unchecked() as connection:
             config.attributes["connection"] = connection
             present = MigrationContext.configure(connection).get_current_revision()
             known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
@@ -104,6 +104,20 @@ class Database:
             if present is None and inspect(connection).has_table("jobs"):
                 command.stamp(config, "0001")  # of the versions before there were migrations
             command.upgrade(config, "head")
+
+    @contextmanager
+    def _unchecked(self) -> Iterator[Connection]:
+        """A transaction in which SQLite lets a table be replaced that others refer to (it can't alter one in place)."""
+        with self.engine.connect() as connection:
+            is_sqlite = self.engine.dialect.name == "sqlite"
+            if is_sqlite:
+                connection.exec_driver_sql("PRAGMA foreign_keys=OFF")
+                connection.commit()
+            with connection.begin():
+                yield connection
+            if is_sqlite:
+                connection.exec_driver_sql("PRAGMA foreign_keys=ON")
+                connection.commit()
 
 
 def _shown(url: str) -> str:

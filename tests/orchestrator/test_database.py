@@ -14,6 +14,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, select, text
+from sqlalchemy.exc import IntegrityError
 
 from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_now
 from orchestrator.client import ApiError
@@ -88,9 +89,16 @@ def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_job
                 "attempts_allowed) VALUES ('j1', 'old', 'default', 'arn', '{}', '{}', 'r', 'FAILED', 5, 3)"
             )
         )
+        connection.execute(
+            text(
+                "INSERT INTO attempts (job_id, number, epoch, nodes, created_at, spent) VALUES ('j1', 1, 1, '[]', 5, :spent)"
+            ),
+            {"spent": True},
+        )
     engine.dispose()
     with opened().session() as session:
         old = session.get_one(Job, "j1")
+        assert [attempt.number for attempt in old.attempts] == [1]
         assert (old.name, old.attempts_allowed, old.kind, old.tags, old.evaluate_on_exit) == (
             "old",
             3,
@@ -98,6 +106,13 @@ def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_job
             {},
             [],
         )
+
+
+def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:
+    database = Database.at(tmp_path)
+    with pytest.raises(IntegrityError), database.session() as session:
+        session.add(Attempt(job_id="no such job", number=1, epoch=1, nodes=[]))
+    database.close()
 
 
 def test_down_and_up_again_leaves_the_tables_as_they_are(url: str, opened: Callable[[], Database]) -> None:
