@@ -47,6 +47,8 @@ class Client:
         self._found = False
         self.successor: Callable[[], Client] | None = None
         """Where to find, or how to start, another controller when this one is gone; else it is waited for."""
+        self.told: Callable[[str], object] = lambda line: None
+        """Is called with what a person would like to know while nothing happens."""
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False)
 
@@ -158,6 +160,7 @@ class Client:
     def await_return(self, seconds: float = 120) -> None:
         """Wait until the controller, or its successor on the same home directory, answers again. Raises Unreachable."""
         deadline = time.monotonic() + seconds
+        said = False
         while True:
             try:
                 successor = self.successor() if self.successor else Client.connect(None if self._found else self.url)
@@ -165,6 +168,9 @@ class Client:
             except Unreachable:
                 if time.monotonic() > deadline:
                     raise
+                if not said:
+                    self.told(f"no controller answers at {self.url}; waiting up to {seconds:.0f} s for one")
+                    said = True
                 time.sleep(0.5)
         self._http.close()
         self.url, self._http = successor.url, successor._http

@@ -37,6 +37,8 @@ class JobDefinition(Base):
     revision: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     document: Mapped[dict[str, Any]]
     """The request as registered."""
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Whose key registered it."""
     status: Mapped[str] = mapped_column(default="ACTIVE")
     tags: Mapped[dict[str, str]] = mapped_column(default=dict)
     created_at: Mapped[int] = mapped_column(default=now)

@@ -69,7 +69,7 @@ class Identity:
             raise Refusal(
                 "AccessDeniedException",
                 f"{self.name} may use job queue {', '.join(sorted(self.queues)) or 'none'} only: {operation} is refused, since "
-                "it concerns others too",
+                "it concerns other queues too",
             )
 
     def check_write(self, operation: str) -> None:

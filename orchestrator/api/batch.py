@@ -57,7 +57,7 @@ _INSTEAD = {
 _READS = ("Describe", "List", "Get")
 _FOR_ALL_QUEUES = (
     *("CreateComputeEnvironment", "UpdateComputeEnvironment", "DeleteComputeEnvironment"),
-    *("CreateSchedulingPolicy", "UpdateSchedulingPolicy", "DeleteSchedulingPolicy", "DeregisterJobDefinition"),
+    *("CreateSchedulingPolicy", "UpdateSchedulingPolicy", "DeleteSchedulingPolicy"),
 )
 """Not for a key that may use some queues only."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 
 from sqlalchemy import select
@@ -11,6 +12,7 @@ from orchestrator.api.arns import plain_name
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.tables import Job, JobDefinition, JobQueue
+from shared_store.layout import Run, StoreError
 
 
 @dataclass(frozen=True)
@@ -52,3 +54,18 @@ class Context:
     def reason(self, job: Job) -> str | None:
         """Why a job waits just now; None where it does not wait for room."""
         return self.controller.reason(job.id) if job.status == "RUNNABLE" else None
+
+
+def find_run(controller: Controller, name: str) -> Run:
+    """The run called ``name``. Raises ClientError (404) naming the nearest one that exists."""
+    try:
+        run = controller.store.run(name)
+    except StoreError as error:
+        raise ClientError(str(error)) from None
+    if run.description() is None:
+        runs = [each.name for each in controller.store.runs()]
+        nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
+        others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"
+        hint = f"; did you mean {nearest[0]}?" if nearest else others
+        raise ClientError(f"run {name} does not exist in {controller.store.path}{hint}", 404)
+    return run

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import func, select
 
-from orchestrator.api import rules
+from orchestrator.api import auth, rules
 from orchestrator.api.arns import definition_arn, plain_name
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
@@ -33,10 +33,14 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
         rules.check_nodes(request["nodeProperties"])
     else:
         rules.check_container(request["containerProperties"], "containerProperties")
+    _check_owner(context, name, "RegisterJobDefinition")
     newest = context.session.scalar(select(func.max(JobDefinition.revision)).where(JobDefinition.name == name))
     revision = (newest or 0) + 1
+    owner = auth.current_identity.get().name
     document = {key: value for key, value in request.items() if key != "tags"}
-    context.session.add(JobDefinition(name=name, revision=revision, document=document, tags=request.get("tags") or {}))
+    context.session.add(
+        JobDefinition(name=name, revision=revision, document=document, owner=owner, tags=request.get("tags") or {})
+    )
     return {"jobDefinitionName": name, "jobDefinitionArn": definition_arn(name, revision), "revision": revision}
 
 
@@ -72,10 +76,19 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
         raise ClientError(
             f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"
         )
+    _check_owner(context, name, "DeregisterJobDefinition")
     definition = context.session.get(JobDefinition, (name, int(revision)))
     if definition is not None:  # AWS answers the same for one that is not there
         definition.status = "INACTIVE"
     return {}
+
+
+def _check_owner(context: Context, name: str, operation: str) -> None:
+    """A key that is kept to some queues changes only what it has registered itself: others submit by the bare name."""
+    identity = auth.current_identity.get()
+    owners = set(context.session.scalars(select(JobDefinition.owner).where(JobDefinition.name == name).distinct()))
+    if owners - {identity.name}:
+        identity.check_all_queues(f"{operation} of {name}, which others have registered,")
 
 
 def _describe(definition: JobDefinition) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.api import auth, runs
+from orchestrator.api.context import find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
@@ -124,6 +125,11 @@ def job_logs(
     controller = _controller(request)
     with controller.database.session() as session:
         job = _job(session, reference)
+        count = int(job.node_properties["numNodes"])
+        if node is not None and not 0 <= node < count:
+            raise ClientError(
+                f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
+            )
         follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt)
         job_id = job.id
     closing: threading.Event = request.app.state.closing
@@ -190,20 +196,20 @@ def run_detail(request: Request, name: str) -> dict[str, Any]:
     """One run."""
     controller = _controller(request)
     with controller.database.session() as session:
-        return runs.describe_run(controller, session, runs.find_run(controller, name))
+        return runs.describe_run(controller, session, find_run(controller, name))
 
 
 @router.get("/runs/{name}/checkpoints")
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = runs.find_run(_controller(request), name)
+    run = find_run(_controller(request), name)
     return [runs.describe_checkpoint(checkpoint, verify) for checkpoint in list_checkpoints(run)]
 
 
 @router.get("/runs/{name}/metrics")
 def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for iterations greater than ``after``."""
-    return read_metrics(runs.find_run(_controller(request), name), after)
+    return read_metrics(find_run(_controller(request), name), after)
 
 
 @router.post("/runs/{name}/resume")
@@ -215,7 +221,7 @@ def resume_run(
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
     controller = _controller(request)
-    run = runs.find_run(controller, name)
+    run = find_run(controller, name)
     return runs.resume(
         controller, run, body.checkpoint, body.set, body.directory, body.nodes, idempotency_key=idempotency_key
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,24 +19,11 @@ from orchestrator.spec import Spec, SpecError, override, validate
 from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import read_json
-from shared_store.layout import Run, StoreError
+from shared_store.layout import Run
 from shared_store.metrics import read_metrics
 
 CONFLICT = 409
 """The request is well formed, but the state of things refuses it."""
-
-
-def find_run(controller: Controller, name: str) -> Run:
-    """The run called ``name``. Raises ClientError (404) naming the nearest one that exists."""
-    try:
-        run = controller.store.run(name)
-    except StoreError as error:
-        raise ClientError(str(error)) from None
-    if run.description() is None:
-        nearest = difflib.get_close_matches(name, [each.name for each in controller.store.runs()], 1, cutoff=0.3)
-        hint = f"; did you mean {nearest[0]}?" if nearest else "; no run exists yet"
-        raise ClientError(f"run {name} does not exist in {controller.store.path}{hint}", 404)
-    return run
 
 
 def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from sqlalchemy import select
 
 from orchestrator.api import auth, rules
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
@@ -99,6 +99,8 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     is_array = bool(request.get("arrayProperties"))
     run = gang_needs(properties).setting("MUSTER_RUN") or f"{name[:110]}-{job_id[:8]}"
     _check_run(context, run, is_array)
+    if not request.get("dependsOn"):
+        _check_source(context, gang_needs(properties).spec)
     return Job(
         id=job_id,
         name=name,
@@ -147,6 +149,14 @@ def _check_run(context: Context, run: str, is_array: bool) -> None:
         raise ClientError(
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
         )
+
+
+def _check_source(context: Context, spec: Mapping[str, Any] | None) -> None:
+    """The run that a job from YAML evaluates or exports is there, unless it waits for a job that makes it."""
+    for kind in ("evaluate", "export"):
+        section = (spec or {}).get(kind)
+        if isinstance(section, dict) and isinstance(section.get("run"), str):
+            find_run(context.controller, section["run"])
 
 
 def _release(job: Job) -> None:

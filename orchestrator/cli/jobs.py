@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from orchestrator import specfile
-from orchestrator.cli.progress import follow
+from orchestrator.cli.progress import evaluated, follow
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.base import Host
@@ -29,6 +30,8 @@ JobArgument = Annotated[
     str, typer.Argument(help="Job id, the first letters of one (4 or more), or a job name (the newest).")
 ]
 
+_WHOLE = 1000
+"""Columns of a table for another program."""
 _COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
@@ -100,7 +103,7 @@ def list_jobs(
     table = Table(box=None, pad_edge=False)
     for column in ("JOB", "NAME", "STATUS", "NODES", "CREATED", "TOOK"):
         table.add_column(column, no_wrap=True)
-    table.add_column("REASON", overflow="fold")
+    table.add_column("REASON", no_wrap=True, overflow="ellipsis")
     for summary in shown:
         colour = _COLOURS.get(summary["status"], "white")
         took = _took(summary.get("startedAt"), summary.get("stoppedAt"))
@@ -110,7 +113,8 @@ def list_jobs(
         table.add_row(
             summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took, reason
         )
-    Console().print(table)
+    # one line a job: cut to the terminal's width, whole for another program
+    (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)
 
 
 def _list_queue(client: Client, queue: str, all_: bool) -> list[dict[str, Any]]:
@@ -165,6 +169,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
+    if evaluation := results.get("evaluation"):
+        facts["evaluation"] = evaluated(evaluation)
     facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "store": results.get("path")}
     for name, value in facts.items():
         if value:

@@ -42,6 +42,7 @@ def logs(
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour = sys.stdout.isatty()
     with Client.connect() as client:
+        client.told = lambda line: print(line, file=sys.stderr, flush=True)
         for line in client.logs(job, follow=follow, node=node, rank=rank, attempt=attempt):
             if (oldest and line["time"] < oldest) or (pattern and not pattern.search(line["text"])):
                 continue

@@ -74,11 +74,7 @@ def summary(client: Client, job_id: str) -> int:
                 break
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
-        length, longest = evaluation["mean_length"], evaluation["max_length"]
-        console.print(
-            f"  evaluation:  mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
-            f"mean return {evaluation['mean_return']:.2f} over {evaluation['episodes']} episodes"
-        )
+        console.print(f"  evaluation:  {evaluated(evaluation)}")
     log = attempt["nodes"][0]["log"] if attempt else None
     for name, value in {"checkpoint": results.get("checkpoint"), "log": log, "plot": results.get("plot")}.items():
         if value:
@@ -86,6 +82,15 @@ def summary(client: Client, job_id: str) -> int:
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
         console.print(f"  go on with:  muster resume {detail['run']}", markup=False)
     return 0 if succeeded else 1
+
+
+def evaluated(figures: dict[str, Any]) -> str:
+    """An evaluation in one line."""
+    length, longest = figures["mean_length"], figures["max_length"]
+    return (
+        f"mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
+        f"mean return {figures['mean_return']:.2f} over {figures['episodes']} episodes"
+    )
 
 
 def _follow_logs(client: Client, job_id: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -100,6 +101,10 @@ def serve(
         signal.signal(number, lambda _number, _frame: ended.set())
     server.start()
     typer.echo(f"Muster serves {server.url}  (API: {server.url}/api/docs)")
+    if host in ("0.0.0.0", "::"):
+        typer.echo(
+            f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}"
+        )
     typer.echo(f"home {muster_home()}, store {server.store.path}")
     try:
         ended.wait()

@@ -31,6 +31,8 @@ def tasks(
 
     The weights of reward terms are changed in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
+    if sys.stderr.isatty():
+        typer.echo("importing the simulation, some seconds …", err=True)
     found = _ask_worker([name] if name else [])
     if as_json:
         typer.echo(json.dumps(found, indent=1))

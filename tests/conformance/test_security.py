@@ -282,10 +282,13 @@ def test_a_key_for_one_queue_changes_nothing_that_others_depend_on(served: Servi
         lambda: own.untag_resource(resourceArn=f"{prefix}job-queue/default", tagKeys=["a"]),
         lambda: own.update_scheduling_policy(arn=policy, fairsharePolicy=fair),
         lambda: own.deregister_job_definition(jobDefinition="theirs:1"),
+        lambda: own.register_job_definition(**definition("theirs")),
     ):
         with pytest.raises(ClientError, match="key robots may") as caught:
             change()
         assert code(caught) == ("AccessDeniedException", 403)
+    assert [own.register_job_definition(**definition("own"))["revision"] for _ in range(2)] == [1, 2]
+    own.deregister_job_definition(jobDefinition="own:1")
 
 
 def test_no_host_that_a_web_page_can_name_reaches_an_open_server(shared_server: Serving) -> None:

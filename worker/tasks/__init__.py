@@ -42,7 +42,7 @@ def find_task(name: str) -> type[Task]:
     if where is None:
         nearest = difflib.get_close_matches(name.lower(), [task.lower() for task in known], n=1, cutoff=0.5)
         hint = "".join(f"; did you mean {task}?" for task in known if task.lower() in nearest)
-        raise ValueError(f"no task is called {name!r}{hint} Known tasks: {', '.join(known)}, or module:Class")
+        raise ValueError(f"no task is called {name!r}{hint or '.'} Known tasks: {', '.join(known)}, or module:Class")
     module_name, _, class_name = where.partition(":")
     if name == where and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a user's module lies where the job was submitted; ours are never hidden by it
