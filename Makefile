@@ -1,13 +1,14 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the whole test suite
 # make torture N=300   kill everything at random moments; every run must end with the same bits
+# make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make fuzz N=10000    malformed requests, drawn at random; none may be answered with a 500
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume fuzz torture env clean
+.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bits fuzz torture env clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -48,6 +49,9 @@ bench-api: $(READY)
 
 torture: $(READY)
 	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300)
+
+bits: $(READY)
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py
