@@ -1,38 +1,13 @@
-"""A humanoid that runs along +x, with the observations and rewards known from Isaac Gym's Humanoid."""
+"""A humanoid that runs along +x."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
-import newton
-import newton.examples
-import numpy as np
-import warp as wp
-
-from worker.simulation.episodes import (
-    STEP,
-    EpisodeArrays,
-    add_reward,
-    begin_episode,
-    clear_row,
-    end_step,
-    is_finite,
-    random_stream,
-)
-from worker.simulation.worlds import WorldArrays, root_rotation
-from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
-from worker.tasks.task import Task
-
-wp.set_module_options({"enable_backward": False})
-
-JOINTS = wp.constant(21)
-"""Hinges, in the order of the joint coordinates."""
-FIRST_COORDINATE = wp.constant(7)
-"""Joint coordinates of the torso's free joint: position, quaternion xyzw."""
-FIRST_DOF = wp.constant(6)
-"""Joint velocities of the torso's free joint: linear, angular."""
+from worker.tasks.config import reward_weights
+from worker.tasks.running import RunnerConfig, Running, observation_names
 
 JOINT_NAMES = (
     *("abdomen_z", "abdomen_y", "abdomen_x"),
@@ -45,204 +20,25 @@ JOINT_NAMES = (
 
 
 @dataclass(frozen=True)
-class HumanoidConfig(TaskConfig):
-    """Run fast, straight and upright; do not fall."""
+class HumanoidConfig(RunnerConfig):
+    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunnerConfig`."""
 
-    control_hz: float = 60.0
-    """Control steps per simulated second [Hz]."""
-    substeps: int = 2
-    """Physics steps of one control step, each of 1/120 s."""
-    episode_seconds: float = 16.0
-    """Simulated time after which the clock ends an episode [s]."""
     fall_height: float = 0.8
     """Height of the torso under which the episode ends [m]."""
     start_height: float = 1.34
     """Height of the torso at the start [m]: the feet are 5 cm above the ground."""
-    start_angle_noise: float = 0.2
-    """A start moves each joint uniformly within +- this angle [rad], kept inside the joint's range."""
-    start_velocity_noise: float = 0.1
-    """A start gives each joint a uniform velocity within +- this [rad/s]."""
-    velocity_scale: float = 0.1
-    """Factor on joint velocities in observations and in the energy cost [s/rad]."""
-    angular_velocity_scale: float = 0.25
-    """Factor on the torso's angular velocity in observations [s/rad]."""
     rewards: Mapping[str, float] = reward_weights(
         forward=1.0, heading=0.5, up=0.1, alive=2.0, action=-0.01, energy=-0.05, limits=-0.25, fall=-1.0
     )
-    """Weights of: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion
-    below); an upright torso (cosine to vertical above 0.93); each step that does not end in a fall; the sum of squared
-    actions; the sum over joints of |action x scaled joint velocity| x strength; the sum over joints of how far each is into
-    the last hundredth at an end of its range (0 to 1) x strength; a fall, which replaces every other term of that step. A
-    joint's strength is its motor's full torque over that of the strongest."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=32,
-            hidden_sizes=(400, 200, 100),
-            activation="elu",
-            epochs=5,
-            minibatches=4,
-            learning_rate=5.0e-4,
-            desired_kl=0.01,
-        )
-    )
-    """How the task is trained."""
 
 
-@wp.struct
-class HumanoidParameters:
-    """The fields of :class:`HumanoidConfig` that the kernels use, and what the model says of each joint."""
-
-    fall_height: float
-    start_height: float
-    start_angle_noise: float
-    start_velocity_noise: float
-    velocity_scale: float
-    angular_velocity_scale: float
-    ranges: wp.array(dtype=wp.vec2)
-    """Lower and upper end of each joint's range [rad], shape ``(joints,)``."""
-    strengths: wp.array(dtype=wp.float32)
-    """Full torque of each joint's motor over that of the strongest, shape ``(joints,)``."""
-    actuators: wp.array(dtype=wp.int32)
-    """Index of each joint's motor, shape ``(joints,)``."""
-
-
-@wp.func
-def scaled_position(parameters: HumanoidParameters, worlds: WorldArrays, world: int, joint: int) -> float:
-    """Joint angle mapped so that its range becomes [-1, 1]."""
-    ends = parameters.ranges[joint]
-    return (2.0 * worlds.joint_q[world, FIRST_COORDINATE + joint] - ends[0] - ends[1]) / (ends[1] - ends[0])
-
-
-@wp.kernel
-def act(parameters: HumanoidParameters, worlds: WorldArrays, episodes: EpisodeArrays):
-    """The action is each motor's share of its full torque, clipped to [-1, 1]."""
-    world = wp.tid()
-    for joint in range(JOINTS):
-        worlds.controls[world, parameters.actuators[joint]] = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
-
-
-@wp.func
-def write_observation(
-    observations: wp.array2d(dtype=wp.float32),
-    parameters: HumanoidParameters,
-    worlds: WorldArrays,
-    episodes: EpisodeArrays,
-    world: int,
-    first_step: bool,
-):
-    """Torso height, velocities in the torso frame, attitude, then joints, then the action that led here."""
-    rotation = root_rotation(worlds, world)
-    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
-    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
-    linear = wp.quat_rotate_inv(rotation, linear)
-    angular = wp.quat_rotate_inv(rotation, angular) * parameters.angular_velocity_scale
-    forward = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))
-    left = wp.quat_rotate(rotation, wp.vec3(0.0, 1.0, 0.0))
-    up = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))
-    observations[world, 0] = worlds.joint_q[world, 2]
-    for axis in range(3):
-        observations[world, 1 + axis] = linear[axis]
-        observations[world, 4 + axis] = angular[axis]
-    observations[world, 7] = wp.atan2(forward[1], forward[0])
-    observations[world, 8] = wp.atan2(left[2], up[2])
-    observations[world, 9] = up[2]
-    observations[world, 10] = forward[0]
-    for joint in range(JOINTS):
-        observations[world, 11 + joint] = scaled_position(parameters, worlds, world, joint)
-        observations[world, 11 + JOINTS + joint] = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        action = 0.0
-        if not first_step:
-            action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
-        observations[world, 11 + 2 * JOINTS + joint] = action
-
-
-@wp.func
-def place(parameters: HumanoidParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Stand a world's humanoid at the origin facing +x, joints near zero, with a cold solver."""
-    stream = random_stream(episodes, world)
-    clear_row(worlds.joint_q, world)
-    clear_row(worlds.joint_qd, world)
-    clear_row(worlds.warm_start, world)
-    worlds.joint_q[world, 2] = parameters.start_height
-    worlds.joint_q[world, 6] = 1.0
-    for joint in range(JOINTS):
-        ends = parameters.ranges[joint]
-        angle = parameters.start_angle_noise * wp.randf(stream, -1.0, 1.0)
-        worlds.joint_q[world, FIRST_COORDINATE + joint] = wp.clamp(angle, ends[0], ends[1])
-        worlds.joint_qd[world, FIRST_DOF + joint] = parameters.start_velocity_noise * wp.randf(stream, -1.0, 1.0)
-
-
-@wp.func
-def add_rewards(parameters: HumanoidParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Every reward term of a step without a fall."""
-    rotation = root_rotation(worlds, world)
-    heading = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))[0]
-    upright = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))[2]
-    effort = float(0.0)  # not a constant: loops this long are not unrolled
-    energy = float(0.0)
-    limits = float(0.0)
-    for joint in range(JOINTS):
-        action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
-        velocity = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        # of what the policy asked for: beyond the motors' limits nothing else would hold it back from drifting away
-        effort += episodes.actions[world, joint] * episodes.actions[world, joint]
-        energy += wp.abs(action * velocity) * parameters.strengths[joint]
-        into = (wp.abs(scaled_position(parameters, worlds, world, joint)) - 0.98) / 0.02
-        limits += wp.clamp(into, 0.0, 1.0) * parameters.strengths[joint]
-    add_reward(episodes, world, 0, worlds.joint_qd[world, 0])
-    add_reward(episodes, world, 1, wp.min(heading / 0.8, 1.0))
-    if upright > 0.93:
-        add_reward(episodes, world, 2, 1.0)
-    add_reward(episodes, world, 3, 1.0)
-    add_reward(episodes, world, 4, effort)
-    add_reward(episodes, world, 5, energy)
-    add_reward(episodes, world, 6, limits)
-
-
-@wp.kernel
-def observe(mode: int, max_age: int, parameters: HumanoidParameters, worlds: WorldArrays, episodes: EpisodeArrays):
-    """Reward, termination, statistics, masked reset and observation of one world a thread."""
-    world = wp.tid()
-    restart = mode != STEP
-    if mode == STEP:
-        valid = is_finite(worlds.joint_q, world) and is_finite(worlds.joint_qd, world)
-        fallen = valid and worlds.joint_q[world, 2] < parameters.fall_height
-        episodes.rewards[world] = 0.0
-        if fallen:
-            add_reward(episodes, world, 7, 1.0)
-        elif valid:
-            add_rewards(parameters, worlds, episodes, world)
-        restart = end_step(episodes, worlds.overflow, world, fallen, valid, max_age)
-        if restart:
-            if valid:
-                write_observation(episodes.terminal_observations, parameters, worlds, episodes, world, False)
-            else:
-                clear_row(episodes.terminal_observations, world)
-    if restart:
-        begin_episode(episodes, world)
-        place(parameters, worlds, episodes, world)
-    write_observation(episodes.observations, parameters, worlds, episodes, world, restart)
-
-
-class Humanoid(Task):
+class Humanoid(Running):
     """Newton's bundled ``nv_humanoid.xml``: 74 observations, 21 actions, 60 control steps a second, episodes of 16 s."""
 
     config_type = HumanoidConfig
-    parameters_type = HumanoidParameters
-    observation_names = (
-        "torso_height",
-        *(f"torso_velocity_{axis}" for axis in "xyz"),
-        *(f"torso_angular_velocity_{axis}" for axis in "xyz"),
-        "torso_yaw",
-        "torso_roll",
-        "torso_up",
-        "torso_heading",
-        *(f"{joint}_{kind}" for kind in ("position", "velocity", "previous_action") for joint in JOINT_NAMES),
-    )
+    observation_names = observation_names(JOINT_NAMES)
     action_names = JOINT_NAMES
-    act: ClassVar[wp.Kernel] = act
-    observe: ClassVar[wp.Kernel] = observe
-    ground = True
+    asset = "nv_humanoid.xml"
     solver_options: ClassVar[dict[str, object]] = {
         # At most 16 contacts and 37 rows were seen in 96 worlds x 400 steps of random, zero and held random actions with
         # 1,232 falls (data.nacon and data.nefc after each step, limits at the worst case of 35 and 161).
@@ -253,21 +49,3 @@ class Humanoid(Task):
         "ls_iterations": 6,
         "tolerance": 1.0e-3,
     }
-
-    def build(self, builder: newton.ModelBuilder) -> None:
-        """The humanoid without the file's floor; its own parts do not collide with each other."""
-        builder.add_mjcf(
-            newton.examples.get_asset("nv_humanoid.xml"), ignore_names=["floor"], enable_self_collisions=False
-        )
-        # The file has it half under the ground, where the solver would ask for more capacity than it ever needs.
-        builder.joint_q[2] = HumanoidConfig.start_height
-
-    def read_model(self, parameters: Any) -> None:
-        """Ranges, motors and strengths, joint by joint: the file lists motors in another order than joints."""
-        model = self.worlds.solver.mj_model
-        joint_of_motor = model.actuator_trnid[:, 0]
-        motors = [int(np.flatnonzero(joint_of_motor == joint)[0]) for joint in range(1, 1 + len(JOINT_NAMES))]
-        torques = model.actuator_gear[motors, 0]
-        parameters.ranges = wp.array(model.jnt_range[1:], dtype=wp.vec2, device=self.device)
-        parameters.strengths = wp.array(torques / torques.max(), dtype=wp.float32, device=self.device)
-        parameters.actuators = wp.array(motors, dtype=wp.int32, device=self.device)
