@@ -44,6 +44,10 @@ class Run:
         return self.path / "evaluations"
 
     @property
+    def replays(self) -> Path:
+        return self.path / "replays"
+
+    @property
     def exports(self) -> Path:
         return self.path / "exports"
 

@@ -40,6 +40,7 @@ class PointConfig:
     """Rewards are NaN from this step of the task on; 0 never."""
     sleep: float = 0.0
     """How long a step takes [s]."""
+    nan_limit: float = 0.1
     ppo: PointPPO = field(default_factory=PointPPO)
 
 
@@ -69,6 +70,7 @@ class Point:
         self.time_outs = torch.zeros(world_count, dtype=torch.bool)
         self.episode_length = torch.zeros(world_count, dtype=torch.int32)
         self.statistics = torch.zeros(4, dtype=torch.float64)
+        self.mishap = torch.zeros(1, dtype=torch.int32)
         self.reset()
 
     def _draw(self, mask: torch.Tensor) -> torch.Tensor:
@@ -116,15 +118,18 @@ class Point:
     def clear_statistics(self) -> None:
         self.statistics.zero_()
 
-    def _tensors(self) -> dict[str, torch.Tensor]:
+    def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
+        pass
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
         names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")
         return {name: getattr(self, name) for name in names}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {name: tensor.clone() for name, tensor in self._tensors().items()}
+        return {name: tensor.clone() for name, tensor in self.state_tensors().items()}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        for name, tensor in self._tensors().items():
+        for name, tensor in self.state_tensors().items():
             if state[name].shape != tensor.shape:
                 raise ValueError(f"{name}: expected shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}")
             tensor.copy_(state[name])

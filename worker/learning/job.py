@@ -143,7 +143,8 @@ def _as_type_of(default: Any, value: Any, where: str) -> Any:
         return _override(default, value, where)
     if isinstance(default, Mapping):
         if not isinstance(value, Mapping):
-            raise UserError(f"{where}: expected a mapping of {', '.join(default)}; got {value!r}")
+            keys = f" of {', '.join(default)}" if default else ""
+            raise UserError(f"{where}: expected a mapping{keys}; got {value!r}")
         return value
     if isinstance(default, float) and not isinstance(default, bool) and number:
         return float(value)

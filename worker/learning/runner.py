@@ -23,6 +23,7 @@ from worker.learning.job import Job, StopRequest, configure, end_startup, user_e
 from worker.learning.ppo import LOSSES, PPO, Share
 from worker.learning.randomness import seed_generators
 from worker.learning.recording import HostCopy, Recorded
+from worker.learning.replay import Replay
 from worker.learning.report import Report, Stopwatch
 from worker.learning.state import TrainingState
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
+WARNINGS = 10
+"""At most so many iterations with worlds that were reset have a line of their own."""
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
 """What the ranks tell each other once an iteration, besides the statistics: how many were asked to stop, how many to save now, how
 many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
@@ -62,8 +65,9 @@ class Runner:
                 self.task.action_size,
                 gang,
                 seed=self.seed,
-                extras=gang.size + len(self.task.statistic_names) + len(SIGNALS),
+                extras=2 * gang.size + len(self.task.statistic_names) + len(SIGNALS),
             )
+        self.replay = Replay(self.task, self.ppo, job.section, self.seed)
         self.ppo.broadcast_parameters()
         seed_generators(self.seed, gang.rank)
         self.state = TrainingState(
@@ -84,6 +88,7 @@ class Runner:
         self._numbers = HostCopy(gang.device)
         self._own_signals = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
         self._told_captured = False
+        self._warnings = 0
         self._iteration_seconds = self._collect_seconds = self._stall_seconds = 0.0
         self.fence = Fence(job.run, job.epoch)
         self.beacon = Beacon()
@@ -162,10 +167,13 @@ class Runner:
         progress, ppo = self.state.progress, self.ppo
         self._stopwatch.start()
         ppo.begin_iteration(progress.iteration)
+        self.task.begin_iteration(progress.iteration, progress.reward, progress.episode_length)
         self._collecting()
         self._stopwatch.mark()
         ppo.extra.zero_()
-        ppo.extra[self.gang.size : -len(SIGNALS)].copy_(self.task.statistics)
+        ranks = self.gang.size
+        ppo.extra[ranks + self.gang.rank].copy_(self.task.mishap[0])
+        ppo.extra[2 * ranks : -len(SIGNALS)].copy_(self.task.statistics)
         self._own_signals.copy_(torch.tensor([self._collect_seconds, *self._signals()], dtype=torch.float64))
         ppo.extra[self.gang.rank].copy_(self._own_signals[0], non_blocking=True)
         ppo.extra[-len(SIGNALS) :].copy_(self._own_signals[1:], non_blocking=True)
@@ -179,21 +187,50 @@ class Runner:
             )
         )
         values, rate, std = known[: len(LOSSES)], known[len(LOSSES)], known[len(LOSSES) + 1]
-        first = len(LOSSES) + 2
-        ranks, totals = known[first : first + self.gang.size], known[first + self.gang.size : -len(SIGNALS)]
-        signals = known[-len(SIGNALS) :]
+        extra = known[len(LOSSES) + 2 :]
+        collected, mishaps = extra[:ranks], extra[ranks : 2 * ranks]
+        totals, signals = extra[2 * ranks : -len(SIGNALS)], extra[-len(SIGNALS) :]
         progress.iteration += 1
         if not all(map(math.isfinite, values)):
-            self._tell_saved(self.state.finish())  # the losses are those of the gang: every rank is here
             worst = ", ".join(f"{name} {value:g}" for name, value in zip(LOSSES, values, strict=True))
-            last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
-            raise TrainingError(
-                f"iteration {progress.iteration}: the loss is not finite ({worst}); {last}. Try a smaller learning_rate"
-            )
+            raise self._failure(f"the loss is not finite ({worst})", "Try a smaller learning_rate")
         record = self._count(totals)
+        if record.get("nan_worlds"):
+            self._judge_resets(int(record["nan_worlds"]), mishaps)
         record |= {**dict(zip(LOSSES, values, strict=True)), "learning_rate": rate, "action_std": std}
-        record |= straggler(ranks)
+        record |= straggler(collected)
         return record, dict(zip(SIGNALS, signals, strict=True))
+
+    def _failure(self, what: str, hint: str) -> TrainingError:
+        """The end of a training that can't go on. The figures are those of the gang: every rank is here."""
+        self._tell_saved(self.state.finish())
+        last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
+        return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
+
+    def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
+        """Tell of worlds that were reset since something was not finite; raises TrainingError where they are too many."""
+        total, iteration = self.ppo.share.total, self.state.progress.iteration
+        found = [self.task.read_mishap(int(code)) for code in mishaps]
+        rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
+        first = f"first world {Share.of(rank, self.gang.size, total).first + world}: {cause} was not finite"
+        if resets <= math.ceil(self.config.nan_limit * total):
+            self._warnings += 1
+            if self._warnings <= WARNINGS:
+                more = "; from now on only counted" if self._warnings == WARNINGS else ""
+                self._say(f"warning: iteration {iteration}: {resets} resets of worlds, {first}{more}")
+            return
+        files = [self.job.run.replays / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
+        problem = ""
+        if found[self.gang.rank]:
+            try:
+                self.replay.write(files[self.gang.rank], iteration)
+            except OSError as error:
+                problem = f" (it could not be written: {error.strerror})"
+        self.gang.greatest(0)  # nobody ends the gang before every rank has written
+        raise self._failure(
+            f"{resets} resets of worlds, {first}; that is more than nan_limit, {self.config.nan_limit:g} of {total} worlds",
+            f"See it happen again: python -m worker.replay {files[rank]}{problem}",
+        )
 
     def _signals(self) -> tuple[float, ...]:
         """This rank's :data:`SIGNALS`."""
@@ -204,6 +241,7 @@ class Runner:
 
     def _collect(self) -> None:
         task, ppo = self.task, self.ppo
+        self.replay.keep()
         for _ in range(self.config.ppo.steps):
             task.step(ppo.act(task.observations))
             ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)

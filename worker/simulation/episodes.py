@@ -6,6 +6,8 @@ A task's ``observe`` kernel runs one thread a world and calls, in this order, :f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -15,6 +17,8 @@ STEP = wp.constant(0)
 RESET = wp.constant(1)
 """Mode of an ``observe`` kernel: begin a new episode in every world, without reward or statistics."""
 
+NO_MISHAP = wp.constant(2**31 - 1)
+"""``EpisodeArrays.mishap`` where nothing happened."""
 RETURN = wp.constant(0)
 STEPS = wp.constant(1)
 TERMS = wp.constant(2)
@@ -36,7 +40,11 @@ class EpisodeArrays:
         sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
         weights: Weight of each reward term, shape ``(terms,)``.
+        level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
         memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
+        broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
+        mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
+            :data:`NO_MISHAP`; shape ``(1,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
             a reward term, worlds reset because of NaN, control steps with a solver overflow; shape ``(5 + terms,)``.
     """
@@ -51,7 +59,10 @@ class EpisodeArrays:
     sums: wp.array2d(dtype=wp.float32)
     random: wp.array2d(dtype=wp.int32)
     weights: wp.array(dtype=wp.float32)
+    level: wp.array(dtype=wp.float32)
     memory: wp.array2d(dtype=wp.float32)
+    broken: wp.array(dtype=wp.int32)
+    mishap: wp.array(dtype=wp.int32)
     statistics: wp.array(dtype=wp.float64)
 
 
@@ -97,6 +108,25 @@ def begin_episode(episodes: EpisodeArrays, world: int):
 
 
 @wp.func
+def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
+    """World and cause as one number, the lower worlds first; :func:`read_mishap` takes it apart."""
+    columns = episodes.observations.shape[1]
+    cause = columns + 1  # the reward
+    if not valid:
+        cause = columns
+    elif episodes.broken[world] > 0:
+        cause = episodes.broken[world] - 1
+    return world * (columns + 2) + cause
+
+
+def read_mishap(code: int, observations: Sequence[str]) -> tuple[int, str]:
+    """The world of this task, and what of it was not finite, of a ``code`` that is not :data:`NO_MISHAP`."""
+    causes = [*(f"its observation {name}" for name in observations), "its joint positions or velocities", "its reward"]
+    world, cause = divmod(code, len(causes))
+    return world, causes[cause]
+
+
+@wp.func
 def end_step(
     episodes: EpisodeArrays,
     overflow: wp.array(dtype=wp.int32),
@@ -112,24 +142,27 @@ def end_step(
         overflow: Solver overflow bits since the last call, cleared here, shape ``(worlds,)``.
         world: Row.
         terminated: Whether the task ended the episode.
-        valid: Whether the physics is finite. An invalid world is reset and counted, and not as a finished episode.
+        valid: Whether the physics is finite. A world of which it is not, or whose observation before or reward now is not, is
+            reset and counted, and not as a finished episode.
         max_age: Steps after which the clock ends an episode.
 
     Returns:
         Whether the episode ended, so that the world must be placed afresh.
     """
     terms = episodes.sums.shape[1] - TERMS
+    sound = valid and episodes.broken[world] == 0 and wp.isfinite(episodes.rewards[world])
     age = episodes.ages[world] + 1
     episodes.ages[world] = age
-    time_out = valid and not terminated and age >= max_age
-    done = terminated or time_out or not valid
+    time_out = sound and not terminated and age >= max_age
+    done = terminated or time_out or not sound
     episodes.dones[world] = done
     episodes.time_outs[world] = time_out
 
     if overflow[world] != 0:
         overflow[world] = 0
         wp.atomic_add(episodes.statistics, TERMS + terms + 2, wp.float64(1.0))
-    if not valid:
+    if not sound:
+        wp.atomic_min(episodes.mishap, 0, mishap_code(episodes, world, valid))
         episodes.rewards[world] = 0.0
         wp.atomic_add(episodes.statistics, TERMS + terms + 1, wp.float64(1.0))
     else:
@@ -140,6 +173,23 @@ def end_step(
             for column in range(episodes.sums.shape[1]):
                 wp.atomic_add(episodes.statistics, 1 + column, wp.float64(episodes.sums[world, column]))
     return done
+
+
+@wp.kernel
+def check_observations(episodes: EpisodeArrays):
+    """Whatever a task's kernel computed, the policy sees finite numbers; a world of which that was not so ends with the next step."""
+    world = wp.tid()
+    broken = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
+    for column in range(episodes.observations.shape[1]):
+        if not wp.isfinite(episodes.observations[world, column]):
+            episodes.observations[world, column] = 0.0
+            if broken == 0:
+                broken = column + 1
+    episodes.broken[world] = broken
+    if episodes.dones[world]:
+        for column in range(episodes.terminal_observations.shape[1]):
+            if not wp.isfinite(episodes.terminal_observations[world, column]):
+                episodes.terminal_observations[world, column] = 0.0
 
 
 @wp.kernel

@@ -41,7 +41,8 @@ def _push(probability: float, velocity: float, worlds: WorldArrays, episodes: Ep
     stream = random_stream(episodes, world)
     if wp.randf(stream) < probability:
         for axis in range(2):
-            worlds.joint_qd[world, axis] = worlds.joint_qd[world, axis] + velocity * wp.randf(stream, -1.0, 1.0)
+            change = episodes.level[0] * velocity * wp.randf(stream, -1.0, 1.0)
+            worlds.joint_qd[world, axis] = worlds.joint_qd[world, axis] + change
 
 
 @wp.kernel

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
@@ -100,6 +101,27 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def _check_curriculum(curriculum: Mapping[str, Any], terms: Mapping[str, float]) -> None:
+    for name, points in curriculum.items():
+        if name != "level" and name not in terms:
+            raise ValueError(f"curriculum: there is no {name!r}; there are level, {', '.join(terms)}")
+        shaped = isinstance(points, list | tuple) and points and all(isinstance(p, list | tuple) for p in points)
+        if not shaped or not all(len(point) == 2 and all(map(_is_finite, point)) for point in points):
+            raise ValueError(f"curriculum.{name}: expected points [iteration, value], got {points!r}")
+        if any(after[0] <= before[0] for before, after in itertools.pairwise(points)):
+            raise ValueError(f"curriculum.{name}: the iterations of its points must grow, got {points!r}")
+        if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):
+            raise ValueError(f"curriculum.level: expected levels from 0 to 1, got {points!r}")
+
+
+def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
+    """The value of a curriculum's ``points`` in an iteration, counted from 0."""
+    for before, after in itertools.pairwise(points):
+        if before[0] <= iteration < after[0]:
+            return before[1] + (after[1] - before[1]) * (iteration - before[0]) / (after[0] - before[0])
+    return points[0][1] if iteration < points[0][0] else points[-1][1]
+
+
 def reward_weights(**weights: float) -> Any:
     """The ``rewards`` field of a task's configuration: its terms in the order of the kernel's indices, with their weights.
 
@@ -135,11 +157,20 @@ class TaskConfig:
     """Weight of each reward term. Who gives some names changes those; the others keep the task's defaults."""
     randomize: Randomization = Randomization()
     """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
+    curriculum: Mapping[str, Sequence[Sequence[float]]] = field(default_factory=lambda: MappingProxyType({}))
+    """What changes in the course of training: points ``[iteration, value]`` in the order of the iterations, between which the
+    value changes in proportion, and outside of which it stays. By the name of a reward term: its weight; ``level``: how hard the
+    task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
+    nan_limit: float = 0.1
+    """Training stops when more than this share of the worlds had to be reset in one iteration since something was not finite."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How the task is trained."""
 
     def __post_init__(self) -> None:
         known = default_rewards(type(self))
+        _check_curriculum(self.curriculum, known)
+        if not _is_finite(self.nan_limit) or self.nan_limit < 0.0:
+            raise ValueError(f"nan_limit: expected a share of 0 or more, got {self.nan_limit!r}")
         for name, weight in self.rewards.items():
             if name not in known:
                 near = difflib.get_close_matches(str(name), known, n=1)

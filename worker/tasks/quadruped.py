@@ -176,7 +176,7 @@ def new_command(parameters: QuadrupedParameters, episodes: EpisodeArrays, world:
     forward = wp.randf(stream, parameters.command_forward[0], parameters.command_forward[1])
     left = wp.randf(stream, parameters.command_left[0], parameters.command_left[1])
     turn = wp.randf(stream, parameters.command_turn[0], parameters.command_turn[1])
-    share = 1.0
+    share = episodes.level[0]
     if wp.randf(stream) < parameters.command_stand:
         share = 0.0
     episodes.memory[world, COMMAND] = share * forward

@@ -12,10 +12,18 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation.capture import CapturedStep, on_torch_stream
-from worker.simulation.episodes import RESET, STEP, EpisodeArrays, randomize_ages
+from worker.simulation.episodes import (
+    NO_MISHAP,
+    RESET,
+    STEP,
+    EpisodeArrays,
+    check_observations,
+    randomize_ages,
+    read_mishap,
+)
 from worker.simulation.randomization import Randomizer
 from worker.simulation.worlds import Worlds
-from worker.tasks.config import TaskConfig, default_rewards
+from worker.tasks.config import TaskConfig, default_rewards, value_at
 
 
 class Task:
@@ -48,6 +56,7 @@ class Task:
         episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
+        mishap: Which world was reset, and why, since :meth:`clear_statistics`: see :meth:`read_mishap`; shape ``(1,)``, int32.
         randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
     """
@@ -139,6 +148,21 @@ class Task:
     def read_model(self, parameters: Any) -> None:
         """Fill the fields of the kernels' parameters that the built model (``self.worlds``) tells; by default none."""
 
+    def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
+        """Called before every iteration of training, outside the recorded work: the place for a curriculum.
+
+        As it stands it sets what ``config.curriculum`` names. A subclass may do more: fill its own device arrays, which its kernels
+        read. What it does must follow from the arguments alone, which are the same on every rank and after a restart.
+
+        Args:
+            iteration: How many are done.
+            reward: Mean return of the episodes that ended last; None before the first.
+            episode_length: Their mean length [steps].
+        """
+        for name, points in self.config.curriculum.items():
+            number = self.level if name == "level" else self._weights[self.reward_terms.index(name)]
+            number.fill_(value_at(points, iteration))
+
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
 
@@ -184,6 +208,11 @@ class Task:
     def clear_statistics(self) -> None:
         """Set all running totals to zero."""
         self.statistics.zero_()
+        self.mishap.fill_(int(NO_MISHAP))
+
+    def read_mishap(self, code: int) -> tuple[int, str] | None:
+        """The value of :attr:`mishap` taken apart: the world (among these) and what of it was not finite; None: nothing was."""
+        return None if code == NO_MISHAP else read_mishap(code, self.observation_names)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Everything that :meth:`load_state_dict` needs to go on bit for bit (on the CPU), copied to host memory.
@@ -191,7 +220,7 @@ class Task:
         Returns:
             Tensors by name, each with leading dimension ``world_count``, so that worlds can be dealt out again.
         """
-        return {name: tensor.detach().cpu().clone() for name, tensor in self._state_tensors().items()}
+        return {name: tensor.detach().cpu().clone() for name, tensor in self.state_tensors().items()}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Continue from :meth:`state_dict`, in place. Worlds keep the seed and the global index that they had.
@@ -203,7 +232,7 @@ class Task:
             ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn
                 otherwise; nothing was changed.
         """
-        tensors = self._state_tensors()
+        tensors = self.state_tensors()
         task = type(self).__name__
         if missing := sorted(tensors.keys() - state.keys()):
             raise ValueError(f"the saved state of task {task} lacks {', '.join(missing)}")
@@ -272,10 +301,15 @@ class Task:
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
         self._memory = buffer("memory", (count, self.memory_size), wp.float32)
-        self._episodes.weights = wp.array(list(self.config.rewards.values()), dtype=wp.float32, device=device)
+        self._broken = buffer("broken", (count,), wp.int32)
+        self.mishap = buffer("mishap", (1,), wp.int32)
+        self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
+        self._weights.copy_(torch.tensor(list(self.config.rewards.values())))
+        self.level = buffer("level", (1,), wp.float32)
+        self.level.fill_(1.0)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
-    def _state_tensors(self) -> dict[str, torch.Tensor]:
+    def state_tensors(self) -> dict[str, torch.Tensor]:
         """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
         arrays = self.worlds.arrays
         memory = {"memory": self._memory} if self.memory_size else {}
@@ -289,6 +323,7 @@ class Task:
             "episode_length": self.episode_length,
             "episode_sums": self._sums,
             "random": self._random,
+            "broken": self._broken,
         }
 
     def _assert_captured(self) -> None:
@@ -324,4 +359,5 @@ class Task:
             inputs=[int(mode), self.max_episode_length, self._parameters, self.worlds.arrays, self._episodes],
             device=self.device,
         )
+        wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
         self.randomizer.add_noise(int(mode))

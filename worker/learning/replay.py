@@ -1,0 +1,44 @@
+"""The worlds as they were when an iteration began, so that an iteration that went wrong can be done again: ``worker.replay``."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from shared_store.files import write_atomic
+
+if TYPE_CHECKING:
+    from worker.learning.ppo import PPO
+    from worker.tasks.task import Task
+
+
+class Replay:
+    """Keeps, on the device, what :meth:`write` needs. Costs a copy of the worlds' state an iteration, in the rollout's own graph."""
+
+    def __init__(self, task: Task, ppo: PPO, section: dict[str, Any], seed: int) -> None:
+        self._ppo, self._section, self._seed = ppo, section, seed
+        self._live = task.state_tensors()
+        self._kept = {name: tensor.clone() for name, tensor in self._live.items()}
+
+    def keep(self) -> None:
+        """The worlds are about to be stepped."""
+        torch._foreach_copy_(list(self._kept.values()), list(self._live.values()))
+
+    def write(self, path: Path, iteration: int) -> None:
+        """Write the state at the beginning of the last iteration and all its actions."""
+        share = self._ppo.share
+        content = {
+            "iteration": iteration,
+            "train": self._section,
+            "seed": self._seed,
+            "first_world": share.first,
+            "worlds": share.count,
+            "state": {name: tensor.cpu() for name, tensor in self._kept.items()},
+            "actions": self._ppo.storage.actions.cpu(),
+        }
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_atomic(path, buffer.getvalue())

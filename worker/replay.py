@@ -1,0 +1,89 @@
+"""``python -m worker.replay FILE [--device cuda:0]``: do an iteration again in which worlds had to be reset since something was not finite.
+
+A run that stops for that reason leaves ``FILE`` in its ``replays`` directory: the worlds as they were when the iteration began, and
+every action. Shown are the first worlds that go wrong, the step, what was not finite, and the joint state before that step. Exits 0
+where it happened again, 1 where it did not, 2 where the file can't be read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pickle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from worker.errors import UserError
+from worker.learning.job import EX_ERROR, configure, run_command, user_errors
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+SHOWN = 10
+"""At most so many steps with mishaps are shown."""
+
+
+def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
+    """The task as it was when the iteration began, and the file's content. Raises UserError for what is no such file."""
+    import torch
+
+    from worker.tasks import find_task
+
+    try:
+        content = torch.load(path, weights_only=True)
+        section = content["train"]
+    except (OSError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: no replay can be read from it ({str(error).splitlines()[0]})") from error
+    with user_errors(str(path)):
+        task_type = find_task(section["task"])
+        task = task_type(
+            configure(task_type, section),
+            content["worlds"],
+            seed=content["seed"],
+            first_world=content["first_world"],
+            device=device,
+        )
+        task.load_state_dict(content["state"])
+    task.begin_iteration(content["iteration"] - 1, None, None)
+    task.clear_statistics()
+    return task, content
+
+
+def replay(path: Path, device: str) -> int:
+    """Step through the iteration; the exit code."""
+    task, content = load(path, device)
+    actions = content["actions"].to(task.device)
+    print(
+        f"iteration {content['iteration']} of {content['train']['task']}: {len(actions)} steps of {task.world_count} worlds"
+    )
+    found = 0
+    for step, action in enumerate(actions):
+        before = {name: tensor.cpu() for name, tensor in task.state_tensors().items() if name.startswith("joint")}
+        task.step(action)
+        mishap = task.read_mishap(int(task.mishap))
+        if mishap is None:
+            continue
+        found += 1
+        world, cause = mishap
+        print(f"step {step + 1}: world {content['first_world'] + world}: {cause} was not finite; before it:")
+        for name, tensor in before.items():
+            print(f"  {name}: {[round(value, 6) for value in tensor.view(task.world_count, -1)[world].tolist()]}")
+        print(f"  action: {[round(value, 6) for value in action[world].tolist()]}")
+        task.clear_statistics()
+        if found == SHOWN:
+            print(f"(the first {SHOWN} such steps)")
+            break
+    print("it happened again" if found else "everything stayed finite: on another device the last digits differ")
+    return 0 if found else EX_ERROR
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:<n>"')
+    options = parser.parse_args()
+    return replay(options.file, options.device)
+
+
+if __name__ == "__main__":
+    run_command(main)
