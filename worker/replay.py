@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import pickle
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,8 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
         raise UserError(f"{path}: no replay can be read from it ({str(error).splitlines()[0]})") from error
     with user_errors(str(path)):
         task_type = find_task(section["task"])
+        if warp := sys.modules.get("warp"):
+            warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
         task = task_type(
             configure(task_type, section),
             content["worlds"],
@@ -57,7 +60,7 @@ def replay(path: Path, device: str) -> int:
     )
     found = 0
     for step, action in enumerate(actions):
-        before = {name: tensor.cpu() for name, tensor in task.state_tensors().items() if name.startswith("joint")}
+        before = {name: tensor.cpu().clone() for name, tensor in task.state_tensors().items() if name.startswith("joint")}
         task.step(action)
         mishap = task.read_mishap(int(task.mishap))
         if mishap is None:

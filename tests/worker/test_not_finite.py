@@ -91,7 +91,7 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
     assert again.stdout.startswith(f"iteration {found[1]} of tests.worker.broken_task:Rooted: 16 steps of 16 worlds\nstep ")
     assert found[3] in again.stdout and again.stdout.count("joint_q:") >= 1
     angle = re.search(r"joint_q: \[\S+ (\S+)\]", again.stdout)
-    assert angle and float(angle[1]) < -0.15, "the pole leant to the left"
+    assert angle and float(angle[1]) < -0.2, "the pole leant to the left"
 
 
 def test_what_is_no_replay_is_refused_in_one_line(tmp_path: Path) -> None:
