@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from worker.simulation.episodes import STEP, EpisodeArrays, add_reward, begin_episode, end_step, random_stream
-from worker.simulation.worlds import WorldArrays
+from worker.simulation.worlds import WorldArrays, is_sound
 from worker.tasks.config import TaskConfig, reward_weights
 from worker.tasks.task import Task
 
@@ -39,7 +39,7 @@ def observe(mode: int, max_age: int, parameters: Parameters, worlds: WorldArrays
     world = wp.tid()
     restart = mode != STEP
     if mode == STEP:
-        valid = wp.isfinite(worlds.joint_q[world, 0]) and wp.isfinite(worlds.joint_qd[world, 0])
+        valid = is_sound(worlds, world)
         episodes.rewards[world] = 0.0
         add_reward(episodes, world, 0, -wp.cos(worlds.joint_q[world, 0]))
         add_reward(episodes, world, 1, worlds.joint_qd[world, 0] * worlds.joint_qd[world, 0])

@@ -1,7 +1,7 @@
-"""``python -m worker.replay FILE [--device cuda:0]``: do an iteration again in which worlds had to be reset since something was not finite.
+"""``python -m worker.replay FILE [--device cuda:0]``: do an iteration again in which worlds failed.
 
 A run that stops for that reason leaves ``FILE`` in its ``replays`` directory: the worlds as they were when the iteration began, and
-every action. Shown are the first worlds that go wrong, the step, what was not finite, and the joint state before that step. Exits 0
+every action. Shown are the first worlds that go wrong, the step, what was wrong, and the joint state before that step. Exits 0
 where it happened again, 1 where it did not, 2 where the file can't be read.
 """
 
@@ -60,14 +60,16 @@ def replay(path: Path, device: str) -> int:
     )
     found = 0
     for step, action in enumerate(actions):
-        before = {name: tensor.cpu().clone() for name, tensor in task.state_tensors().items() if name.startswith("joint")}
+        before = {
+            name: tensor.cpu().clone() for name, tensor in task.state_tensors().items() if name.startswith("joint")
+        }
         task.step(action)
         mishap = task.read_mishap(int(task.mishap))
         if mishap is None:
             continue
         found += 1
         world, cause = mishap
-        print(f"step {step + 1}: world {content['first_world'] + world}: {cause} was not finite; before it:")
+        print(f"step {step + 1}: world {content['first_world'] + world}: {cause}; before it:")
         for name, tensor in before.items():
             print(f"  {name}: {[round(value, 6) for value in tensor.view(task.world_count, -1)[world].tolist()]}")
         print(f"  action: {[round(value, 6) for value in action[world].tolist()]}")
@@ -75,7 +77,7 @@ def replay(path: Path, device: str) -> int:
         if found == SHOWN:
             print(f"(the first {SHOWN} such steps)")
             break
-    print("it happened again" if found else "everything stayed finite: on another device the last digits differ")
+    print("it happened again" if found else "nothing failed: on another device the last digits differ")
     return 0 if found else EX_ERROR
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from worker.errors import UserError
-from worker.learning.job import Job, StopRequest, run_command, user_errors
+from worker.learning.job import Job, StopRequest, configure, run_command, user_errors
 
 
 def main() -> int:
@@ -24,9 +24,13 @@ def main() -> int:
 
     with user_errors("train.task"):
         task_type = find_task(job.section["task"])
-    from worker.learning.runner import Runner
+    from worker.learning.memory import within_memory
+    from worker.learning.ppo import Share
+    from worker.learning.runner import Runner, total_worlds
 
-    code = Runner(job, gang, task_type, stop).train()
+    worlds = Share.of(gang.rank, gang.size, total_worlds(job, gang)).count
+    with within_memory(task_type, configure(task_type, job.section), worlds, gang):
+        code = Runner(job, gang, task_type, stop).train()
     gang.close()
     return code
 

@@ -49,7 +49,7 @@ class Point:
 
     config_type = PointConfig
     statistic_names = ("episodes", "episode_return", "episode_length", "reward_place")
-    action_size, observation_size = 1, 2
+    action_size, observation_shape = 1, (2,)
     action_names = ("push",)
     observation_names = ("place", "velocity")
 

@@ -40,7 +40,7 @@ def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
     task = Point(PointConfig(ppo=config), share.count, seed=2, first_world=share.first)
     task.set_random_episode_length()
     torch.manual_seed(7)
-    ppo = PPO(config, share, 2, 1, gang, seed=4, extras=1)
+    ppo = PPO(config, share, (2,), 1, gang, seed=4, extras=1)
     found = []
     for iteration in range(3):
         ppo.begin_iteration(iteration)

@@ -16,7 +16,7 @@ def runner(store: Path, task: str, worlds: int = 256):  # type: ignore[no-untype
     return build(task, worlds, store)
 
 
-@pytest.mark.parametrize("task", ["Cartpole", "Ant"])
+@pytest.mark.parametrize("task", ["Cartpole", "Ant", "CartpolePixels"])
 def test_an_iteration_is_two_graphs_and_never_waits_for_the_device(tmp_path: Path, task: str) -> None:
     training = runner(tmp_path, task)
     for _ in range(3):

@@ -30,7 +30,7 @@ def humanoid() -> Humanoid:
 
 def test_it_is_found_and_its_sizes_are_those_of_its_names(humanoid: Humanoid) -> None:
     assert find_task("Humanoid") is Humanoid
-    assert (humanoid.observation_size, humanoid.action_size) == (74, 21)
+    assert (humanoid.observation_shape, humanoid.action_size) == ((74,), 21)
     assert len(set(Humanoid.observation_names)) == 74 and Humanoid.action_names == JOINT_NAMES
     assert humanoid.config.ppo.hidden_sizes == (400, 200, 100)
     assert HumanoidConfig().control_hz == 60 and HumanoidConfig().substeps == 2

@@ -38,7 +38,7 @@ def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_
     assert task.observations[2, 1].abs() <= 0.15, "placed afresh"
     totals = statistics(task)
     assert totals["nan_worlds"] == 1 and totals["episodes"] == 0
-    assert task.read_mishap(int(task.mishap)) == (2, "its observation slider_velocity")
+    assert task.read_mishap(int(task.mishap)) == (2, "its observation slider_velocity was not finite")
     # it is part of the state: who resumes between the two steps sees the same
     after = task.state_dict()
     task.load_state_dict(saved)
@@ -48,13 +48,19 @@ def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_
 
 def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None:
     task = Cartpole(CartpoleConfig(rewards={"velocity": -1e38}), 4, seed=1)
-    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [1e4, 0.0], [0.0, 0.0], [math.nan, 0.0]])
+    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [900.0, 0.0], [0.0, 0.0], [math.nan, 0.0]])
     task.step(STILL)
     assert task.dones.tolist() == [False, True, False, True] and statistics(task)["nan_worlds"] == 2
-    assert task.read_mishap(int(task.mishap)) == (1, "its reward")
+    assert task.read_mishap(int(task.mishap)) == (1, "its reward was not finite")
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 3 + [[math.nan, 0.0]])
     task.step(STILL)
-    assert task.read_mishap(int(task.mishap)) == (3, "its joint positions or velocities")
+    assert task.read_mishap(int(task.mishap)) == (
+        3,
+        "its physics failed (a joint faster than `fastest`, or not finite)",
+    )
+    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 2 + [[0.0, 2000.0], [0.0, 0.0]])
+    task.step(STILL)
+    assert task.dones.tolist() == [False, False, True, False] and task.rewards[2] == 0, "finite, but past belief"
 
 
 def runner(path: Path, limit: float) -> Runner:
@@ -78,7 +84,7 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
     with pytest.raises(TrainingError) as stop:
         runner(tmp_path, 0.0).train()
     found = re.fullmatch(
-        r"iteration (\d): (\d+) resets of worlds, first (world \d+: its observation slider_velocity) was not finite; that is more "
+        r"iteration (\d): (\d+) resets of worlds, first (world \d+: its observation slider_velocity was not finite); that is more "
         r"than nan_limit, 0 of 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.replay (\S+)",
         str(stop.value),
     )
@@ -88,7 +94,9 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
         [sys.executable, "-m", "worker.replay", found[4]], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert again.returncode == 0, again.stderr
-    assert again.stdout.startswith(f"iteration {found[1]} of tests.worker.broken_task:Rooted: 16 steps of 16 worlds\nstep ")
+    assert again.stdout.startswith(
+        f"iteration {found[1]} of tests.worker.broken_task:Rooted: 16 steps of 16 worlds\nstep "
+    )
     assert found[3] in again.stdout and again.stdout.count("joint_q:") >= 1
     angle = re.search(r"joint_q: \[\S+ (\S+)\]", again.stdout)
     assert angle and float(angle[1]) < -0.2, "the pole leant to the left"

@@ -25,7 +25,7 @@ def alone() -> Gang:
 
 def make(worlds: int = 4, **settings: object) -> PPO:
     torch.manual_seed(5)
-    return PPO(dataclasses.replace(PointPPO(), **settings), Share(0, worlds, worlds), 2, 1, alone(), seed=1)
+    return PPO(dataclasses.replace(PointPPO(), **settings), Share(0, worlds, worlds), (2,), 1, alone(), seed=1)
 
 
 class FirstComponent(torch.nn.Module):
@@ -102,7 +102,7 @@ def test_a_fixed_schedule_keeps_the_learning_rate() -> None:
 def test_noise_belongs_to_worlds_not_to_ranks() -> None:
     def actions(first: int, count: int, iteration: int) -> torch.Tensor:
         torch.manual_seed(5)
-        ppo = PPO(PointPPO(), Share(first, count, 6), 2, 1, alone(), seed=1)
+        ppo = PPO(PointPPO(), Share(first, count, 6), (2,), 1, alone(), seed=1)
         ppo.begin_iteration(iteration)
         drawn = []
         for ppo.storage.step in range(3):

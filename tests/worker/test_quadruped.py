@@ -30,7 +30,7 @@ def memory(command: list[float], countdown: float, action: list[float]) -> list[
 
 def test_it_is_found_and_its_sizes_are_those_of_its_names(quadruped: Quadruped) -> None:
     assert find_task("Quadruped") is Quadruped
-    assert (quadruped.observation_size, quadruped.action_size) == (48, 12)
+    assert (quadruped.observation_shape, quadruped.action_size) == ((48,), 12)
     assert len(set(Quadruped.observation_names)) == 48
     labels = [label.rsplit("/", 1)[-1] for label in quadruped.worlds.model.joint_label[1:13]]
     assert labels == list(Quadruped.action_names) == list(JOINT_NAMES)

@@ -70,12 +70,12 @@ def same(left: list[tuple[torch.Tensor, ...]], right: list[tuple[torch.Tensor, .
 
 
 def test_sizes_names_and_types(cartpole: Cartpole, ant: Ant) -> None:
-    assert (cartpole.observation_size, cartpole.action_size, cartpole.max_episode_length) == (4, 1, 300)
-    assert (ant.observation_size, ant.action_size) == (35, 8)
+    assert (cartpole.observation_shape, cartpole.action_size, cartpole.max_episode_length) == ((4,), 1, 300)
+    assert (ant.observation_shape, ant.action_size) == ((35,), 8)
     assert Ant.config_type().episode_seconds * Ant.config_type().control_hz == 960
     for task in (cartpole, ant):
         assert task.captured
-        assert task.observations.shape == task.terminal_observations.shape == (8, task.observation_size)
+        assert task.observations.shape == task.terminal_observations.shape == (8, *task.observation_shape)
         assert task.rewards.shape == task.dones.shape == task.time_outs.shape == task.episode_length.shape == (8,)
         assert task.dones.dtype == task.time_outs.dtype == torch.bool and task.statistics.dtype == torch.float64
         assert len(task.statistic_names) == len(task.statistics)

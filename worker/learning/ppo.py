@@ -14,6 +14,7 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -63,7 +64,7 @@ class PPO(RslPPO):
         self,
         config: PPOConfig,
         share: Share,
-        observation_size: int,
+        observation_shape: Sequence[int],
         action_size: int,
         gang: Gang,
         *,
@@ -75,7 +76,7 @@ class PPO(RslPPO):
         Args:
             config: Hyperparameters.
             share: The worlds of this rank.
-            observation_size: Length of one observation.
+            observation_shape: Shape of one observation: ``(size,)``, or ``(channels, height, width)`` of an image of bytes.
             action_size: Length of one action.
             gang: The ranks that learn together.
             seed: Of action noise and minibatch order; weights come from torch's own generator.
@@ -92,39 +93,47 @@ class PPO(RslPPO):
             )
         self._rate = torch.tensor(config.learning_rate, device=device)
         storage = RolloutStorage(
-            "rl", worlds, steps, example_observations(worlds, observation_size, device), [action_size], device
+            "rl", worlds, steps, example_observations(worlds, observation_shape, device), [action_size], device
         )
-        super().__init__(
-            *build_models(config, observation_size, action_size),
-            storage,
-            num_learning_epochs=config.epochs,
-            num_mini_batches=config.minibatches,
-            clip_param=config.clip,
-            gamma=config.gamma,
-            lam=config.lam,
-            value_loss_coef=config.value_loss_coef,
-            entropy_coef=config.entropy_coef,
-            learning_rate=config.learning_rate,
-            max_grad_norm=config.max_grad_norm,
-            schedule=config.schedule,
-            desired_kl=config.desired_kl,
-            device=device,
-        )
+        with warnings.catch_warnings():  # of convolutions that are both models'; the optimizer is replaced below
+            warnings.filterwarnings("ignore", "optimizer contains a parameter group with duplicate parameters")
+            super().__init__(
+                *build_models(config, observation_shape, action_size),
+                storage,
+                num_learning_epochs=config.epochs,
+                num_mini_batches=config.minibatches,
+                clip_param=config.clip,
+                gamma=config.gamma,
+                lam=config.lam,
+                value_loss_coef=config.value_loss_coef,
+                entropy_coef=config.entropy_coef,
+                learning_rate=config.learning_rate,
+                max_grad_norm=config.max_grad_norm,
+                schedule=config.schedule,
+                desired_kl=config.desired_kl,
+                device=device,
+            )
         self.gang, self.share, self.seed = gang, share, seed
-        self._allocate_rollout(worlds, steps, observation_size, action_size, extras)
+        self._allocate_rollout(worlds, steps, observation_shape, action_size, extras)
         self._allocate_gradients()
         counts = [Share.of(r, gang.size, share.total).count * steps // config.minibatches for r in range(gang.size)]
         self._batch = share.count * steps // config.minibatches
         self._weight = self._batch / sum(counts)
         self._allocate_minibatches()
 
-    def _allocate_rollout(self, worlds: int, steps: int, observations: int, actions: int, extras: int) -> None:
+    def _allocate_rollout(
+        self, worlds: int, steps: int, observation_shape: Sequence[int], actions: int, extras: int
+    ) -> None:
         def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, device=self.device, dtype=dtype)
 
         self._observations = self.storage.observations[GROUP]
-        self._latents = empty(steps, worlds, observations)
-        self._terminal = empty(steps, worlds, observations)
+        self._images: torch.Tensor | None = None
+        if len(observation_shape) > 1:
+            self._images = self._observations.flatten(0, 1)
+        features = self.actor._get_latent_dim()
+        self._latents = empty(steps, worlds, features)
+        self._terminal = empty(steps, worlds, features if self._images is None else 0)
         self._time_outs = empty(steps, worlds, 1)
         self._std = empty(actions)
         mean = empty(steps, worlds, actions)
@@ -132,16 +141,19 @@ class PPO(RslPPO):
         self._noise = empty(steps, self.share.total, actions)
         self._noise_source = torch.Generator(self.device)
         self._order_source = torch.Generator(self.device)
-        self._columns = [observations, actions, actions, 1, 1, 1, 1]
+        self._columns = [features if self._images is None else 0, actions, actions, 1, 1, 1, 1]
         self._samples = empty(steps * worlds, sum(self._columns))
-        self._last_observations = empty(worlds, observations)
-        self._sums = empty(3 + 2 * observations + extras, dtype=torch.float64)
-        self.extra = self._sums[3 + 2 * observations :]
+        self._last_observations = torch.zeros_like(self._observations[0])
+        self._moments = features if self.actor.obs_normalization else 0
+        self._sums = empty(3 + 2 * self._moments + extras, dtype=torch.float64)
+        self.extra = self._sums[3 + 2 * self._moments :]
         """The caller's own numbers, shape (extras,), float64: :meth:`compute_returns` sums them over the ranks."""
 
     def _allocate_gradients(self) -> None:
         """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it."""
-        actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
+        actor = list(self.actor.parameters())
+        shared = set(map(id, actor))  # convolutions are the actor's too
+        critic = [parameter for parameter in self.critic.parameters() if id(parameter) not in shared]
         sizes = [sum(p.numel() for p in part) for part in (actor, critic)]
         self._shared = torch.zeros(sum(sizes) + len(LOSSES), device=self.device)
         offset = 0
@@ -215,7 +227,7 @@ class PPO(RslPPO):
 
     @torch.no_grad()
     def act(self, observations: torch.Tensor) -> torch.Tensor:
-        """Actions, shape (worlds, actions), for ``observations``, shape (worlds, observations); both are recorded."""
+        """Actions, shape (worlds, actions), for ``observations``, shape (worlds, *observation_shape); both are recorded."""
         step = self.storage.step
         self._observations[step].copy_(observations)
         latent = self._latents[step].copy_(self.actor.get_latent({GROUP: observations}))
@@ -234,13 +246,15 @@ class PPO(RslPPO):
         """Record what the step did.
 
         Args:
-            terminal_observations: The observation before the reset, shape (worlds, observations), where ``dones``.
+            terminal_observations: The observation before the reset, shape (worlds, observations), where ``dones``; not used
+                where observations are images, of which none is taken then: the last one before the step stands for it.
             rewards: Shape (worlds,).
             dones: The episode ended, for any reason, shape (worlds,).
             time_outs: It ended by the clock alone, shape (worlds,).
         """
         step = self.storage.step
-        self._terminal[step].copy_(terminal_observations)
+        if self._images is None:
+            self._terminal[step].copy_(terminal_observations)
         self.storage.rewards[step, :, 0].copy_(rewards)
         self.storage.dones[step, :, 0].copy_(dones)
         self._time_outs[step, :, 0].copy_(time_outs)
@@ -306,6 +320,9 @@ class PPO(RslPPO):
 
     def _bootstrap(self) -> None:
         """Where an episode was cut by the clock, its future is the value of the observation at which it was cut."""
+        if self._images is not None:
+            self.storage.rewards.addcmul_(self._time_outs, self.storage.values, value=self.gamma)
+            return
         if self.device == "cpu":
             rows = self._time_outs.flatten().nonzero().squeeze(1)
             if len(rows):
@@ -320,11 +337,11 @@ class PPO(RslPPO):
 
     def _gather_moments(self) -> None:
         """Count, sum and sum of squares of advantages and of observations, beside the caller's extras, to be summed over the ranks."""
-        advantages, size = self.storage.advantages, self._observations.shape[-1]
+        advantages, size = self.storage.advantages, self._moments
         self._sums[0].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
         self._sums[1] = advantages.sum(dtype=torch.float64)
         self._sums[2] = advantages.double().square().sum()
-        if self.actor.obs_normalization:
+        if size:
             # around the running mean, which all ranks share: keeps the squares small
             offsets = (self._observations - self.actor.obs_normalizer._mean).flatten(0, 1)
             self._sums[3 : 3 + size] = offsets.sum(0, dtype=torch.float64)
@@ -345,7 +362,7 @@ class PPO(RslPPO):
         """Rows of everything that a minibatch reads, so that it takes one gather."""
         st = self.storage
         columns = (
-            self._latents,
+            *([self._latents] if self._images is None else []),
             st.actions,
             st.distribution_params[0],
             st.actions_log_prob,
@@ -375,6 +392,8 @@ class PPO(RslPPO):
         samples = self._samples[self._rows]
         latents, actions, old_mean, old_log_prob, advantages, returns, old_values = samples.split(self._columns, dim=1)
         distribution = self.actor.distribution
+        if self._images is not None:
+            latents = self.actor.get_latent({GROUP: self._images[self._rows]})
         distribution.update(linear.forward(self.actor.mlp, latents))
         values = linear.forward(self.critic.mlp, latents)
         ratio = torch.exp(distribution.log_prob(actions) - old_log_prob[:, 0])
@@ -405,7 +424,7 @@ class PPO(RslPPO):
         """Merge this iteration's observations of all ranks into the running moments (Chan et al. 1979), as rsl-rl does."""
         if not self.actor.obs_normalization:
             return
-        norm, size = self.actor.obs_normalizer, self._observations.shape[-1]
+        norm, size = self.actor.obs_normalizer, self._moments
         added = self._sums[0]
         offset = self._sums[3 : 3 + size] / added
         variance = (self._sums[3 + size : 3 + 2 * size] / added - offset.square()).clamp(min=0.0)

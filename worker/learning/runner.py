@@ -61,7 +61,7 @@ class Runner:
             self.ppo = PPO(
                 self.config.ppo,
                 share,
-                self.task.observation_size,
+                self.task.observation_shape,
                 self.task.action_size,
                 gang,
                 seed=self.seed,
@@ -208,11 +208,11 @@ class Runner:
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
-        """Tell of worlds that were reset since something was not finite; raises TrainingError where they are too many."""
+        """Tell of worlds that were reset since something was not finite or the physics failed; raises TrainingError where they are too many."""
         total, iteration = self.ppo.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
-        first = f"first world {Share.of(rank, self.gang.size, total).first + world}: {cause} was not finite"
+        first = f"first world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
@@ -365,7 +365,7 @@ def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
         "train": job.section,
         "ppo": dataclasses.asdict(config.ppo),
         "policy": {
-            "observation_size": task.observation_size,
+            "observation_shape": list(task.observation_shape),
             "action_size": task.action_size,
             "control_hz": config.control_hz,
             **names,

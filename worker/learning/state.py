@@ -195,7 +195,7 @@ class TrainingState:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
 
 
-_SHAPE = ("hidden_sizes", "activation", "normalize_observations")
+_SHAPE = ("hidden_sizes", "activation", "normalize_observations", "channels", "kernel_sizes", "strides")
 """Settings of PPO that shape the network."""
 
 

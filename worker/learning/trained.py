@@ -53,9 +53,8 @@ def load_actor(checkpoint: Checkpoint) -> MLPModel:
     from worker.learning.models import build_models
 
     facts = checkpoint.manifest
-    actor, _ = build_models(
-        SimpleNamespace(**facts["ppo"]), facts["policy"]["observation_size"], facts["policy"]["action_size"]
-    )  # type: ignore[arg-type]
+    config: Any = SimpleNamespace(**facts["ppo"])
+    actor, _ = build_models(config, facts["policy"]["observation_shape"], facts["policy"]["action_size"])
     actor.load_state_dict(load_learner(checkpoint)["ppo"]["actor_state_dict"])
     return actor.eval()
 

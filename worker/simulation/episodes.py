@@ -67,15 +67,6 @@ class EpisodeArrays:
 
 
 @wp.func
-def is_finite(rows: wp.array2d(dtype=wp.float32), world: int) -> bool:
-    """Whether every value in a world's row is a finite number."""
-    for column in range(rows.shape[1]):  # noqa: SIM110 (Warp has no all())
-        if not wp.isfinite(rows[world, column]):
-            return False
-    return True
-
-
-@wp.func
 def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
     """Set a world's row to zero."""
     for column in range(rows.shape[1]):
@@ -120,8 +111,9 @@ def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
 
 
 def read_mishap(code: int, observations: Sequence[str]) -> tuple[int, str]:
-    """The world of this task, and what of it was not finite, of a ``code`` that is not :data:`NO_MISHAP`."""
-    causes = [*(f"its observation {name}" for name in observations), "its joint positions or velocities", "its reward"]
+    """The world of this task, and what was wrong with it, of a ``code`` that is not :data:`NO_MISHAP`."""
+    causes = [f"its observation {name} was not finite" for name in observations]
+    causes += ["its physics failed (a joint faster than `fastest`, or not finite)", "its reward was not finite"]
     world, cause = divmod(code, len(causes))
     return world, causes[cause]
 

@@ -25,6 +25,7 @@ class WorldArrays:
         drives: Forces of the actuators on the joints in the last physics step [N, N m], shape ``(worlds, dofs)``.
         warm_start: Accelerations [m/s^2, rad/s^2] from which the constraint solver starts, shape ``(worlds, dofs)``.
         overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
+        fastest: Velocity from which on the physics can't be believed [m/s, rad/s].
     """
 
     joint_q: wp.array2d(dtype=wp.float32)
@@ -33,6 +34,7 @@ class WorldArrays:
     drives: wp.array2d(dtype=wp.float32)
     warm_start: wp.array2d(dtype=wp.float32)
     overflow: wp.array(dtype=wp.int32)
+    fastest: float
 
 
 @wp.func
@@ -41,6 +43,22 @@ def root_rotation(worlds: WorldArrays, world: int) -> wp.quat:
     return wp.quat(
         worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
     )
+
+
+@wp.func
+def is_sound(worlds: WorldArrays, world: int) -> bool:
+    """Whether a world's physics can be believed: finite, and no velocity beyond ``worlds.fastest``.
+
+    A contact on which the solver fails throws a robot through enormous velocities before anything is NaN, and one such step in
+    millions is enough to spoil returns and the observations' moments for the rest of a training.
+    """
+    for column in range(worlds.joint_q.shape[1]):
+        if not wp.isfinite(worlds.joint_q[world, column]):
+            return False
+    for column in range(worlds.joint_qd.shape[1]):  # noqa: SIM110 (Warp has no all())
+        if not wp.abs(worlds.joint_qd[world, column]) < worlds.fastest:  # NaN is not either
+            return False
+    return True
 
 
 # Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
@@ -66,6 +84,7 @@ class Worlds:
         device: ``"cpu"`` or ``"cuda:<n>"``.
         timestep: Length of one physics step [s].
         substeps: Physics steps of one :meth:`simulate`.
+        fastest: See :class:`WorldArrays`.
         ground: Whether to add one ground plane (z = 0) that all worlds share.
         solver_options: Keyword arguments of ``SolverMuJoCo`` (``njmax`` and ``nconmax`` are per world).
     """
@@ -78,6 +97,7 @@ class Worlds:
         *,
         timestep: float,
         substeps: int,
+        fastest: float,
         ground: bool = False,
         solver_options: Mapping[str, Any],
     ) -> None:
@@ -105,6 +125,7 @@ class Worlds:
         self.substeps = substeps
 
         self.arrays = WorldArrays()
+        self.arrays.fastest = fastest
         self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
         self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
         self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 BUILT_IN = {
     "Cartpole": "worker.tasks.cartpole:Cartpole",
+    "CartpolePixels": "worker.tasks.cartpole_pixels:CartpolePixels",
     "Ant": "worker.tasks.ant:Ant",
     "Humanoid": "worker.tasks.humanoid:Humanoid",
     "Quadruped": "worker.tasks.quadruped:Quadruped",

@@ -17,10 +17,9 @@ from worker.simulation.episodes import (
     begin_episode,
     clear_row,
     end_step,
-    is_finite,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays
+from worker.simulation.worlds import WorldArrays, is_sound
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
 from worker.tasks.task import Task
 
@@ -105,7 +104,7 @@ def observe(mode: int, max_age: int, parameters: CartpoleParameters, worlds: Wor
     world = wp.tid()
     restart = mode != STEP
     if mode == STEP:
-        valid = is_finite(worlds.joint_q, world) and is_finite(worlds.joint_qd, world)
+        valid = is_sound(worlds, world)
         position = worlds.joint_q[world, 0]
         angle = worlds.joint_q[world, 1]
         velocity = worlds.joint_qd[world, 0]

@@ -19,6 +19,12 @@ class PPOConfig:
     """Control steps of every world in one iteration."""
     hidden_sizes: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
+    channels: tuple[int, ...] = (16, 32, 32)
+    """Channels of the convolutions that actor and critic share, where observations are images."""
+    kernel_sizes: tuple[int, ...] = (8, 4, 3)
+    """Width and height of their kernels [px]."""
+    strides: tuple[int, ...] = (4, 2, 1)
+    """Their strides [px]."""
     activation: str = "elu"
     """Activation between layers, by torch's lower-case name (``"elu"``, ``"relu"``, ``"tanh"``)."""
     epochs: int = 5
@@ -46,7 +52,16 @@ class PPOConfig:
     init_std: float = 1.0
     """Initial standard deviation of the actions [unit of the action]."""
     normalize_observations: bool = True
-    """Whether observations are normalised by their running mean and variance."""
+    """Whether observations are normalised by their running mean and variance; images never are."""
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.channels), len(self.kernel_sizes), len(self.strides)}
+        if len(lengths) > 1 or not self.channels:
+            raise ValueError("channels, kernel_sizes and strides: give one number of each for every convolution")
+
+
+_SCALARS = ("push_interval", "push_velocity", "observation_noise")
+_SCENE = ("camera_position", "camera_angle", "colors")
 
 
 @dataclass(frozen=True)
@@ -73,11 +88,24 @@ class Randomization:
     """A push adds velocities uniform in +- this to the robot's, along the world's x and y [m/s]."""
     observation_noise: float = 0.0
     """Standard deviation of the normal noise on every observation [the observation's own unit]."""
+    camera_position: float = 0.0
+    """Each camera stands up to this far from its place, along each axis [m]."""
+    camera_angle: float = 0.0
+    """Each camera is turned up to this far about each of its axes [rad]."""
+    colors: float = 0.0
+    """Red, green and blue of each shape differ by up to this from their usual value, of 1."""
+    light: tuple[float, float] = (1.0, 1.0)
+    """Factor on the brightness of what a camera sees."""
     action_latency: int = 0
     """Greatest number of control steps by which controls reach the actuators late; each episode draws its own, from 0."""
 
+    @property
+    def scene(self) -> list[str]:
+        """What is on that only a camera sees."""
+        return [name for name in _SCENE if getattr(self, name)] + (["light"] if self.light != (1.0, 1.0) else [])
+
     def __post_init__(self) -> None:
-        for name in ("mass", "friction", "damping", "gains", "gravity"):
+        for name in ("mass", "friction", "damping", "gains", "gravity", "light"):
             ends = getattr(self, name)
             pair = isinstance(ends, list | tuple) and len(ends) == 2 and all(_is_finite(end) for end in ends)
             if not pair or not 0.0 <= ends[0] <= ends[1] or (name == "mass" and ends[0] == 0.0):
@@ -85,7 +113,7 @@ class Randomization:
                 shown = list(ends) if isinstance(ends, tuple) else ends
                 raise ValueError(f"{name}: expected [least, greatest], two factors {least}; got {shown!r}")
             object.__setattr__(self, name, (float(ends[0]), float(ends[1])))
-        for name in ("push_interval", "push_velocity", "observation_noise"):
+        for name in (*_SCALARS, *_SCENE):
             value = getattr(self, name)
             if not _is_finite(value) or value < 0.0:
                 raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
@@ -161,6 +189,8 @@ class TaskConfig:
     """What changes in the course of training: points ``[iteration, value]`` in the order of the iterations, between which the
     value changes in proportion, and outside of which it stays. By the name of a reward term: its weight; ``level``: how hard the
     task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
+    fastest: float = 1000.0
+    """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""
     nan_limit: float = 0.1
     """Training stops when more than this share of the worlds had to be reset in one iteration since something was not finite."""
     ppo: PPOConfig = field(default_factory=PPOConfig)

@@ -48,7 +48,13 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.task = task_type(config, num_envs, seed=seed, device=device)
         self.num_envs = num_envs
         self.metadata = {**self.metadata, "render_fps": config.control_hz}
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.task.observation_size,), np.float32)
+        shape, images = self.task.observation_shape, self.task.observations.dtype == torch.uint8
+        self.single_observation_space = (
+            gymnasium.spaces.Box(0, 255, shape, np.uint8)
+            if images
+            else gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+        )
+        self._images = self._numpy(self.task.observations) if images else None
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -63,7 +69,8 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             options: Not used by any task.
 
         Returns:
-            Observations, shape ``(num_envs, observations)``, float32, and an empty info.
+            Observations, shape ``(num_envs, observations)``, float32 (images ``(num_envs, channels, height, width)``, uint8),
+            and an empty info.
 
         Raises:
             ValueError: ``seed`` is negative, or ``options`` asks for a partial reset, which worlds do by themselves.
@@ -74,7 +81,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self.task.seed(seed)
             super().reset(seed=seed)
         self.task.reset()
-        return self._numpy(self.task.observations), {}
+        return self._observe(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance every world by one control step.
@@ -83,7 +90,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             actions: Shape ``(num_envs, actions)``; clipped to [-1, 1].
 
         Returns:
-            Observations (float32), rewards (float32), terminations, truncations (bool) and info.
+            Observations (float32, images uint8), rewards (float32), terminations, truncations (bool) and info.
 
         Raises:
             ValueError: ``actions`` has another shape.
@@ -98,18 +105,25 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         truncations = self._numpy(self.task.time_outs)
         info: dict[str, Any] = {}
         if dones.any():
-            terminal = self._numpy(self.task.terminal_observations)
+            # no picture is taken of a world between its end and its reset: the one before stands for it
+            terminal = self._numpy(self.task.terminal_observations) if self._images is None else self._images
             final_obs = np.full(self.num_envs, None, dtype=object)
             for world in np.flatnonzero(dones):
                 final_obs[world] = terminal[world]
             info = {"final_obs": final_obs, "_final_obs": dones.copy(), "final_info": {}, "_final_info": dones.copy()}
         return (
-            self._numpy(self.task.observations),
+            self._observe(),
             self._numpy(self.task.rewards),
             dones & ~truncations,
             truncations,
             info,
         )
+
+    def _observe(self) -> np.ndarray:
+        observations = self._numpy(self.task.observations)
+        if self._images is not None:
+            self._images = observations
+        return observations
 
     @staticmethod
     def _numpy(tensor: torch.Tensor) -> np.ndarray:

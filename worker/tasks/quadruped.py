@@ -19,10 +19,9 @@ from worker.simulation.episodes import (
     begin_episode,
     clear_row,
     end_step,
-    is_finite,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays, root_rotation
+from worker.simulation.worlds import WorldArrays, is_sound, root_rotation
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
 from worker.tasks.task import Task
 
@@ -62,6 +61,8 @@ class QuadrupedConfig(TaskConfig):
     """Physics steps of one control step, each of 1/200 s."""
     episode_seconds: float = 20.0
     """Simulated time after which the clock ends an episode [s]."""
+    fastest: float = 100.0
+    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 40."""
     action_scale: float = 0.5
     """How far an action of 1 moves a joint's target from its standing angle [rad]."""
     stand_hip: float = 0.0
@@ -292,7 +293,7 @@ def observe(mode: int, max_age: int, parameters: QuadrupedParameters, worlds: Wo
     world = wp.tid()
     restart = mode != STEP
     if mode == STEP:
-        valid = is_finite(worlds.joint_q, world) and is_finite(worlds.joint_qd, world)
+        valid = is_sound(worlds, world)
         fallen = valid and has_fallen(parameters, worlds, world)
         episodes.rewards[world] = 0.0
         if valid:

@@ -18,10 +18,9 @@ from worker.simulation.episodes import (
     begin_episode,
     clear_row,
     end_step,
-    is_finite,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays, root_rotation
+from worker.simulation.worlds import WorldArrays, is_sound, root_rotation
 from worker.tasks.config import PPOConfig, TaskConfig
 from worker.tasks.task import Task
 
@@ -52,6 +51,8 @@ class RunnerConfig(TaskConfig):
     """Physics steps of one control step, each of 1/120 s."""
     episode_seconds: float = 16.0
     """Simulated time after which the clock ends an episode [s]."""
+    fastest: float = 100.0
+    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 70."""
     fall_height: float = 0.0
     """Height of the torso under which the episode ends [m]."""
     start_height: float = 1.0
@@ -199,7 +200,7 @@ def observe(mode: int, max_age: int, parameters: RunnerParameters, worlds: World
     world = wp.tid()
     restart = mode != STEP
     if mode == STEP:
-        valid = is_finite(worlds.joint_q, world) and is_finite(worlds.joint_qd, world)
+        valid = is_sound(worlds, world)
         fallen = valid and worlds.joint_q[world, 2] < parameters.fall_height
         episodes.rewards[world] = 0.0
         if fallen:

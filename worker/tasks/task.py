@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation.camera import Camera
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import (
     NO_MISHAP,
@@ -48,8 +49,10 @@ class Task:
         max_episode_length: Control steps after which the clock ends an episode.
         device: As given.
         actions: What to do next, shape ``(worlds, action_size)``, float32.
-        observations: What the policy sees, shape ``(worlds, observation_size)``, float32.
-        terminal_observations: The observation before the reset, valid where ``dones``; same shape, float32.
+        observations: What the policy sees, shape ``(worlds, *observation_shape)``: float32, or uint8 where there is a camera.
+        states: What ``observe`` writes, named by ``observation_names``, shape ``(worlds, states)``, float32: without a camera the
+            observations.
+        terminal_observations: The states before the reset, valid where ``dones``; same shape as ``states``, float32.
         rewards: Shape ``(worlds,)``, float32.
         dones: Whether the episode ended, shape ``(worlds,)``, bool.
         time_outs: Whether it ended by the clock alone, shape ``(worlds,)``, bool.
@@ -97,7 +100,14 @@ class Task:
         self.world_count = world_count
         self.device = "cuda:0" if device == "cuda" else device
         self.action_size = len(self.action_names)
-        self.observation_size = len(self.observation_names)
+        camera = getattr(config, "camera", None)
+        if config.randomize.scene and camera is None:
+            raise ValueError(
+                f"randomize: {', '.join(config.randomize.scene)}: task {type(self).__name__} has no camera"
+            )
+        if config.randomize.observation_noise and camera is not None:
+            raise ValueError("randomize.observation_noise: it is for numbers, not for images; use light and colors")
+        self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
         self.statistic_names: tuple[str, ...] = (
             "episodes",
@@ -117,6 +127,7 @@ class Task:
             self.device,
             timestep=1.0 / (config.control_hz * config.substeps),
             substeps=config.substeps,
+            fastest=config.fastest,
             ground=self.ground,
             solver_options=self.solver_options,
         )
@@ -132,6 +143,10 @@ class Task:
         self.seed(seed)
         with on_torch_stream(self.device):
             self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz)
+            self._camera = Camera(camera, config.randomize, self.worlds, self._episodes) if camera else None
+            if self._camera:
+                self.observations = self._camera.images
+                self.observation_shape = tuple(self.observations.shape[1:])
             self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
         self._graph = CapturedStep(self._launch_step, self.device)
         self._assert_captured()
@@ -276,6 +291,8 @@ class Task:
             raise ValueError(f"task {task}: substeps is {config.substeps}; use at least 1")
         if config.control_hz <= 0.0:
             raise ValueError(f"task {task}: control_hz is {config.control_hz}; use a positive frequency in Hz")
+        if config.fastest <= 0.0:
+            raise ValueError(f"task {task}: fastest is {config.fastest}; use a positive velocity in m/s and rad/s")
         if config.episode_seconds <= 0.0:
             raise ValueError(
                 f"task {task}: episode_seconds is {config.episode_seconds}; use a positive time in seconds"
@@ -292,8 +309,9 @@ class Task:
 
         self._episodes = EpisodeArrays()
         self.actions = buffer("actions", (count, self.action_size), wp.float32)
-        self.observations = buffer("observations", (count, self.observation_size), wp.float32)
-        self.terminal_observations = buffer("terminal_observations", (count, self.observation_size), wp.float32)
+        states = len(self.observation_names)
+        self.states = self.observations = buffer("observations", (count, states), wp.float32)
+        self.terminal_observations = buffer("terminal_observations", (count, states), wp.float32)
         self.rewards = buffer("rewards", (count,), wp.float32)
         self.dones = buffer("dones", (count,), wp.bool)
         self.time_outs = buffer("time_outs", (count,), wp.bool)
@@ -313,13 +331,15 @@ class Task:
         """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
         arrays = self.worlds.arrays
         memory = {"memory": self._memory} if self.memory_size else {}
+        images = {"images": self._camera.images} if self._camera else {}
         return {
             **memory,
+            **images,
             **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
-            "observations": self.observations,
+            "observations": self.states,
             "episode_length": self.episode_length,
             "episode_sums": self._sums,
             "random": self._random,
@@ -361,3 +381,5 @@ class Task:
         )
         wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
         self.randomizer.add_noise(int(mode))
+        if self._camera:
+            self._camera.render(int(mode))

@@ -1,0 +1,201 @@
+"""A camera for every world, whose images go straight into the buffer that the policy reads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+from newton.sensors import SensorCamera
+
+from worker.simulation.episodes import STEP, EpisodeArrays
+from worker.simulation.worlds import Worlds
+
+if TYPE_CHECKING:
+    from worker.tasks.config import Randomization
+
+wp.set_module_options({"enable_backward": False})
+
+_SKY = 0x00D0B090
+"""What the camera sees where there is nothing: packed as alpha, blue, green, red."""
+_STREAM = wp.constant(-100)
+"""The scene is drawn from this random stream and below; episodes draw from 0 up, physics from -1 down."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """Where the camera of a world stands and what an image is.
+
+    Raises:
+        ValueError: A size is not positive, or the camera stands where it looks to.
+    """
+
+    width: int = 64
+    """Width of an image [px]."""
+    height: int = 64
+    """Height of an image [px]."""
+    position: tuple[float, float, float] = (0.0, -3.0, 1.0)
+    """Where it stands in its world [m]."""
+    target: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """The point in the middle of the image [m]."""
+    fov: float = 0.9
+    """Vertical field of view [rad]."""
+    frames: int = 2
+    """Images of one observation: the present one and those of the control steps before, since one alone shows no velocity."""
+    samples: int = 1
+    """Rays of each pixel: 1, or 4 or more for edges that move by less than a pixel."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "frames", "samples"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"camera.{name}: expected at least 1, got {getattr(self, name)}")
+        if not 0.0 < self.fov < math.pi:
+            raise ValueError(f"camera.fov: expected an angle between 0 and pi [rad], got {self.fov}")
+        for name in ("position", "target"):
+            if len(getattr(self, name)) != 3:
+                raise ValueError(f"camera.{name}: expected [x, y, z], got {list(getattr(self, name))}")
+        if math.dist(self.position, self.target) < 1e-6:
+            raise ValueError(f"camera.target: the camera stands there, at {list(self.position)}; choose another point")
+
+    @property
+    def channels(self) -> int:
+        """Channels of one observation: red, green and blue of each frame, the present one first."""
+        return 3 * self.frames
+
+
+@wp.kernel
+def _draw_scene(
+    position: float,
+    angle: float,
+    colors: float,
+    pose: wp.transformf,
+    episodes: EpisodeArrays,
+    poses: wp.array(dtype=wp.transformf),
+    shape_colors: wp.array2d(dtype=wp.vec3f),
+):
+    """Where one world's camera stands, and the colours of its shapes: drawn once, from the seed and the world alone."""
+    world = wp.tid()
+    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
+    stream = wp.rand_init(int(key), _STREAM)
+    shift = wp.vec3f(wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0))
+    turn = wp.vec3f(wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0))
+    turned = wp.quat_rpy(angle * turn[0], angle * turn[1], angle * turn[2])
+    poses[world] = wp.transformf(
+        wp.transform_get_translation(pose) + position * shift, wp.transform_get_rotation(pose) * turned
+    )
+    for shape in range(shape_colors.shape[1]):
+        change = wp.vec3f(wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0))
+        color = shape_colors[world, shape] + colors * change
+        for channel in range(3):
+            color[channel] = wp.clamp(color[channel], 0.0, 1.0)
+        shape_colors[world, shape] = color
+
+
+@wp.kernel
+def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array(dtype=wp.float32)):
+    """How bright one world's image is."""
+    world = wp.tid()
+    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
+    light[world] = wp.randf(wp.rand_init(int(key), _STREAM - 1), ends[0], ends[1])
+
+
+@wp.kernel
+def _stack(
+    mode: int,
+    frames: int,
+    rendered: wp.array3d(dtype=wp.uint32),
+    light: wp.array(dtype=wp.float32),
+    episodes: EpisodeArrays,
+    images: wp.array4d(dtype=wp.uint8),
+):
+    """Unpack one pixel and push it before the earlier ones; an episode's first image stands for those before it."""
+    world, row, column = wp.tid()
+    pixel = rendered[world, row, column]
+    first = mode != STEP or episodes.dones[world]
+    for channel in range(3):
+        value = float((pixel >> wp.uint32(8 * channel)) & wp.uint32(255)) * light[world]
+        value = wp.min(wp.round(value), 255.0)
+        for back in range(frames - 1):
+            slot = 3 * (frames - 1 - back) + channel
+            if first:
+                images[world, slot, row, column] = wp.uint8(value)
+            else:
+                images[world, slot, row, column] = images[world, slot - 3, row, column]
+        images[world, channel, row, column] = wp.uint8(value)
+
+
+class Camera:
+    """Renders all worlds into :attr:`images`; launches only, so that it can be captured.
+
+    Args:
+        config: Where it stands, how it sees.
+        randomize: How the scenes of the worlds differ; colours are changed here, in the worlds' model.
+        worlds: What it sees.
+        episodes: The task's buffers; ``random`` holds seed and global indices already.
+
+    Attributes:
+        images: What the policy sees, shape ``(worlds, 3 * frames, height, width)``, uint8: red, green and blue in sRGB, the
+            present frame first.
+    """
+
+    def __init__(self, config: CameraConfig, randomize: Randomization, worlds: Worlds, episodes: EpisodeArrays) -> None:
+        self._worlds, self._episodes, self._frames = worlds, episodes, config.frames
+        model, count = worlds.model, worlds.world_count
+        self._device = model.device
+        smooth = SensorCamera.AntiAliasing.MSAA if config.samples > 1 else SensorCamera.AntiAliasing.NONE
+        self._sensor = SensorCamera(
+            model,
+            default_clear_data=SensorCamera.ClearData(clear_color=_SKY),
+            default_render_config=SensorCamera.RenderConfig(
+                render_order=SensorCamera.RenderOrder.TILED, anti_aliasing=smooth
+            ),
+        )
+        self._sensor.create_default_light(enable_shadows=False)
+        self._rays = SensorCamera.compute_camera_rays_pinhole(
+            config.width, config.height, camera_fov=config.fov, sample_count=config.samples, device=self._device
+        )
+        self._rendered = self._sensor.allocate_image_color(count, config.width, config.height)
+        shape = (count, config.channels, config.height, config.width)
+        self._images = wp.zeros(shape, dtype=wp.uint8, device=self._device)
+        self.images: torch.Tensor = wp.to_torch(self._images)
+        self._poses = wp.zeros(count, dtype=wp.transformf, device=self._device)
+        self._light = wp.ones(count, dtype=wp.float32, device=self._device)
+        shapes = (
+            int((model.shape_world.numpy() >= 0).sum()) // count
+        )  # those of the ground come last and belong to no world
+        colors = model.shape_color[: shapes * count].reshape((count, shapes))
+        wp.launch(
+            _draw_scene,
+            dim=count,
+            inputs=[randomize.camera_position, randomize.camera_angle, randomize.colors, _look(config), episodes],
+            outputs=[self._poses, colors],
+            device=self._device,
+        )
+        wp.launch(
+            _draw_light, dim=count, inputs=[wp.vec2(*randomize.light), episodes, self._light], device=self._device
+        )
+
+    def render(self, mode: int) -> None:
+        """After ``observe`` in ``mode``: take a picture of every world, of those that were placed afresh too."""
+        worlds = self._worlds
+        worlds.update_bodies()
+        worlds.model.bvh_refit_shapes(worlds.state)
+        self._sensor.update(worlds.state, self._poses, self._rays, color_image=self._rendered)
+        wp.launch(
+            _stack,
+            dim=self._rendered.shape,
+            inputs=[mode, self._frames, self._rendered, self._light, self._episodes],
+            outputs=[self._images],
+            device=self._device,
+        )
+
+
+def _look(config: CameraConfig) -> wp.transformf:
+    """The pose of a camera that looks along its own -z, with its +y as near to the world's +z as can be."""
+    back = wp.normalize(wp.vec3f(*config.position) - wp.vec3f(*config.target))
+    upward = wp.vec3f(0.0, 1.0, 0.0) if abs(back[2]) > 0.999 else wp.vec3f(0.0, 0.0, 1.0)
+    right = wp.normalize(wp.cross(upward, back))
+    up = wp.cross(back, right)
+    return wp.transformf(wp.vec3f(*config.position), wp.quat_from_matrix(wp.matrix_from_cols(right, up, back)))
