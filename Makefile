@@ -26,8 +26,11 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# the spine, and what training makes of this machine's processor: cpu.md, curves_cpu.md
 bench: $(READY)
 	$(BIN)/python -m benchmarks.spine
+	$(BIN)/python -m benchmarks.training
+	$(BIN)/python -m benchmarks.curves
 
 bench-scheduling: $(READY)
 	$(BIN)/python -m benchmarks.scheduling | tee benchmarks/scheduling.md
@@ -40,7 +43,7 @@ bench-resume: $(READY)
 
 # needs CUDA devices: all tables, with as many GPUs as there are
 bench-gpu: $(READY)
-	$(BIN)/python -m benchmarks.gpu --tasks Cartpole Ant Humanoid Quadruped --worlds 4096 16384
+	$(BIN)/python -m benchmarks.training --sweep Ant Humanoid
 	$(BIN)/python -m benchmarks.curves
 	$(BIN)/python -m benchmarks.scaling
 

@@ -1,78 +1,162 @@
-"""Whole trainings: reward against time, of each built-in task with its own settings.
+"""Whole trainings: reward against time and steps, of each built-in task with its own settings, and of rsl-rl's own runner beside them.
 
-    python -m benchmarks.curves [--tasks Ant Humanoid Quadruped] [--worlds 4096] [--iterations 500] [--out DIRECTORY]
+    python -m benchmarks.curves [--tasks Ant Humanoid Quadruped] [--stock Ant] [--out DIRECTORY]
 
-Writes ``curves.json``, and ``curves.png`` where matplotlib is installed. The clock starts with the first iteration; what is before
-it (imports, worlds, kernels) stands apart.
+Writes ``curves.md``, ``curves.json``, and ``curves.png`` where matplotlib is installed (without a GPU ``curves_cpu.*``, with fewer
+worlds). The clock starts with the first iteration; what is before it (imports, worlds, kernels) stands apart. Each policy is
+evaluated at the end, its mean action from fresh starts; where a task's solver has limits, also in a simulation without them.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gpu import build
+from benchmarks.stock import stock_runner
+from benchmarks.training import CUDA, build, wait
+from worker.learning.evaluation import evaluate
+from worker.learning.runner import Runner, build_task
+
+PLAN = {
+    "Cartpole": (4096, 60),
+    "Ant": (4096, 300),
+    "Humanoid": (4096, 500),
+    "Quadruped": (4096, 300),
+    "CartpolePixels": (1024, 250),
+}
+"""Worlds and iterations on a GPU."""
+PLAN_CPU = {"Cartpole": (64, 150), "CartpolePixels": (64, 60)}
+REFERENCE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
+"""MuJoCo's own defaults for its solver."""
 
 
 def train(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -> dict[str, Any]:
-    """Reward, episode length and seconds after each iteration."""
+    """Reward, episode length and seconds after each iteration, and what the policy is worth in the end."""
     started = time.perf_counter()
     runner = build(task, worlds, store, seed)
     built = time.perf_counter() - started
     started = time.perf_counter()
-    curve = []
+    curve, failed = [], 0.0
     for _ in range(iterations):
         record = runner._iterate()[0]
+        failed += record["nan_worlds"]
         seconds = time.perf_counter() - started
         curve.append([round(seconds, 3), record["env_steps"], record["reward"], record["episode_length"]])
-    keep = ("nan_worlds", "solver_overflows", "learning_rate", "kl", "action_std")
-    terms = {name: value for name, value in record.items() if name.startswith("reward_") or name in keep}
-    return {"task": task, "worlds": worlds, "built_s": built, "seconds": seconds, "last": terms, "curve": curve}
+    terms = {name: value for name, value in record.items() if name.startswith("reward_")}
+    found = {"task": task, "worlds": worlds, "built_s": built, "seconds": seconds, "terms": terms, "curve": curve}
+    return found | {"failed_worlds": failed} | worth(runner)
+
+
+def worth(runner: Runner) -> dict[str, float]:
+    """Mean return of the policy's mean action, as trained and under :data:`REFERENCE`."""
+    own = evaluate(runner.task, runner.ppo, runner.gang, checkpoint="-")
+    found = {"evaluated": own.mean_return, "evaluated_length": own.mean_length, "longest": own.max_length}
+    options = type(runner.task).solver_options
+    if "iterations" in options and CUDA:
+        exact: Any = type(
+            type(runner.task).__name__, (type(runner.task),), {"solver_options": {**options, **REFERENCE}}
+        )
+        task = build_task(exact, runner.config, runner.ppo.share, runner.gang, 1)
+        found["reference"] = evaluate(task, runner.ppo, runner.gang, checkpoint="-").mean_return
+    return found
+
+
+def train_stock(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -> dict[str, Any]:
+    """The same with rsl-rl's own runner, on worlds of the same seed."""
+    runner = build(task, worlds, store / "stock", seed)
+    config, own = runner.config.ppo, runner.task
+    stock = stock_runner(own, config)
+    own.clear_statistics()
+    curve: list[list[Any]] = []
+    reward = length = None
+    seconds = 0.0
+    every = 5
+    for done in range(0, iterations, every):
+        started = time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()):
+            stock.learn(every, init_at_random_ep_len=done == 0)
+        wait()
+        seconds += time.perf_counter() - started
+        episodes, returns, lengths = own.statistics[:3].tolist()
+        own.clear_statistics()
+        if episodes:
+            reward, length = returns / episodes, lengths / episodes
+        curve.append([round(seconds, 3), (done + every) * worlds * config.steps, reward, length])
+    return {"task": task, "worlds": worlds, "stock": True, "seconds": seconds, "curve": curve}
 
 
 def main() -> None:
+    plan = PLAN if CUDA else PLAN_CPU
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", default=["Cartpole", "Ant", "Humanoid", "Quadruped"])
-    parser.add_argument("--worlds", type=int, default=4096)
-    parser.add_argument("--iterations", type=int, default=500)
+    parser.add_argument("--tasks", nargs="+", default=list(plan))
+    parser.add_argument(
+        "--stock", nargs="*", default=["Ant"] if CUDA else ["Cartpole"], help="tasks that rsl-rl trains, too"
+    )
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     options = parser.parse_args()
-    rows = []
+    rows: list[dict[str, Any]] = []
+    name = "curves" if CUDA else "curves_cpu"
     with tempfile.TemporaryDirectory() as store:
-        for task in options.tasks:
-            rows.append(train(task, options.worlds, options.iterations, Path(store)))
-            steps, reward, length = rows[-1]["curve"][-1][1:]
-            print(
-                f"{task}: {steps / 1e6:.1f} M steps in {rows[-1]['seconds']:.1f} s; reward {reward}, length {length}",
-                flush=True,
-            )
-            print(rows[-1]["last"], flush=True)
-            (options.out / "curves.json").write_text(json.dumps(rows))
+        for task, trainer in [(task, train) for task in options.tasks] + [
+            (task, train_stock) for task in options.stock
+        ]:
+            rows.append(trainer(task, *plan[task], Path(store), options.seed))
+            print({key: value for key, value in rows[-1].items() if key != "curve"}, rows[-1]["curve"][-1], flush=True)
+            (options.out / f"{name}.json").write_text(json.dumps(rows))
+            (options.out / f"{name}.md").write_text(table(rows, name))
     with contextlib.suppress(ImportError):
-        draw(rows, options.out / "curves.png")
+        draw(rows, options.out / f"{name}.png")
+
+
+def table(rows: list[dict[str, Any]], name: str) -> str:
+    """Markdown."""
+    lines = [
+        "# Whole trainings",
+        "",
+        f"`python -m benchmarks.curves`, each task with its own settings. ![reward against steps]({name}.png)",
+        "",
+        "| task | by | worlds | steps | time | mean return | of the mean action | under MuJoCo's own solver limits | its length |",
+        "|---|---|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        steps, reward = row["curve"][-1][1:3]
+        evaluated = f"{row['evaluated']:,.1f}" if "evaluated" in row else "–"
+        reference = f"{row['reference']:,.1f}" if "reference" in row else "–"
+        length = f"{row['evaluated_length']:.0f} of {row['longest']}" if "evaluated" in row else "–"
+        lines.append(
+            f"| {row['task']} | {'stock rsl-rl' if row.get('stock') else 'Muster'} | {row['worlds']:,} | {steps / 1e6:.1f} M | "
+            f"{row['seconds']:.1f} s | {reward:,.1f} | {evaluated} | {reference} | {length} |"
+        )
+    return "\n".join(lines) + "\n"
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Mean return of finished episodes against time, one panel a task."""
+    """Mean return of finished episodes against steps, one panel a task."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, panels = pyplot.subplots(1, len(rows), figsize=(4 * len(rows), 3), squeeze=False)
-    for panel, row in zip(panels[0], rows, strict=True):
-        points = [(seconds, reward) for seconds, _, reward, _ in row["curve"] if reward is not None]
-        panel.plot(*zip(*points, strict=True))
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    figure, panels = pyplot.subplots(1, len(tasks), figsize=(4 * len(tasks), 3), squeeze=False)
+    for row in rows:
+        panel = panels[0][tasks.index(row["task"])]
+        points = [(steps / 1e6, reward) for _, steps, reward, _ in row["curve"] if reward is not None]
+        label = f"{'stock rsl-rl' if row.get('stock') else 'Muster'}, {row['seconds']:.0f} s"
+        panel.plot(*zip(*points, strict=True), label=label)
         panel.set_title(f"{row['task']}, {row['worlds']:,} worlds")
-        panel.set_xlabel("seconds of training")
+        panel.set_xlabel("million steps")
+        panel.legend()
     panels[0][0].set_ylabel("mean return")
     figure.tight_layout()
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=100)
 
 
 if __name__ == "__main__":

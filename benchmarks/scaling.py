@@ -25,7 +25,7 @@ def rank(task: str, worlds: int, store: Path, result: Path) -> None:
     """One rank: train, and (rank 0) write down how long an iteration took."""
     import torch
 
-    from benchmarks.gpu import build
+    from benchmarks.training import build
 
     runner = build(task, worlds, store)
     slowest = []

@@ -25,8 +25,10 @@ class StockEnv(VecEnv):
         self.max_episode_length, self.episode_length_buf = task.max_episode_length, task.episode_length
 
     def get_observations(self) -> TensorDict:
-        # a copy: rsl-rl keeps what it was given until after the next step
-        return TensorDict({"policy": self.task.observations.clone()}, [self.num_envs], device=self.device)
+        # a copy: rsl-rl keeps what it was given until after the next step. Its convolutions take floats.
+        seen = self.task.observations
+        seen = seen.float() / 255.0 - 0.5 if seen.dtype == torch.uint8 else seen.clone()
+        return TensorDict({"policy": seen}, [self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         self.task.step(actions)
@@ -36,12 +38,17 @@ class StockEnv(VecEnv):
 
 def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
     """rsl-rl's runner with the hyperparameters of ``ppo``; it writes nothing."""
-    network = {
+    network: dict[str, Any] = {
         "class_name": "MLPModel",
         "hidden_dims": list(ppo.hidden_sizes),
         "activation": ppo.activation,
         "obs_normalization": ppo.normalize_observations,
     }
+    images = len(task.observation_shape) > 1
+    if images:
+        layers = {"output_channels": list(ppo.channels), "kernel_size": list(ppo.kernel_sizes)}
+        layers |= {"stride": list(ppo.strides), "activation": ppo.activation}
+        network |= {"class_name": "CNNModel", "cnn_cfg": layers}
     config = {
         "num_steps_per_env": ppo.steps,
         "save_interval": 10**9,
@@ -50,6 +57,7 @@ def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
         "critic": dict(network),
         "algorithm": {
             "class_name": "PPO",
+            **({"share_cnn_encoders": True} if images else {}),
             "num_learning_epochs": ppo.epochs,
             "num_mini_batches": ppo.minibatches,
             "clip_param": ppo.clip,
@@ -67,12 +75,17 @@ def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
         return OnPolicyRunner(StockEnv(task), config, None, task.device)
 
 
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
 def stock_seconds(runner: OnPolicyRunner, iterations: int, warm: int = 5) -> float:
     """Seconds an iteration, after ``warm`` ones."""
     with contextlib.redirect_stdout(io.StringIO()):
         runner.learn(warm)
-        torch.cuda.synchronize()
+        _wait()
         started = time.perf_counter()
         runner.learn(iterations)
-        torch.cuda.synchronize()
+        _wait()
     return (time.perf_counter() - started) / iterations

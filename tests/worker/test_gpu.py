@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 
 def runner(store: Path, task: str, worlds: int = 256):  # type: ignore[no-untyped-def]
-    from benchmarks.gpu import build
+    from benchmarks.training import build
 
     return build(task, worlds, store)
 
