@@ -8,6 +8,7 @@ Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun an
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import json
 import os
 import statistics
@@ -27,6 +28,7 @@ def rank(task: str, worlds: int, store: Path, result: Path) -> None:
 
     from benchmarks.training import build
 
+    faulthandler.dump_traceback_later(140, exit=True)  # who waits for whom
     runner = build(task, worlds, store)
     slowest = []
     for _ in range(6):
@@ -48,7 +50,7 @@ def rank(task: str, worlds: int, store: Path, result: Path) -> None:
             "captured": [part.name for part in runner.ppo.recordings if part.captured],
         }
         result.write_text(json.dumps(found))
-    runner.gang.close()
+    runner.close()
     os._exit(0)
 
 
@@ -61,7 +63,7 @@ def launch(gpus: int, inside: bool, options: argparse.Namespace) -> dict[str, An
             *("benchmarks.scaling", "--rank", directory, "--task", options.task, "--worlds", str(options.worlds)),
         ]
         env = {**os.environ, "MUSTER_BENCH_INSIDE": "1" if inside else "0", "OMP_NUM_THREADS": "4"}
-        subprocess.run(command, env=env, check=True, timeout=300)
+        subprocess.run(command, env=env, check=True, timeout=150)
         return {"gpus": gpus, "inside": inside, **json.loads(result.read_text())}
 
 
@@ -77,6 +79,7 @@ def main() -> None:
     parser.add_argument("--task", default="Ant")
     parser.add_argument("--worlds", type=int, default=4096, help="of each GPU")
     parser.add_argument("--gpus", nargs="+", type=int, default=_counts())
+    parser.add_argument("--where", nargs="+", choices=("inside", "between"), default=["inside", "between"])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -87,7 +90,7 @@ def main() -> None:
         rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")
     rows = []
     for gpus in options.gpus:
-        for inside in (True, False) if gpus > 1 else (True,):
+        for inside in [place == "inside" for place in options.where] if gpus > 1 else [True]:
             try:
                 rows.append(launch(gpus, inside, options))
             except (subprocess.SubprocessError, OSError) as error:
@@ -101,7 +104,7 @@ def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     import torch
 
-    single = next(row["rate"] for row in rows if row["gpus"] == 1)
+    single = next((row["rate"] for row in rows if row["gpus"] == 1), float("nan"))
     lines = [
         f"# {options.task} on several {torch.cuda.get_device_name()}",
         "",

@@ -30,8 +30,9 @@ def main() -> int:
 
     worlds = Share.of(gang.rank, gang.size, total_worlds(job, gang)).count
     with within_memory(task_type, configure(task_type, job.section), worlds, gang):
-        code = Runner(job, gang, task_type, stop).train()
-    gang.close()
+        runner = Runner(job, gang, task_type, stop)
+        code = runner.train()
+    runner.close()
     return code
 
 

@@ -46,6 +46,12 @@ class Recorded:
             self._graph = self._record()
         self._graph.replay()
 
+    def release(self) -> None:
+        """Forget the graph. A process group must not be left while a graph holds its collectives: NCCL would wait for ever."""
+        if self._graph is not None:
+            self._graph.reset()
+            self._graph = None
+
     def _record(self) -> torch.cuda.CUDAGraph:
         started = time.perf_counter()
         graph = torch.cuda.CUDAGraph()

@@ -122,6 +122,12 @@ class Runner:
         self._finish()
         return 0
 
+    def close(self) -> None:
+        """Leave the gang; nothing can be trained afterwards."""
+        for part in (self._collecting, *self.ppo.recordings):
+            part.release()
+        self.gang.close()
+
     def _tell_captured(self) -> None:
         """Say once, when it has come to that, which parts of an iteration the device replays by itself."""
         parts = [self._collecting, *self.ppo.recordings]
