@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 FEW, MORE = 64, 2048
 """Worlds of two builds: the first loads kernels and libraries, the second is measured."""
-CHECKED = 4 * MORE
-"""From so many worlds on, memory is looked at beforehand on the CPU, where the kernel kills who takes too much."""
+CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
+"""From so many worlds on, memory is looked at beforehand: on the CPU the kernel kills who takes too much, and on a GPU building many
+worlds takes long before it fails."""
 SPARE = 0.9
 """Share of the free memory that may be taken: graphs and kernels take some more."""
 
@@ -38,7 +39,7 @@ def within_memory(task_type: type[Task], config: TaskConfig, worlds: int, gang: 
         gang: On whose device they are to be.
     """
     free = free_bytes(gang.device)
-    if gang.device == "cpu" and worlds >= CHECKED:
+    if worlds >= CHECKED[gang.device.partition(":")[0]]:
         size = bytes_per_world(task_type, config, gang)
         if worlds * size > free:
             raise UserError(_explain(task_type, worlds, gang, free, size))
