@@ -1,7 +1,7 @@
 """``python -m worker.export``: write a checkpoint's policy as one ONNX file with all that a robot needs to run it.
 
-``exports/<checkpoint>/policy.onnx`` takes ``obs``, shape (batch, observations), and gives ``actions``, shape (batch, actions): the
-mean action, with the observation normaliser inside. ``policy.json`` beside it says what the numbers mean and holds a self-test. The
+``exports/<checkpoint>/policy.onnx`` takes ``obs``, shape (batch, observations), or, for a camera, (batch, channels, height, width) as
+bytes, and gives ``actions``, shape (batch, actions): the mean action, with the observation normaliser inside. ``policy.json`` beside it says what the numbers mean and holds a self-test. The
 file is run with ONNX's own reference evaluator, and compared, before the directory appears.
 """
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-5
 """Greatest absolute difference between the exported and the trained policy's actions."""
-SAMPLES = 1024
-"""Observations on which they are compared."""
+SAMPLES, IMAGES = 1024, 16
+"""Observations on which they are compared: numbers, or images, for which ONNX's evaluator takes its time."""
 
 
 def export(run: Run, checkpoint: Checkpoint) -> Path:
@@ -49,6 +49,7 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
     observations = _observations(actor)
     with torch.no_grad():
         actions = actor.as_onnx(verbose=False)(observations)
+    few = 8 if observations.ndim == 2 else 1
     metadata = {
         "format": 1,
         "task": facts["task"],
@@ -59,7 +60,7 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
         **facts["policy"],
         "input": "obs",
         "output": "actions",
-        "self_test": {"obs": observations[:8].tolist(), "actions": actions[:8].tolist(), "tolerance": TOLERANCE},
+        "self_test": {"obs": observations[:few].tolist(), "actions": actions[:few].tolist(), "tolerance": TOLERANCE},
     }
     model = to_onnx(actor, metadata)
     metadata["max_difference"] = check(model, observations.numpy(), actions.numpy())
@@ -123,10 +124,16 @@ def check(model: bytes, observations: np.ndarray, actions: np.ndarray) -> float:
 
 
 def _observations(actor: MLPModel) -> Any:
-    """Observations as the policy has met them (its normaliser's moments), a few far outside: shape (SAMPLES, observations)."""
+    """Observations as the policy has met them (its normaliser's moments), a few far outside: shape (SAMPLES, observations).
+
+    Of a policy that sees images, (IMAGES, channels, height, width): any bytes."""
     import torch
 
     generator = torch.Generator().manual_seed(0)
+    if not actor.obs_dim:
+        (example,) = actor.as_onnx(verbose=False).get_dummy_inputs()
+        shape = (IMAGES, *example.shape[1:])
+        return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
     samples = torch.randn(SAMPLES, actor.obs_dim, generator=generator)
     samples[-SAMPLES // 8 :] *= 5.0
     if actor.obs_normalization:

@@ -361,11 +361,14 @@ def _figure(name: str, total: float, episodes: float) -> float | None:
 
 def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
     """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
-    names = {
+    names: dict[str, Any] = {
         key: list(value)
         for key in ("joint_names", "action_names", "observation_names")
         if (value := getattr(task, key, None)) is not None
     }
+    if len(task.observation_shape) > 1:
+        names["camera"] = dataclasses.asdict(config.camera)
+        del names["observation_names"]  # of what the simulation knows; the policy sees the image
     return {
         "task": job.section["task"],
         "train": job.section,

@@ -25,13 +25,21 @@ def describe(name: str) -> dict[str, Any]:
         "name": name,
         "class": f"{task.__module__}:{task.__qualname__}",
         "about": (task.__doc__ or "").strip().partition("\n")[0],
-        "observations": list(task.observation_names),
+        "observations": _observations(task, config),
         "actions": list(task.action_names),
         "rewards": dict(config.rewards),
         "control_hz": config.control_hz,
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
     }
+
+
+def _observations(task: Any, config: Any) -> list[str]:
+    """Name of each observation; of a camera one line says what its image is."""
+    camera = getattr(config, "camera", None)
+    if camera is None:
+        return list(task.observation_names)
+    return [f"image: {camera.frames} x RGB of {camera.width} x {camera.height} bytes, the present one first"]
 
 
 def main(names: list[str]) -> int:

@@ -1,0 +1,58 @@
+"""Worlds beyond memory: told before anything is built, with what they need and what fits."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from worker.distributed import Gang, Placement
+from worker.errors import UserError
+from worker.learning import memory
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+
+HERE = Gang(Placement(), "cpu", None, ["here"])
+CONFIG = CartpoleConfig()
+
+
+def test_too_many_are_refused_before_they_are_built() -> None:
+    free = memory.free_bytes("cpu")
+    with pytest.raises(UserError) as refusal, memory.within_memory(Cartpole, CONFIG, 200_000_000, HERE):
+        pytest.fail("they are not to be built")
+    found = re.fullmatch(
+        r"worlds: 200,000,000 worlds of Cartpole on rank 0 need more memory than the ([\d.]+) GB that are free: about ([\d,.]+) GB. "
+        r"About ([\d,]+) fit: set `worlds`, or use more ranks",
+        str(refusal.value),
+    )
+    assert found, refusal.value
+    assert float(found[1]) == pytest.approx(free / 1e9, rel=0.2)
+    # a rollout of 16 steps alone has 16 x (4 states twice, their latents, noise, samples, ...) floats: 1 to 40 KB a world
+    assert 200 < float(found[2].replace(",", "")) < 8000
+    fit = int(found[3].replace(",", ""))
+    assert fit == pytest.approx(0.9 * free / (float(found[2].replace(",", "")) * 1e9 / 200e6), rel=0.25)
+
+
+def test_what_fits_goes_on_and_other_errors_stay_what_they_are() -> None:
+    with memory.within_memory(Cartpole, CONFIG, 64, HERE):
+        pass
+    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(Cartpole, CONFIG, 64, HERE):
+        raise RuntimeError("something else")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+        RuntimeError("Failed to allocate 123 bytes on device 'cuda:0'"),
+        MemoryError(),
+    ],
+)
+def test_an_allocation_that_fails_is_told_in_the_same_words(error: Exception) -> None:
+    with (
+        pytest.raises(
+            UserError, match=r"^worlds: 64 worlds of Cartpole on rank 0 need more memory .* About [\d,]+ fit: set"
+        ),
+        memory.within_memory(Cartpole, CONFIG, 64, HERE),
+    ):
+        raise error
