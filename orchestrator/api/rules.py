@@ -73,8 +73,8 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> None:
-    """``nodeProperties`` of a definition or, ``complete``, of a job, with the submission's overrides applied."""
+def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> GangNeeds:
+    """``nodeProperties`` of a definition or, ``complete``, of a job, with the submission's overrides applied; what they ask for."""
     count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
     if not 1 <= count <= _MOST_NODES:
         raise ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
@@ -97,6 +97,7 @@ def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> Non
     except ValueError as error:
         raise ClientError(str(error)) from None
     _check_settings(needs)
+    return needs
 
 
 def _check_settings(needs: GangNeeds) -> None:

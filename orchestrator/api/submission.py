@@ -92,15 +92,15 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
-    rules.check_nodes(properties, complete=True)
+    needs = rules.check_nodes(properties, complete=True)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     job_id = str(uuid.uuid4())
     is_array = bool(request.get("arrayProperties"))
-    run = gang_needs(properties).setting("MUSTER_RUN") or f"{name[:110]}-{job_id[:8]}"
+    run = needs.setting("MUSTER_RUN") or f"{name[:110]}-{job_id[:8]}"
     _check_run(context, run, is_array)
     if not request.get("dependsOn"):
-        _check_source(context, gang_needs(properties).spec)
+        _check_source(context, needs.spec)
     return Job(
         id=job_id,
         name=name,

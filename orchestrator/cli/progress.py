@@ -122,15 +122,14 @@ class _Display:
         self._first: tuple[float, int] | None = None
         self.started = time.monotonic()
 
-    def eta(self, iteration: int) -> str:
-        """Time left at the pace since the first iteration that was seen, as h:mm:ss."""
-        now = time.monotonic()
+    def eta(self, record: dict[str, Any]) -> str:
+        """Time left at the pace since the first iteration that was seen (then: of that iteration), as h:mm:ss."""
+        now, iteration = time.monotonic(), record["iteration"]
         if self._first is None or iteration < self._first[1]:
             self._first = (now, iteration)
         done = iteration - self._first[1]
-        if done < 1:
-            return "-:--:--"
-        left = int((self.total - iteration) * (now - self._first[0]) / done)
+        pace = (now - self._first[0]) / done if done else record.get("iteration_seconds", 0.0)
+        left = int((self.total - iteration) * pace)
         return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
 
     def state(self, job: dict[str, Any]) -> str:
@@ -166,7 +165,7 @@ class _Bar(_Display):
             iteration = record["iteration"]
             text = (
                 f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-                f"{values['rate']} steps/s  ETA {self.eta(iteration)}  {self.nodes} node{'s' if self.nodes != 1 else ''}"
+                f"{values['rate']} steps/s  ETA {self.eta(record)}  {self.nodes} node{'s' if self.nodes != 1 else ''}"
             )
             self._progress.update(self._task, completed=iteration, text=text)
         elif task.completed == 0 or job["status"] not in ("RUNNING", *_TERMINAL):
@@ -196,7 +195,7 @@ class _Lines(_Display):
             print(f"{job['status']}: {job.get('statusReason', '')}", flush=True)
             self._state = state
         if record:
-            self.eta(record["iteration"])
+            self.eta(record)
             self._latest = record
         if time.monotonic() - self._printed >= _PLAIN_INTERVAL:
             self._flush()
@@ -207,7 +206,7 @@ class _Lines(_Display):
         values, iteration = _describe(self._latest), self._latest["iteration"]
         print(
             f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-            f"steps/s {values['rate']}  ETA {self.eta(iteration)}  nodes {self.nodes}",
+            f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}",
             flush=True,
         )
         self._latest, self._printed = None, time.monotonic()
