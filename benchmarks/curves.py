@@ -107,7 +107,7 @@ def main() -> None:
         for task, trainer in [(task, train) for task in options.tasks] + [
             (task, train_stock) for task in options.stock
         ]:
-            rows.append(trainer(task, *plan[task], Path(store), options.seed))
+            rows.append(trainer(task, *plan.get(task, (64, 60)), Path(store), options.seed))
             print({key: value for key, value in rows[-1].items() if key != "curve"}, rows[-1]["curve"][-1], flush=True)
             (options.out / f"{name}.json").write_text(json.dumps(rows))
             (options.out / f"{name}.md").write_text(table(rows, name))

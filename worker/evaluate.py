@@ -35,7 +35,9 @@ def main() -> int:
     seed_generators(seed)
     share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
     task = build_task(task_type, config, share, gang, seed)
-    ppo = PPO(config.ppo, share, task.observation_shape, task.action_size, gang)
+    with user_errors():
+        ppo = PPO(config.ppo, share, task.observation_shape, task.action_size, gang)
+    task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
     try:
         ppo.load(load_learner(checkpoint, gang.device)["ppo"], {"actor": True, "critic": True})
     except RuntimeError as error:

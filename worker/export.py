@@ -42,13 +42,14 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
     """
     import torch
 
+    from worker.learning.models import GROUP
     from worker.learning.trained import load_actor
 
     actor = load_actor(checkpoint)
     facts = checkpoint.manifest
     observations = _observations(actor)
     with torch.no_grad():
-        actions = actor.as_onnx(verbose=False)(observations)
+        actions = actor.mlp(actor.get_latent({GROUP: observations}))  # as it was trained, not as it is exported
     few = 8 if observations.ndim == 2 else 1
     metadata = {
         "format": 1,

@@ -32,8 +32,9 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
     try:
         content = torch.load(path, weights_only=True)
         section = content["train"]
-    except (OSError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: no replay can be read from it ({str(error).splitlines()[0]})") from error
+    except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{path}: no replay can be read from it ({said})") from error
     with user_errors(str(path)):
         task_type = find_task(section["task"])
         if warp := sys.modules.get("warp"):
@@ -45,8 +46,11 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
             first_world=content["first_world"],
             device=device,
         )
-        task.load_state_dict(content["state"])
-    task.begin_iteration(content["iteration"] - 1, None, None)
+        state, own = content["state"], task.state_tensors().get("world_factors")
+        if own is not None and torch.allclose(state["world_factors"], own.cpu(), rtol=1e-5):
+            state["world_factors"] = own.cpu()  # drawn anew, on another device with other last digits
+        task.load_state_dict(state)
+    task.begin_iteration(*content["began"])
     task.clear_statistics()
     return task, content
 

@@ -25,11 +25,14 @@ def main() -> int:
     with user_errors("train.task"):
         task_type = find_task(job.section["task"])
     from worker.learning.memory import within_memory
-    from worker.learning.ppo import Share
     from worker.learning.runner import Runner, total_worlds
 
-    worlds = Share.of(gang.rank, gang.size, total_worlds(job, gang)).count
-    with within_memory(task_type, configure(task_type, job.section), worlds, gang):
+    worlds = -(-total_worlds(job, gang) // gang.size)
+    runner: Runner | None = None
+    # what fails later than the first iterations, which allocate everything, is not the worlds' fault
+    with within_memory(
+        task_type, configure(task_type, job.section), worlds, gang, lambda: runner is None or runner.iterated < 3
+    ):
         runner = Runner(job, gang, task_type, stop)
         code = runner.train()
     runner.close()

@@ -82,5 +82,6 @@ def test_a_tasks_own_hook_is_called_before_every_iteration_and_goes_on_after_a_r
         job = Job.from_env(env, "train")
         raise_epoch(job.run, epoch)
         Runner(job, Gang(Placement(), "cpu", None, ["here"]), Watched, StopRequest()).train()
-    assert [call[0] for call in calls] == [0, 1, 2, 3] and calls[0][1] is None
+    # before each iteration, and before the evaluation at the end, which is of the last one's task
+    assert [call[0] for call in calls] == [0, 1, 1, 2, 3, 3] and calls[0][1] is None
     assert calls[-1][1] is not None and calls[-1][2] > 1

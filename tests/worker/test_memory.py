@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
@@ -17,12 +18,12 @@ CONFIG = CartpoleConfig()
 
 
 def test_too_many_are_refused_before_they_are_built() -> None:
-    free = memory.free_bytes("cpu")
+    free = memory.free_bytes(HERE)
     with pytest.raises(UserError) as refusal, memory.within_memory(Cartpole, CONFIG, 200_000_000, HERE):
         pytest.fail("they are not to be built")
     found = re.fullmatch(
         r"worlds: 200,000,000 worlds of Cartpole on rank 0 need more memory than the ([\d.]+) GB that are free: about ([\d,.]+) GB. "
-        r"About ([\d,]+) fit: set `worlds`, or use more ranks",
+        r"About ([\d,]+) fit: set `worlds`",
         str(refusal.value),
     )
     assert found, refusal.value
@@ -48,11 +49,25 @@ def test_what_fits_goes_on_and_other_errors_stay_what_they_are() -> None:
         MemoryError(),
     ],
 )
-def test_an_allocation_that_fails_is_told_in_the_same_words(error: Exception) -> None:
+def test_an_allocation_that_fails_is_told_as_what_it_is(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         pytest.raises(
-            UserError, match=r"^worlds: 64 worlds of Cartpole on rank 0 need more memory .* About [\d,]+ fit: set"
+            UserError, match=r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
         ),
         memory.within_memory(Cartpole, CONFIG, 64, HERE),
     ):
+        raise error  # 64 worlds would fit: somebody else took it
+    monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
+    with (
+        pytest.raises(UserError, match=r"than the 0.0 GB that are free: about 0.0 GB. About \d+ fit: set `worlds`$"),
+        memory.within_memory(Cartpole, CONFIG, 64, HERE),
+    ):
         raise error
+    with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, 64, HERE, lambda: False):
+        raise error  # long after the start: not the worlds' fault, and not the user's
+
+
+def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
+    refused = dataclasses.replace(CONFIG, substeps=0)
+    with pytest.raises(UserError, match="substeps is 0"), memory.within_memory(Cartpole, refused, 9000, HERE):
+        pytest.fail("nothing is to be built")

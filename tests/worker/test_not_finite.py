@@ -85,7 +85,7 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
         runner(tmp_path, 0.0).train()
     found = re.fullmatch(
         r"iteration (\d): (\d+) resets of worlds, first (world \d+: its observation slider_velocity was not finite); that is more "
-        r"than nan_limit, 0 of 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.replay (\S+)",
+        r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.replay (\S+)",
         str(stop.value),
     )
     assert found, stop.value
@@ -104,7 +104,8 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
 
 def test_what_is_no_replay_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "nonsense").write_text("x")
-    for name in ("nonsense", "missing"):
+    (tmp_path / "empty").touch()
+    for name in ("nonsense", "missing", "empty"):
         refused = subprocess.run(
             [sys.executable, "-m", "worker.replay", str(tmp_path / name)], cwd=ROOT, capture_output=True, text=True
         )

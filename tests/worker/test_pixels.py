@@ -96,6 +96,7 @@ def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> Non
         ({"camera": {"fov": 4.0}}, "camera.fov: expected an angle between 0 and pi"),
         ({"camera": {"target": [0.0, -3.2, 1.4]}}, "camera.target: the camera stands there"),
         ({"camera": {"position": [0.0, 1.0]}}, "camera.position: expected [x, y, z], got [0.0, 1.0]"),
+        ({"camera": {"target": [0.0, math.nan, 1.0]}}, "camera.target: expected [x, y, z], got [0.0, nan, 1.0]"),
         ({"camera": {"witdh": 32}}, "config.camera.witdh: CameraConfig has no such key; did you mean width?"),
         ({"randomize": {"light": [1.0]}}, "light: expected [least, greatest]"),
         ({"randomize": {"colors": -1.0}}, "colors: expected a number of 0 or more"),
@@ -142,7 +143,12 @@ def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_pat
 
 
 def test_it_is_a_gymnasium_environment_of_images() -> None:
-    worlds = gymnasium.make_vec("worker.tasks.gym:Muster/CartpolePixels-v0", num_envs=2, episode_seconds=0.05)
+    worlds = gymnasium.make_vec(
+        "worker.tasks.gym:Muster/CartpolePixels-v0",
+        num_envs=2,
+        episode_seconds=0.05,
+        camera={"position": (0.0, -3.2, 1.4), "target": (0.0, 0.0, 1.4)},
+    )
     first, _ = worlds.reset(seed=1)
     assert worlds.single_observation_space == gymnasium.spaces.Box(0, 255, (6, 64, 64), np.uint8)
     assert worlds.observation_space.contains(first)
@@ -152,6 +158,17 @@ def test_it_is_a_gymnasium_environment_of_images() -> None:
         seen, _, _, truncated, info = worlds.step(np.zeros((2, 1), np.float32))
     assert truncated.all() and np.array_equal(info["final_obs"][0], before[0]), "the last image of the episode"
     worlds.close()
+
+
+@pytest.mark.parametrize(
+    ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [0, 2, 1]}, {})]
+)
+def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: Path, ppo: dict, camera: dict) -> None:
+    env = training(tmp_path, worlds=4, task="CartpolePixels", config={"camera": camera}, ppo=ppo)
+    with pytest.raises(
+        UserError, match=r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
+    ):
+        Runner(Job.from_env(env, "train"), Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
 
 
 def test_layers_of_the_network_have_to_match() -> None:

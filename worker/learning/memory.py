@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gc
-import os
+import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +16,9 @@ import torch
 
 from worker.distributed import Gang
 from worker.errors import UserError
+from worker.learning.job import user_errors
 from worker.learning.ppo import PPO, Share
+from worker.learning.runner import build_task
 
 if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
@@ -30,28 +34,31 @@ SPARE = 0.9
 
 
 @contextmanager
-def within_memory(task_type: type[Task], config: TaskConfig, worlds: int, gang: Gang) -> Iterator[None]:
+def within_memory(
+    task_type: type[Task], config: TaskConfig, worlds: int, gang: Gang, starting: Callable[[], bool] = lambda: True
+) -> Iterator[None]:
     """In here, worlds for which the memory does not suffice are the user's error, which says how many would do.
 
     Args:
         task_type: The task, with its ``config``.
-        worlds: Of this rank.
-        gang: On whose device they are to be.
+        worlds: The most that a rank has; the same number on all ranks.
+        gang: On whose devices they are to be.
+        starting: Whether memory that runs out now is that of the worlds; else its error passes.
     """
-    free = free_bytes(gang.device)
+    free = free_bytes(gang)
     if worlds >= CHECKED[gang.device.partition(":")[0]]:
         size = bytes_per_world(task_type, config, gang)
-        if worlds * size > free:
+        if worlds * size > SPARE * free:
             raise UserError(_explain(task_type, worlds, gang, free, size))
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        if not _is_out_of_memory(error):
+        if not starting() or not _is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # what was built so far goes
         try:
             size = bytes_per_world(task_type, config, gang)
-        except Exception:  # a device that is in the middle of a recording, for one: the first error is what counts
+        except Exception:  # on a device that is full, or in the middle of a recording: the first error is what counts
             size = 0.0
         raise UserError(_explain(task_type, worlds, gang, free, size)) from error
 
@@ -61,59 +68,80 @@ def _is_out_of_memory(error: Exception) -> bool:
     return known or "Failed to allocate" in str(error) or "out of memory" in str(error)
 
 
-def free_bytes(device: str) -> int:
-    """Memory that this process can still take: of the GPU, or of the machine and the control group that it is in."""
-    if device != "cpu":
-        return torch.cuda.mem_get_info(device)[0]
+def free_bytes(gang: Gang) -> int:
+    """Memory that this rank can still take: of its GPU, or its part of the host's (of the control group's that it is in)."""
+    if gang.device != "cpu":
+        return torch.cuda.mem_get_info(gang.device)[0]
     fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
     free = int(fields["MemAvailable"].split()[0]) * 1024
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        if limit != "max":
-            free = min(free, int(limit) - int(Path("/sys/fs/cgroup/memory.current").read_text()))
-    except OSError:
-        pass  # no control groups of version 2
-    return max(free, 0)
+    group = Path("/sys/fs/cgroup")
+    with contextlib.suppress(OSError, ValueError):  # no control groups of version 2, or no limit
+        limit = int((group / "memory.max").read_text())
+        used = int((group / "memory.current").read_text())
+        found = re.search(r"^inactive_file (\d+)$", (group / "memory.stat").read_text(), re.MULTILINE)
+        free = min(free, limit - used + (int(found[1]) if found else 0))  # pages of files are given back
+    return max(free, 0) // gang.placement.local_world_size
 
 
 def bytes_per_world(task_type: type[Task], config: TaskConfig, gang: Gang) -> float:
-    """What a world takes with its part of the rollout. Takes some seconds."""
+    """What a world takes with its part of rollout and update. Takes some seconds; every rank calls it."""
     _taken(task_type, config, FEW, gang)
     return _taken(task_type, config, MORE, gang) / MORE
 
 
 def _taken(task_type: type[Task], config: TaskConfig, worlds: int, gang: Gang) -> int:
-    """Memory that a build of ``worlds`` takes."""
+    """The most memory that ``worlds`` take while they are built and learn from one minibatch."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
-    before = _used(gang.device)
-    task = task_type(config, worlds, device=gang.device)
-    learner = PPO(config.ppo, Share(0, worlds, worlds), task.observation_shape, task.action_size, alone)
-    taken = _used(gang.device) - before
+    gc.collect()
+    before = _start_measuring(gang.device)
+    share = Share(0, worlds, worlds)
+    task = build_task(task_type, config, share, gang, 0)
+    with user_errors():
+        learner = PPO(config.ppo, share, task.observation_shape, task.action_size, alone)
+    learner.begin_iteration(0)
+    learner._compute_gradients()
+    taken = _most(gang.device) - before
     del task, learner
+    gc.collect()
     return max(taken, 0)
 
 
-def _used(device: str) -> int:
-    gc.collect()
+def _start_measuring(device: str) -> int:
+    """Forget the most that was taken before; what is taken now [bytes]."""
     if device == "cpu":
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        with contextlib.suppress(AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed, and would build from that
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM
+        return _status("VmRSS")
     torch.cuda.synchronize(device)
     torch.cuda.empty_cache()
+    return _most(device)
+
+
+def _most(device: str) -> int:
+    if device == "cpu":
+        return _status("VmHWM")
+    torch.cuda.synchronize(device)  # torch's cache still holds what the minibatch took
     free, total = torch.cuda.mem_get_info(device)
     return total - free
+
+
+def _status(name: str) -> int:
+    found = re.search(rf"^{name}:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(found[1]) * 1024 if found else 0
 
 
 def _explain(task_type: type[Task], worlds: int, gang: Gang, free: int, size: float) -> str:
     """One line; ``size`` of one world in bytes, 0 where it could not be measured."""
     where = "memory" if gang.device == "cpu" else f"memory of {gang.device}"
-    name, rank = task_type.__name__, gang.placement.rank
-    start = f"worlds: {worlds:,} worlds of {name} on rank {rank} need more {where} than the {_gb(free)} that are free"
-    if not size:
-        return f"{start}; set fewer `worlds`, or use more ranks"
+    start = f"worlds: {worlds:,} worlds of {task_type.__name__} on rank {gang.placement.rank} need more {where} than"
+    if worlds * size <= SPARE * free:  # others took what was free at the start
+        return f"{start} there is; set fewer `worlds`, or free some"
     fit = max(1, int(SPARE * free / size))
-    return f"{start}: about {_gb(worlds * size)}. About {fit:,} fit: set `worlds`, or use more ranks"
+    return f"{start} the {_gb(free)} that are free: about {_gb(worlds * size)}. About {fit:,} fit: set `worlds`"
 
 
-def _gb(size: int) -> str:
+def _gb(size: float) -> str:
     return f"{size / 1e9:.1f} GB"

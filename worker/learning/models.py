@@ -73,6 +73,7 @@ def build_models(
         critic = MLPModel(example, groups, "critic", 1, **common)
         critic.obs_normalizer = actor.obs_normalizer  # both see the same observations: keep one set of moments
         return actor, critic
+    _check_layers(config, observation_shape)
     layers = {
         "output_channels": list(config.channels),
         "kernel_size": list(config.kernel_sizes),
@@ -83,6 +84,18 @@ def build_models(
     with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl says that they are shared
         judging = PixelModel(example, groups, "critic", 1, cnns=seeing.cnns, **common)
     return seeing, judging
+
+
+def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:
+    """Raises ValueError for a convolution that leaves nothing of an image."""
+    height, width = shape[1:]
+    for number, (kernel, stride) in enumerate(zip(config.kernel_sizes, config.strides, strict=True), start=1):
+        if stride < 1 or not 1 <= kernel <= min(height, width):
+            raise ValueError(
+                f"ppo: convolution {number} has a kernel of {kernel} and a stride of {stride}, but {width} x {height} px are left of "
+                f"the image of {shape[2]} x {shape[1]}; change kernel_sizes and strides, or the camera's size"
+            )
+        height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
 
 
 def example_observations(worlds: int, shape: Sequence[int], device: str) -> TensorDict:

@@ -5,6 +5,7 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
 - Advantage moments, observation moments, gradients, KL and losses are sums over all ranks' samples, so that the number of
   ranks changes nothing but rounding. One collective an iteration, one a minibatch.
 - A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl takes the one before the step.
+  (Of images there is none after the step: there it is as in rsl-rl.)
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws a new permutation (rsl-rl draws one and repeats the same minibatches in all epochs).
 - The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device, and on CUDA all of

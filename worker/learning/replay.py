@@ -22,6 +22,11 @@ class Replay:
         self._ppo, self._section, self._seed = ppo, section, seed
         self._live = task.state_tensors()
         self._kept = {name: tensor.clone() for name, tensor in self._live.items()}
+        self._began: tuple[int, float | None, float | None] = (0, None, None)
+
+    def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
+        """What the task's ``begin_iteration`` is told now, for its curriculum."""
+        self._began = iteration, reward, episode_length
 
     def keep(self) -> None:
         """The worlds are about to be stepped."""
@@ -32,6 +37,7 @@ class Replay:
         share = self._ppo.share
         content = {
             "iteration": iteration,
+            "began": list(self._began),
             "train": self._section,
             "seed": self._seed,
             "first_world": share.first,

@@ -70,6 +70,8 @@ class Runner:
         self.replay = Replay(self.task, self.ppo, job.section, self.seed)
         self.ppo.broadcast_parameters()
         seed_generators(self.seed, gang.rank)
+        self.iterated = 0
+        """Iterations that this process has done."""
         self.state = TrainingState(
             job,
             gang,
@@ -173,7 +175,7 @@ class Runner:
         progress, ppo = self.state.progress, self.ppo
         self._stopwatch.start()
         ppo.begin_iteration(progress.iteration)
-        self.task.begin_iteration(progress.iteration, progress.reward, progress.episode_length)
+        self._begin_iteration(progress.iteration)
         self._collecting()
         self._stopwatch.mark()
         ppo.extra.zero_()
@@ -197,6 +199,7 @@ class Runner:
         collected, mishaps = extra[:ranks], extra[ranks : 2 * ranks]
         totals, signals = extra[2 * ranks : -len(SIGNALS)], extra[-len(SIGNALS) :]
         progress.iteration += 1
+        self.iterated += 1
         if not all(map(math.isfinite, values)):
             worst = ", ".join(f"{name} {value:g}" for name, value in zip(LOSSES, values, strict=True))
             raise self._failure(f"the loss is not finite ({worst})", "Try a smaller learning_rate")
@@ -233,10 +236,17 @@ class Runner:
             except OSError as error:
                 problem = f" (it could not be written: {error.strerror})"
         self.gang.greatest(0)  # nobody ends the gang before every rank has written
+        where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
-            f"{resets} resets of worlds, {first}; that is more than nan_limit, {self.config.nan_limit:g} of {total} worlds",
-            f"See it happen again: python -m worker.replay {files[rank]}{problem}",
+            f"{resets} resets of worlds, {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
+            f"See it happen again: python -m worker.replay {files[rank]}{where}{problem}",
         )
+
+    def _begin_iteration(self, iteration: int) -> None:
+        """Tell the task, whose curriculum may depend on it."""
+        told = iteration, self.state.progress.reward, self.state.progress.episode_length
+        self.replay.begin(*told)
+        self.task.begin_iteration(*told)
 
     def _signals(self) -> tuple[float, ...]:
         """This rank's :data:`SIGNALS`."""
@@ -293,6 +303,7 @@ class Runner:
                 "training is done, but its last checkpoint could not be saved; free space in the store and start again"
             )
         self.beacon.tell(done=True)
+        self._begin_iteration(max(0, self.state.progress.iteration - 1))
         result = evaluate(self.task, self.ppo, self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:
@@ -375,6 +386,7 @@ def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
         "ppo": dataclasses.asdict(config.ppo),
         "policy": {
             "observation_shape": list(task.observation_shape),
+            **({"observation_size": task.observation_shape[0]} if len(task.observation_shape) == 1 else {}),
             "action_size": task.action_size,
             "control_hz": config.control_hz,
             **names,

@@ -105,6 +105,7 @@ class TrainingState:
             "worlds": self.share.total,
             "shards": [[share.first, share.count] for share in shares],
             "reward": self.progress.reward,
+            "episode_length": self.progress.episode_length,
             "env_steps": self.progress.env_steps,
             "seconds": self.seconds,
         }
@@ -169,7 +170,8 @@ class TrainingState:
     def _check_fit(self, checkpoint: Checkpoint) -> None:
         """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        keys = [("task",), *(("train", key) for key in ("seed", "config")), *(("ppo", key) for key in _SHAPE)]
+        shape = (*_SHAPE, *_CONVOLUTIONS) if len(self.task.observation_shape) > 1 else _SHAPE
+        keys = [("task",), *(("train", key) for key in ("seed", "config")), *(("ppo", key) for key in shape)]
         for path in keys:
             old, new = _at(there, path), _at(here, path)
             if old != new:
@@ -195,8 +197,11 @@ class TrainingState:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
 
 
-_SHAPE = ("hidden_sizes", "activation", "normalize_observations", "channels", "kernel_sizes", "strides")
-"""Settings of PPO that shape the network."""
+_SHAPE, _CONVOLUTIONS = (
+    ("hidden_sizes", "activation", "normalize_observations"),
+    ("channels", "kernel_sizes", "strides"),
+)
+"""Settings of PPO that shape the network, and those that do where observations are images."""
 
 
 def _at(facts: Any, path: tuple[str, ...]) -> Any:

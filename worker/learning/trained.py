@@ -54,7 +54,9 @@ def load_actor(checkpoint: Checkpoint) -> MLPModel:
 
     facts = checkpoint.manifest
     config: Any = SimpleNamespace(**facts["ppo"])
-    actor, _ = build_models(config, facts["policy"]["observation_shape"], facts["policy"]["action_size"])
+    policy = facts["policy"]
+    shape = policy.get("observation_shape") or [policy["observation_size"]]  # the name of older checkpoints
+    actor, _ = build_models(config, shape, policy["action_size"])
     actor.load_state_dict(load_learner(checkpoint)["ppo"]["actor_state_dict"])
     return actor.eval()
 

@@ -45,7 +45,7 @@ class CameraConfig:
     frames: int = 2
     """Images of one observation: the present one and those of the control steps before, since one alone shows no velocity."""
     samples: int = 1
-    """Rays of each pixel: 1, or 4 or more for edges that move by less than a pixel."""
+    """Rays of each pixel; with 4 or more, edges that move by less than a pixel are seen to move."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "frames", "samples"):
@@ -54,8 +54,9 @@ class CameraConfig:
         if not 0.0 < self.fov < math.pi:
             raise ValueError(f"camera.fov: expected an angle between 0 and pi [rad], got {self.fov}")
         for name in ("position", "target"):
-            if len(getattr(self, name)) != 3:
-                raise ValueError(f"camera.{name}: expected [x, y, z], got {list(getattr(self, name))}")
+            place = getattr(self, name)
+            if len(place) != 3 or not all(map(math.isfinite, place)):
+                raise ValueError(f"camera.{name}: expected [x, y, z], got {list(place)}")
         if math.dist(self.position, self.target) < 1e-6:
             raise ValueError(f"camera.target: the camera stands there, at {list(self.position)}; choose another point")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from worker.simulation.camera import CameraConfig
@@ -34,6 +35,14 @@ class CartpolePixelsConfig(CartpoleConfig):
         )
     )
     """How the task is trained."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.camera, Mapping):  # as keyword of a Gymnasium environment
+            try:
+                object.__setattr__(self, "camera", CameraConfig(**self.camera))
+            except TypeError as error:
+                raise ValueError(f"camera: {error}") from error
 
 
 class CartpolePixels(Cartpole):

@@ -130,6 +130,8 @@ def _is_finite(value: object) -> bool:
 
 
 def _check_curriculum(curriculum: Mapping[str, Any], terms: Mapping[str, float]) -> None:
+    if not isinstance(curriculum, Mapping):
+        raise ValueError(f"curriculum: expected a mapping from names to points, got {curriculum!r}")
     for name, points in curriculum.items():
         if name != "level" and name not in terms:
             raise ValueError(f"curriculum: there is no {name!r}; there are level, {', '.join(terms)}")
@@ -192,7 +194,7 @@ class TaskConfig:
     fastest: float = 1000.0
     """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""
     nan_limit: float = 0.1
-    """Training stops when more than this share of the worlds had to be reset in one iteration since something was not finite."""
+    """Training stops when worlds that failed had to be reset more often in one iteration than this, times the number of worlds."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How the task is trained."""
 

@@ -22,7 +22,8 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """One task as a vector environment, with numpy at its edge.
 
     A world whose episode ends is reset in the same step: the step returns the first observation of the next episode, and
-    ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask).
+    ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask); of images
+    the one before the last step.
 
     Args:
         task: Name or ``module:Class``, as :func:`worker.tasks.find_task` takes it.

@@ -249,6 +249,7 @@ class Task:
         """
         tensors = self.state_tensors()
         task = type(self).__name__
+        state = {"broken": torch.zeros_like(self._broken, device="cpu"), **state}  # older states do not have it
         if missing := sorted(tensors.keys() - state.keys()):
             raise ValueError(f"the saved state of task {task} lacks {', '.join(missing)}")
         if unknown := sorted(state.keys() - tensors.keys()):
@@ -291,7 +292,7 @@ class Task:
             raise ValueError(f"task {task}: substeps is {config.substeps}; use at least 1")
         if config.control_hz <= 0.0:
             raise ValueError(f"task {task}: control_hz is {config.control_hz}; use a positive frequency in Hz")
-        if config.fastest <= 0.0:
+        if not config.fastest > 0.0:
             raise ValueError(f"task {task}: fastest is {config.fastest}; use a positive velocity in m/s and rad/s")
         if config.episode_seconds <= 0.0:
             raise ValueError(
