@@ -19,7 +19,7 @@ from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus
+from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus, NotYet
 from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
@@ -97,6 +97,8 @@ class Gangs:
         needs = gang_needs(job.node_properties)
         try:
             attempt.handle = self.engine.launch(self.engine.plan(self._gang(job, attempt, needs)))
+        except NotYet as wait:
+            job.status_reason = str(wait)
         except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()

@@ -142,6 +142,9 @@ class PPO(_Section):
 
     steps: int | None = Field(default=None, ge=1, description="steps per world and iteration")
     hidden_sizes: list[int] | None = Field(default=None, min_length=1)
+    channels: list[int] | None = Field(default=None, min_length=1, description="of each convolution, for images")
+    kernel_sizes: list[int] | None = Field(default=None, min_length=1, description="of each convolution [px]")
+    strides: list[int] | None = Field(default=None, min_length=1, description="of each convolution [px]")
     activation: str | None = None
     epochs: int | None = Field(default=None, ge=1)
     minibatches: int | None = Field(default=None, ge=1)

@@ -32,9 +32,12 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
     try:
         content = torch.load(path, weights_only=True)
         section = content["train"]
-    except (OSError, EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
-        said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise UserError(f"{path}: no replay can be read from it ({said})") from error
+    except OSError as error:
+        raise UserError(f"{path}: no replay can be read from it ({error.strerror})") from error
+    except (EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: no replay can be read from it (it is none)") from error
+    if Path(content["directory"]).is_dir():
+        sys.path.append(content["directory"])  # where a task of the user's own was found
     with user_errors(str(path)):
         task_type = find_task(section["task"])
         if warp := sys.modules.get("warp"):

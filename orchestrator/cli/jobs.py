@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from orchestrator import specfile
@@ -111,7 +112,8 @@ def list_jobs(
         nodes = _nodes(summary)
         created = _when(summary["createdAt"])
         table.add_row(
-            summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took, reason
+            *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
+            escape(" ".join(reason.split())),  # a compiler's message has lines, and brackets that are no markup
         )
     # one line a job: cut to the terminal's width, whole for another program
     (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
@@ -76,5 +77,5 @@ def _waiting(jobs: list[dict[str, Any]]) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("WHY IT WAITS", overflow="fold")
     for number, job in enumerate(jobs, 1):
-        table.add_row(str(number), job["jobId"][:8], job["jobName"], job.get("statusReason", ""))
+        table.add_row(str(number), job["jobId"][:8], job["jobName"], escape(job.get("statusReason", "")))
     return table

@@ -13,6 +13,10 @@ class EngineError(Exception):
     """The engine can't do what was asked; the message is the reason that the job is given."""
 
 
+class NotYet(EngineError):
+    """A launch has to wait; the message says for what. It will be asked for again."""
+
+
 @dataclass(frozen=True)
 class Host:
     """A machine (or what is free of it)."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -19,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodePlan, NodeStatus, Plan
+from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
 from shared_store.contract import NodeContract
 from shared_store.layout import Store
@@ -42,7 +42,10 @@ class LocalEngine:
         """
         self.home = home
         self._host = Host(
-            "localhost", cpus or float(os.cpu_count() or 1), tuple(gpus if gpus is not None else _gpus()), _memory()
+            "localhost",
+            cpus or float(os.cpu_count() or 1),
+            tuple(gpus if gpus is not None else visible_gpus()),
+            _memory(),
         )
         self._children: dict[int, subprocess.Popen[bytes]] = {}
 
@@ -250,18 +253,3 @@ def _signal(pid: int, number: int) -> None:
 def _memory() -> int:
     """Memory of the machine in MiB."""
     return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)
-
-
-def _gpus() -> list[str]:
-    """Indices of the GPUs that NVIDIA's driver lists, less those hidden by ``CUDA_VISIBLE_DEVICES``."""
-    if (visible := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
-        return [gpu for gpu in visible.split(",") if gpu.strip()]
-    if not (command := shutil.which("nvidia-smi")):
-        return []
-    try:
-        listed = subprocess.run(
-            [command, "--query-gpu=index", "--format=csv,noheader"], capture_output=True, text=True, timeout=20
-        )
-    except subprocess.TimeoutExpired:
-        return []
-    return listed.stdout.split() if listed.returncode == 0 else []

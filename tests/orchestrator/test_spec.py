@@ -41,7 +41,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
 
 LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
-TASKS = "(known: Ant, Cartpole, Humanoid, Quadruped; your own: module:Class)"
+TASKS = "(known: Ant, Cartpole, CartpolePixels, Humanoid, Quadruped; your own: module:Class)"
 TOP = (
     "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, retry, "
     "on_child_failure, timeout, stall_timeout"
@@ -307,7 +307,7 @@ def test_a_task_of_one_s_own_is_taken_by_module_and_class() -> None:
 
 
 def test_the_known_tasks_are_the_installed_ones() -> None:
-    assert known_tasks() == ["Ant", "Cartpole", "Humanoid", "Quadruped"]
+    assert known_tasks() == ["Ant", "Cartpole", "CartpolePixels", "Humanoid", "Quadruped"]
 
 
 def test_there_is_a_spec_to_copy() -> None:

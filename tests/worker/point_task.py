@@ -41,6 +41,7 @@ class PointConfig:
     sleep: float = 0.0
     """How long a step takes [s]."""
     nan_limit: float = 0.1
+    curriculum: Mapping[str, list[list[float]]] = field(default_factory=dict)
     ppo: PointPPO = field(default_factory=PointPPO)
 
 

@@ -55,7 +55,12 @@ def test_the_level_scales_the_quadrupeds_commands() -> None:
 @pytest.mark.parametrize(
     ("curriculum", "message"),
     [
-        ({"forwards": [[0, 1.0]]}, "curriculum: there is no 'forwards'; there are level, forward, heading,"),
+        (
+            {"forwards": [[0, 1.0]]},
+            "curriculum: there is no 'forwards'; did you mean forward? there are level, forward,",
+        ),
+        ({"forward": [[-1, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up, got [[-1, 1.0]]"),
+        ({"forward": [[2.5, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up"),
         ({"forward": 3}, "curriculum.forward: expected points [iteration, value], got 3"),
         ({"forward": [[0, "x"]]}, "curriculum.forward: expected points [iteration, value], got [[0, 'x']]"),
         ({"forward": [[5, 1.0], [5, 2.0]]}, "curriculum.forward: the iterations of its points must grow"),

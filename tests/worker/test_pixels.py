@@ -92,7 +92,7 @@ def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> Non
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"camera": {"samples": 0}}, "camera.samples: expected at least 1, got 0"),
+        ({"camera": {"samples": 0}}, "camera.samples: expected 1 to 64, got 0"),
         ({"camera": {"fov": 4.0}}, "camera.fov: expected an angle between 0 and pi"),
         ({"camera": {"target": [0.0, -3.2, 1.4]}}, "camera.target: the camera stands there"),
         ({"camera": {"position": [0.0, 1.0]}}, "camera.position: expected [x, y, z], got [0.0, 1.0]"),

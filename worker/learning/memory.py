@@ -65,7 +65,7 @@ def within_memory(
 
 def _is_out_of_memory(error: Exception) -> bool:
     known = isinstance(error, MemoryError | torch.OutOfMemoryError)
-    return known or "Failed to allocate" in str(error) or "out of memory" in str(error)
+    return known or any(text in str(error) for text in ("Failed to allocate", "out of memory", "can't allocate memory"))
 
 
 def free_bytes(gang: Gang) -> int:

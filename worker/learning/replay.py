@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ class Replay:
         share = self._ppo.share
         content = {
             "iteration": iteration,
+            "directory": os.getcwd(),
             "began": list(self._began),
             "train": self._section,
             "seed": self._seed,

@@ -26,6 +26,7 @@ from worker.learning.recording import HostCopy, Recorded
 from worker.learning.replay import Replay
 from worker.learning.report import Report, Stopwatch
 from worker.learning.state import TrainingState
+from worker.tasks.config import value_at
 
 if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
@@ -221,12 +222,12 @@ class Runner:
         total, iteration = self.ppo.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
-        first = f"first world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
+        first = f"world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
                 more = "; from now on only counted" if self._warnings == WARNINGS else ""
-                self._say(f"warning: iteration {iteration}: {resets} resets of worlds, {first}{more}")
+                self._say(f"warning: iteration {iteration}: {resets} resets of worlds, among them {first}{more}")
             return
         files = [self.job.run.replays / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
@@ -238,7 +239,7 @@ class Runner:
         self.gang.greatest(0)  # nobody ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
-            f"{resets} resets of worlds, {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
+            f"{resets} resets of worlds, among them {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
             f"See it happen again: python -m worker.replay {files[rank]}{where}{problem}",
         )
 
@@ -286,6 +287,10 @@ class Runner:
             "iteration_seconds": collect + learn,
             "stall_seconds": stall,  # of the save before this iteration, 0 where there was none
             "total_seconds": self.state.seconds,
+            **{
+                f"curriculum_{name}": value_at(points, progress.iteration - 1)
+                for name, points in self.config.curriculum.items()
+            },
             **{
                 name: _figure(name, value, finished)
                 for name, value in zip(self.task.statistic_names[3:], others, strict=True)

@@ -48,9 +48,9 @@ class CameraConfig:
     """Rays of each pixel; with 4 or more, edges that move by less than a pixel are seen to move."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "frames", "samples"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"camera.{name}: expected at least 1, got {getattr(self, name)}")
+        for name, most in (("width", 1024), ("height", 1024), ("frames", 16), ("samples", 64)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"camera.{name}: expected 1 to {most}, got {getattr(self, name)}")
         if not 0.0 < self.fov < math.pi:
             raise ValueError(f"camera.fov: expected an angle between 0 and pi [rad], got {self.fov}")
         for name in ("position", "target"):

@@ -134,10 +134,14 @@ def _check_curriculum(curriculum: Mapping[str, Any], terms: Mapping[str, float])
         raise ValueError(f"curriculum: expected a mapping from names to points, got {curriculum!r}")
     for name, points in curriculum.items():
         if name != "level" and name not in terms:
-            raise ValueError(f"curriculum: there is no {name!r}; there are level, {', '.join(terms)}")
+            near = difflib.get_close_matches(str(name), ["level", *terms], n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise ValueError(f"curriculum: there is no {name!r}; {hint}there are level, {', '.join(terms)}")
         shaped = isinstance(points, list | tuple) and points and all(isinstance(p, list | tuple) for p in points)
         if not shaped or not all(len(point) == 2 and all(map(_is_finite, point)) for point in points):
             raise ValueError(f"curriculum.{name}: expected points [iteration, value], got {points!r}")
+        if any(not float(point[0]).is_integer() or point[0] < 0 for point in points):
+            raise ValueError(f"curriculum.{name}: an iteration is a whole number from 0 up, got {points!r}")
         if any(after[0] <= before[0] for before, after in itertools.pairwise(points)):
             raise ValueError(f"curriculum.{name}: the iterations of its points must grow, got {points!r}")
         if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):

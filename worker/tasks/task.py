@@ -103,10 +103,12 @@ class Task:
         camera = getattr(config, "camera", None)
         if config.randomize.scene and camera is None:
             raise ValueError(
-                f"randomize: {', '.join(config.randomize.scene)}: task {type(self).__name__} has no camera"
+                f"config.randomize: {', '.join(config.randomize.scene)}: task {type(self).__name__} has no camera"
             )
         if config.randomize.observation_noise and camera is not None:
-            raise ValueError("randomize.observation_noise: it is for numbers, not for images; use light and colors")
+            raise ValueError(
+                "config.randomize.observation_noise: it is for numbers, not for images; use light and colors"
+            )
         self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
         self.statistic_names: tuple[str, ...] = (
