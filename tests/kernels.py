@@ -26,7 +26,7 @@ def main() -> int:
     """One process a task, since Warp compiles on one core; the worst exit code."""
     building = [
         subprocess.Popen([sys.executable, "-c", BUILD.format(name=name)], cwd=REPOSITORY)
-        for name in ("Cartpole", "Ant", "Humanoid", "Quadruped")
+        for name in ("Cartpole", "CartpolePixels", "Ant", "Humanoid", "Quadruped")
     ]
     return max(process.wait() for process in building)
 
