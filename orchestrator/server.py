@@ -15,7 +15,8 @@ from orchestrator.api.limits import RATE, RateLimit
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
-from orchestrator.engines.local import LocalEngine
+from orchestrator.engines import make_engine
+from orchestrator.engines.base import EngineError
 from orchestrator.home import HomeLock, ServerError
 from orchestrator.keys import KeyStore
 from shared_store.layout import Store
@@ -38,16 +39,21 @@ class Server:
         submit_rate_limit: int = 0,
         database: str | None = None,
         retention: float | None = None,
+        engine: str = "local",
     ) -> None:
         """Take the lock, the port, the store and the database, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
-        jobs is kept; None: for ever.
+        jobs is kept; None: for ever. ``engine``: what starts the nodes, one of :data:`orchestrator.engines.ENGINES`.
 
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
+        try:
+            nodes = make_engine(engine, home, cpus, gpus)
+        except EngineError as error:
+            raise ServerError(str(error)) from None
         self.access = Access(KeyStore(home), token, exposed=not is_loopback(host))
         _check_exposure(host, self.access)
         try:
@@ -67,7 +73,7 @@ class Server:
             self._lock.release()
             raise
         self.bus = Bus(home)
-        self.controller = Controller(found, LocalEngine(home, cpus, gpus), self.store, self.bus, retention=retention)
+        self.controller = Controller(found, nodes, self.store, self.bus, retention=retention)
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]
         self.url = (

@@ -21,6 +21,12 @@ from orchestrator.home import ServerError, local_url, muster_home
 from orchestrator.spec import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
+EngineOption = Annotated[
+    str,
+    typer.Option(
+        help="What runs the nodes: local (processes of this machine) or docker (containers of the job's image)."
+    ),
+]
 CpusOption = Annotated[
     float | None, typer.Option(min=0.1, help="CPU cores to hand out; those of the machine by default.")
 ]
@@ -31,13 +37,19 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster serve --store /mnt/efs/muster")(serve)
 
 
-def run(spec: SpecArgument, set_: SetOption = None, store: StoreOption = None, cpus: CpusOption = None) -> None:
+def run(
+    spec: SpecArgument,
+    set_: SetOption = None,
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+    engine: EngineOption = "local",
+) -> None:
     """Run a job to its end, with a controller of its own where none is running; exit with its result.
 
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
     loaded = specfile.load(spec, set_)
-    with controller(store, cpus) as connect:
+    with controller(store, cpus, engine) as connect:
         client = connect()
         job = submit_spec(client, loaded, spec)["jobId"]
         code = see_through(client, job)
@@ -63,6 +75,7 @@ def serve(
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free port.")] = 8080,
     store: StoreOption = None,
     cpus: CpusOption = None,
+    engine: EngineOption = "local",
     database: Annotated[
         str | None,
         typer.Option(
@@ -91,6 +104,7 @@ def serve(
         store=store,
         token=os.environ.get("MUSTER_TOKEN"),
         cpus=cpus,
+        engine=engine,
         rate_limit=rate_limit,
         submit_rate_limit=submit_rate_limit,
         database=database,
@@ -114,12 +128,12 @@ def serve(
 
 
 @contextlib.contextmanager
-def controller(store: str | None, cpus: float | None) -> Iterator[Callable[[], Client]]:
+def controller(store: str | None, cpus: float | None, engine: str = "local") -> Iterator[Callable[[], Client]]:
     """A function that connects to the controller of this home directory, or brings one where there is none (any more)."""
     with contextlib.ExitStack() as stack:
 
         def connect() -> Client:
-            client = stack.enter_context(_controller(store, cpus))
+            client = stack.enter_context(_controller(store, cpus, engine))
             client.successor = connect
             return client
 
@@ -127,7 +141,7 @@ def controller(store: str | None, cpus: float | None) -> Iterator[Callable[[], C
 
 
 @contextlib.contextmanager
-def _controller(store: str | None, cpus: float | None) -> Iterator[Client]:
+def _controller(store: str | None, cpus: float | None, engine: str) -> Iterator[Client]:
     """A client of the controller that serves this home directory, or of a new one in this process."""
     url = os.environ.get("MUSTER_URL") or local_url()
     if url:
@@ -145,7 +159,7 @@ def _controller(store: str | None, cpus: float | None) -> Iterator[Client]:
                 raise
     from orchestrator.server import Server
 
-    server = Server(muster_home(), store=store, cpus=cpus)
+    server = Server(muster_home(), store=store, cpus=cpus, engine=engine)
     server.start()
     try:
         with Client(server.url, server.access.own_token) as client:  # it may have keys, and this command none of them

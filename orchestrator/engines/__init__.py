@@ -1,1 +1,35 @@
-"""What starts processes on machines: one module an engine, all behind :class:`orchestrator.engines.base.Engine`."""
+"""Engines: what starts gangs on machines, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from orchestrator.engines.base import Engine, EngineError
+
+ENGINES = ("local", "docker")
+
+
+def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> Engine:
+    """The engine called ``name``.
+
+    Args:
+        name: One of :data:`ENGINES`.
+        home: ``$MUSTER_HOME``.
+        cpus: CPU cores to hand out; all by default.
+        gpus: Ids of the GPUs to hand out; all by default.
+
+    Raises:
+        EngineError: There is none, it is not installed, or it does not answer; one line with what to do.
+    """
+    if name == "local":
+        from orchestrator.engines.local import LocalEngine
+
+        return LocalEngine(home, cpus, gpus)
+    if name == "docker":
+        try:
+            from orchestrator.engines.docker import DockerEngine
+        except ModuleNotFoundError as error:
+            raise EngineError("the docker engine is not installed: pip install 'muster[docker]'") from error
+        return DockerEngine(home, cpus, gpus)
+    raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")

@@ -106,15 +106,19 @@ class LocalEngine:
 
     def observe(self, handle: str) -> GangStatus:
         state = json.loads(handle)
+        if "nodes" not in state:
+            return [NodeStatus(False, address, None, "another engine started it") for address in state["addresses"]]
         return [self._observe_node(state["gang"], index, node) for index, node in enumerate(state["nodes"])]
 
     def stop(self, handle: str, grace: float) -> None:
         state = json.loads(handle)
         deadline = time.monotonic() + grace
-        for node in state["nodes"]:
+        for node in state.get("nodes", []):
             if _alive(node["pid"], node["start"]):
                 _signal(node["pid"], signal.SIGTERM)
-        while any(_alive(node["pid"], node["start"]) for node in state["nodes"]) and time.monotonic() < deadline:
+        while (
+            any(_alive(node["pid"], node["start"]) for node in state.get("nodes", [])) and time.monotonic() < deadline
+        ):
             time.sleep(0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
         _end(state["gang"])

@@ -41,27 +41,24 @@ def test_what_fits_goes_on_and_other_errors_stay_what_they_are() -> None:
         raise RuntimeError("something else")
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
-        RuntimeError("Failed to allocate 123 bytes on device 'cuda:0'"),
-        MemoryError(),
-    ],
+FULL = (
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+    RuntimeError("Failed to allocate 123 bytes on device 'cuda:0'"),
+    RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 27648000000 bytes"),
+    MemoryError(),
 )
-def test_an_allocation_that_fails_is_told_as_what_it_is(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    with (
-        pytest.raises(
-            UserError, match=r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
-        ),
-        memory.within_memory(Cartpole, CONFIG, 64, HERE),
-    ):
+
+
+def test_an_allocation_that_fails_is_told_as_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert all(memory._is_out_of_memory(error) for error in FULL)
+    assert not memory._is_out_of_memory(RuntimeError("shapes do not fit"))
+    error = FULL[0]
+    there = r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
+    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
     monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
-    with (
-        pytest.raises(UserError, match=r"than the 0.0 GB that are free: about 0.0 GB. About \d+ fit: set `worlds`$"),
-        memory.within_memory(Cartpole, CONFIG, 64, HERE),
-    ):
+    little = r"than the 0.0 GB that are free: about 0.0 GB. About \d+ fit: set `worlds`$"
+    with pytest.raises(UserError, match=little), memory.within_memory(Cartpole, CONFIG, 64, HERE):
         raise error
     with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, 64, HERE, lambda: False):
         raise error  # long after the start: not the worlds' fault, and not the user's

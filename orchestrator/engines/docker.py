@@ -1,0 +1,393 @@
+"""The Docker engine: nodes are containers of the job's own image, on a private network of their gang's own.
+
+What AWS Batch will run, tried at home first. In an image that has Muster in it (label ``muster.version``) the command runs under the
+supervisor, with the store at ``/muster/store``; in any other it runs plainly, and this engine writes its log and its outcome.
+Containers and networks carry the gang's name as a label: a restarted controller finds them by it. They go when the gang is stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import docker
+from docker.errors import APIError, DockerException, ImageNotFound, NotFound
+from docker.models.containers import Container
+from docker.models.images import Image
+from docker.models.networks import Network
+from docker.types import DeviceRequest, IPAMConfig, IPAMPool, Mount, Ulimit
+
+from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodePlan, NodeStatus, NotYet, Plan
+from orchestrator.engines.gpus import visible_gpus
+from orchestrator.engines.mounts import mounts_of
+from shared_store.contract import NodeContract
+from shared_store.layout import Store
+from shared_store.logs import format_line
+from shared_store.outcomes import Outcome, read_outcome, write_outcome
+
+STORE, KERNELS = "/muster/store", "/muster/kernels"
+"""Where a container of an image with Muster finds the store and the cache of compiled kernels."""
+_GANG, _NODE = "muster.gang", "muster.node"
+"""Labels of containers and networks."""
+_REMEMBERED = 256
+"""Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
+_PORT = 29500
+_TRIES = 64
+"""Subnets that are tried before a gang can't be started: others on this machine may hold some."""
+
+
+class DockerEngine:
+    """One machine's Docker Engine."""
+
+    name = "docker"
+
+    def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
+        """Args:
+        home: ``$MUSTER_HOME``; the kernel cache goes below it.
+        cpus: CPU cores to hand out; the engine's by default.
+        gpus: Ids of the GPUs to hand out; those that the driver lists by default.
+
+        Raises:
+            EngineError: No Docker Engine answers.
+        """
+        try:
+            self._client = docker.from_env(timeout=120)
+            info = self._client.info()
+        except (DockerException, OSError) as error:
+            raise EngineError(
+                f"no Docker Engine answers ({error}); start it (systemctl start docker), or set DOCKER_HOST"
+            ) from error
+        self._cores = float(info["NCPU"])
+        self._host = Host(
+            info["Name"],
+            cpus or self._cores,
+            tuple(gpus if gpus is not None else visible_gpus()),
+            int(info["MemTotal"] / 2**20),
+        )
+        self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
+        self._pulls: dict[str, Future[Image]] = {}
+        self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
+        self._copies: dict[str, threading.Thread] = {}
+        self._ended: dict[str, dict[int, NodeStatus]] = {}
+
+    def capacity(self) -> Sequence[Host]:
+        return [self._host]
+
+    def plan(self, gang: Gang) -> Plan:
+        """With the addresses of the first subnet that would be tried."""
+        return Plan(gang, _nodes(gang, _addresses(_subnet(gang.name, 0), len(gang.placements))))
+
+    def launch(self, plan: Plan) -> str:
+        gang = plan.gang
+        images = [self._image(str(container.get("image") or "")) for container in gang.containers]
+        there = self._containers(gang.name)
+        network, subnet = self._network(gang.name)
+        addresses = _addresses(subnet, len(gang.placements))
+        nodes = _nodes(gang, addresses)
+        run = Store(gang.store).run(gang.run)
+        facts = {**_facts(gang), "addresses": addresses}
+        try:
+            for index in sorted(range(len(nodes)), key=lambda index: index != gang.main):
+                if index in there:
+                    if there[index].status == "created":  # the controller was killed between the two
+                        there[index].start()
+                elif read_outcome(run, gang.job, gang.attempt, index) is None:
+                    container = self._create(gang, nodes[index], images[index], network, addresses[index])
+                    container.start()
+                    self._follow(container, facts, index)
+        except APIError as error:
+            self._remove(gang.name)  # never half a gang
+            raise EngineError(f"CannotStartContainerError: Error response from daemon: {error.explanation}") from error
+        except BaseException:
+            self._remove(gang.name)
+            raise
+        return json.dumps(facts)
+
+    def observe(self, handle: str) -> GangStatus:
+        facts = json.loads(handle)
+        if "addresses" not in facts:
+            return [NodeStatus(False, "", None, "another engine started it") for _ in facts["nodes"]]
+        found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
+        status = []
+        for index, address in enumerate(facts["addresses"]):
+            container = found.get(index)
+            if container is None:
+                status.append(ended.get(index) or NodeStatus(False, address))
+                continue
+            self._follow(container, facts, index)
+            status.append(self._status(container, facts, index, address))
+        return status
+
+    def stop(self, handle: str, grace: float) -> None:
+        facts = json.loads(handle)
+        found = self._containers(facts["gang"])
+        if found:
+            with ThreadPoolExecutor(len(found)) as pool:
+                list(pool.map(lambda container: _stop(container, grace), found.values()))
+        self._ended[facts["gang"]] = dict(enumerate(self.observe(handle)))
+        while len(self._ended) > _REMEMBERED:
+            del self._ended[next(iter(self._ended))]
+        self._remove(facts["gang"])
+
+    # -- starting -----------------------------------------------------------------------------------------------------
+
+    def _image(self, name: str) -> Image:
+        """The image; where it is not here it is pulled meanwhile. Raises NotYet, and EngineError in AWS's words."""
+        try:
+            return self._client.images.get(name)
+        except ImageNotFound:
+            pass
+        except (APIError, DockerException) as error:
+            raise EngineError(f"CannotInspectContainerError: image {name!r}: {error}") from error
+        pull = self._pulls.setdefault(name, self._puller.submit(self._client.images.pull, name))
+        if not pull.done():
+            raise NotYet(f"pulling image {name}")
+        del self._pulls[name]
+        try:
+            return pull.result()
+        except (APIError, DockerException) as error:
+            why = error.explanation if isinstance(error, APIError) and error.explanation else str(error)
+            raise EngineError(f"CannotPullContainerError: Error response from daemon: {why}") from error
+
+    def _network(self, gang: str) -> tuple[Network, str]:
+        """The gang's network and its subnet, ``a.b.c.0/24``."""
+        for network in self._client.networks.list(filters={"label": f"{_GANG}={gang}"}):
+            return network, network.attrs["IPAM"]["Config"][0]["Subnet"]
+        problem = ""
+        for salt in range(_TRIES):
+            subnet = _subnet(gang, salt)
+            try:
+                network = self._client.networks.create(
+                    f"muster-{gang.replace('/', '-')}",
+                    driver="bridge",
+                    ipam=IPAMConfig(pool_configs=[IPAMPool(subnet=subnet)]),
+                    labels={_GANG: gang},
+                )
+                return network, subnet
+            except APIError as error:
+                problem = error.explanation or str(error)
+                if "overlaps" not in problem:
+                    break
+        raise EngineError(f"no network for the gang: {problem}")
+
+    def _create(self, gang: Gang, node: NodePlan, image: Image, network: Network, address: str) -> Container:
+        container = gang.containers[node.contract.node_index]
+        supervised = "muster.version" in (image.labels or {})
+        entrypoint = list((image.attrs.get("Config") or {}).get("Entrypoint") or [])
+        options = {**_limits(container, node, self._cores), **_linux(container)}
+        mounts = [Mount(m.target, m.source, "bind", read_only=m.read_only) for m in mounts_of(container, gang.store)]
+        environment = {**node.environment, **node.contract.to_env()}
+        if supervised:
+            self._kernels.mkdir(parents=True, exist_ok=True)
+            mounts += [Mount(STORE, gang.store, "bind"), Mount(KERNELS, str(self._kernels), "bind")]
+            environment = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **environment}
+            # whoever owns the store writes it; that is seldom the user that the image names
+            owner = Path(gang.store).stat()
+            options.setdefault("user", f"{owner.st_uid}:{owner.st_gid}")
+            command = [*entrypoint, *node.command]
+            entrypoint = ["python", "-P", "-m", "worker.supervisor", "--"]
+        else:
+            command = list(node.command)
+        return self._client.containers.create(
+            image,
+            command,
+            entrypoint=entrypoint or None,
+            name=f"muster-{gang.name.replace('/', '-')}-{node.contract.node_index}",
+            hostname=f"node-{node.contract.node_index}",
+            environment=environment,
+            labels={_GANG: gang.name, _NODE: str(node.contract.node_index), "muster.plain": "" if supervised else "1"},
+            mounts=mounts,
+            network=network.name,
+            networking_config={network.name: self._client.api.create_endpoint_config(ipv4_address=address)},
+            **options,
+        )
+
+    # -- watching -----------------------------------------------------------------------------------------------------
+
+    def _containers(self, gang: str) -> dict[int, Container]:
+        found = self._client.containers.list(all=True, filters={"label": f"{_GANG}={gang}"}, ignore_removed=True)
+        return {int(container.labels[_NODE]): container for container in found}
+
+    def _status(self, container: Container, facts: Mapping[str, Any], index: int, address: str) -> NodeStatus:
+        state = container.attrs["State"]
+        if state["Status"] in ("created", "running", "paused", "restarting"):
+            return NodeStatus(True, address)
+        code, detail = int(state["ExitCode"]), state.get("Error") or ""
+        if state.get("OOMKilled"):
+            detail = "OutOfMemoryError: Container killed due to memory usage"
+        if container.labels.get("muster.plain"):
+            self._settle(facts, index, state, detail)
+        elif code and not detail:
+            detail = container.logs(tail=1).decode(errors="replace").strip()
+        return NodeStatus(False, address, code, detail)
+
+    def _settle(self, facts: Mapping[str, Any], index: int, state: Mapping[str, Any], detail: str) -> None:
+        """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written."""
+        copy = self._copies.get(f"{facts['gang']}/{index}")
+        if copy is not None:
+            copy.join(timeout=10.0)
+        run = Store(facts["store"]).run(facts["run"])
+        if read_outcome(run, facts["job"], facts["attempt"], index) is not None or not run.path.exists():
+            return
+        code = int(state["ExitCode"])
+        reason = detail or ("done" if code == 0 else f"container exited with code {code}")
+        ended = time.time()
+        write_outcome(
+            run, facts["job"], facts["attempt"], Outcome(index, facts["epoch"], code, None, reason, None, ended, ended)
+        )
+
+    def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
+        """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
+        key = f"{facts['gang']}/{index}"
+        if not container.labels.get("muster.plain") or key in self._copies:
+            return
+        run = Store(facts["store"]).run(facts["run"])
+        if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
+            return
+        log = run.log(facts["job"], facts["attempt"], index)
+        copy = threading.Thread(target=_copy_log, args=(container, log), name=f"log {key}", daemon=True)
+        self._copies[key] = copy
+        copy.start()
+
+    def _remove(self, gang: str) -> None:
+        for container in self._containers(gang).values():
+            try:
+                container.remove(force=True)
+            except NotFound:
+                pass
+        for network in self._client.networks.list(filters={"label": f"{_GANG}={gang}"}):
+            try:
+                network.remove()
+            except APIError:
+                pass  # a container that is still going; the next stop removes it
+        for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
+            del self._copies[key]
+
+
+def _facts(gang: Gang) -> dict[str, Any]:
+    """What a handle remembers."""
+    return {
+        "gang": gang.name,
+        "job": gang.job,
+        "attempt": gang.attempt,
+        "epoch": gang.epoch,
+        "run": gang.run,
+        "store": gang.store,
+    }
+
+
+def _nodes(gang: Gang, addresses: Sequence[str]) -> list[NodePlan]:
+    nodes = []
+    for index, placement in enumerate(gang.placements):
+        contract = NodeContract(
+            job=gang.job,
+            attempt=gang.attempt,
+            node_index=index,
+            node_count=len(gang.placements),
+            main_index=gang.main,
+            master_address=addresses[gang.main],
+            master_port=_PORT,
+            run=gang.run,
+            store=STORE,
+            epoch=gang.epoch,
+            job_epoch=gang.job_epoch,
+            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
+            grace=gang.grace,
+            queue=gang.queue,
+            compute_environment=gang.pool,
+            is_gang=gang.is_gang,
+            array=gang.array,
+            cpus=placement.cpus,
+            stall_timeout=gang.stall_timeout,
+            address=addresses[index],
+        )
+        nodes.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
+    return nodes
+
+
+def _subnet(gang: str, salt: int) -> str:
+    """One of 8,192 networks of 10.192.0.0/11, by the gang's name; another one for each ``salt``."""
+    digest = hashlib.sha256(f"{gang}#{salt}".encode()).digest()
+    return f"10.{192 + digest[0] % 32}.{digest[1]}.0/24"
+
+
+def _addresses(subnet: str, count: int) -> list[str]:
+    """The nodes' addresses; the first of the subnet is the network's gateway."""
+    if count > 250:
+        raise EngineError(f"{count} nodes: the docker engine has room for 250 on a gang's network")
+    return [f"{subnet.rpartition('.')[0]}.{index + 2}" for index in range(count)]
+
+
+def _limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[str, Any]:
+    """Cores, memory and GPUs of a node, as Docker's options."""
+    placement = node.placement
+    options: dict[str, Any] = {
+        "nano_cpus": int(min(placement.cpus, cores) * 1e9),
+        "mem_limit": f"{placement.memory}m",
+    }
+    if placement.gpus:
+        options["device_requests"] = [DeviceRequest(device_ids=list(placement.gpus), capabilities=[["gpu"]])]
+    ulimits = container.get("ulimits") or []
+    options["ulimits"] = [Ulimit(name=u["name"], soft=u["softLimit"], hard=u["hardLimit"]) for u in ulimits]
+    return options
+
+
+def _linux(container: Mapping[str, Any]) -> dict[str, Any]:
+    """What else ``containerProperties`` say, as Docker's options."""
+    linux = container.get("linuxParameters") or {}
+    options: dict[str, Any] = {"init": bool(linux.get("initProcessEnabled"))}
+    if size := linux.get("sharedMemorySize"):
+        options["shm_size"] = f"{size}m"
+    if tmpfs := linux.get("tmpfs"):
+        options["tmpfs"] = {
+            entry["containerPath"]: ",".join([f"size={entry['size']}m", *(entry.get("mountOptions") or [])])
+            for entry in tmpfs
+        }
+    if user := container.get("user"):
+        options["user"] = user
+    if container.get("privileged"):
+        options["privileged"] = True
+    if container.get("readonlyRootFilesystem"):
+        options["read_only"] = True
+    return options
+
+
+def _stop(container: Container, grace: float) -> None:
+    """SIGTERM, ``grace`` seconds later SIGKILL; a paused one can't be asked."""
+    try:
+        if container.status == "paused":
+            container.unpause()
+            container.kill()
+        elif container.status == "created":
+            return
+        else:
+            container.stop(timeout=int(max(1.0, grace)))
+    except (NotFound, APIError):
+        pass  # it ended meanwhile, or is being removed
+
+
+def _copy_log(container: Container, log: Path) -> None:
+    """Append what a container prints to ``log`` until it ends; what is there already is not copied twice."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    copied = log.read_bytes().count(b"\n") if log.exists() else 0
+    with open(log, "a", encoding="utf-8", errors="backslashreplace") as file:
+        for number, line in enumerate(_lines(container)):
+            if number >= copied:
+                file.write(format_line(time.time(), 0, "o", line))
+                file.flush()
+
+
+def _lines(container: Container) -> Iterator[str]:
+    rest = b""
+    for chunk in container.logs(stream=True, follow=True):
+        *whole, rest = (rest + chunk).split(b"\n")
+        yield from (line.decode(errors="backslashreplace") for line in whole)
+    if rest:
+        yield rest.decode(errors="backslashreplace")

@@ -1,0 +1,240 @@
+"""The Docker engine on a real one: containers, their network and limits, found again, stopped, and gone."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower
+from shared_store.outcomes import read_outcome
+from tests.conftest import wait_for
+from tests.engines.conftest import PATH, PLAIN, SUPERVISED, host_files
+
+JOB = "docker-engine-job"
+WAIT = "echo ready; exec sleep 600"
+
+
+class Bench:
+    """An engine with a home and a store of its own, and the gangs that it started."""
+
+    def __init__(self, client: Any, home: Path) -> None:
+        self.client, self.home = client, home
+        self.store = Store(home / "store").open()
+        self.engine = self.another()
+        self.handles: list[str] = []
+        run = self.store.run("run")
+        run.create({"run": "run"})
+        raise_epoch(run, 1)
+
+    def another(self) -> Any:
+        """As a controller that was started again has it."""
+        from orchestrator.engines.docker import DockerEngine
+
+        return DockerEngine(self.home / "home", gpus=[])
+
+    def gang(self, script: str = WAIT, nodes: int = 2, image: str = PLAIN, **container: Any) -> Gang:
+        changes = {name: container.pop(name) for name in ("attempt", "is_gang", "memory", "main") if name in container}
+        memory = changes.pop("memory", 256)
+        return Gang(
+            job=JOB,
+            attempt=changes.pop("attempt", 1),
+            epoch=1,
+            job_epoch=1,
+            run="run",
+            store=str(self.store.path),
+            queue="default",
+            pool="docker",
+            main=changes.pop("main", 0),
+            commands=[["sh", "-c", script]] * nodes,
+            environments=[{"PATH": PATH, "GREETING": "hello"}] * nodes,
+            placements=[Placement("here", (), 0.5, memory)] * nodes,
+            grace=5.0,
+            directory=None,
+            containers=[{"image": image, **host_files(), **container}] * nodes,
+            **changes,
+        )
+
+    def launch(self, gang: Gang) -> str:
+        handle: str = self.engine.launch(self.engine.plan(gang))
+        self.handles.append(handle)
+        return handle
+
+    def ended(self, handle: str, engine: Any = None) -> list[NodeStatus]:
+        def over() -> list[NodeStatus] | None:
+            status = (engine or self.engine).observe(handle)
+            return status if not any(node.running for node in status) else None
+
+        return wait_for(over, 30, "the gang's end")  # type: ignore[no-any-return]
+
+    def log(self, attempt: int = 1) -> list[str]:
+        lines = LogFollower(self.store.run("run"), JOB).drain()
+        return [line.text for line in lines if line.attempt == attempt]
+
+    def left(self) -> tuple[int, int]:
+        """Containers and networks of the gangs of these tests."""
+        mine = {"label": "muster.gang"}
+        containers = [c for c in self.client.containers.list(all=True, filters=mine) if JOB in c.labels["muster.gang"]]
+        networks = [n for n in self.client.networks.list(filters=mine) if JOB in n.name]
+        return len(containers), len(networks)
+
+
+@pytest.fixture
+def bench(docker_client: Any, tmp_path: Path) -> Iterator[Bench]:
+    found = Bench(docker_client, tmp_path)
+    yield found
+    for handle in found.handles:
+        found.engine.stop(handle, 0.0)
+    assert found.left() == (0, 0)
+
+
+def test_a_plain_image_runs_plainly_and_its_log_and_outcome_are_in_the_store(bench: Bench) -> None:
+    handle = bench.launch(bench.gang('echo "$GREETING from $AWS_BATCH_JOB_NODE_INDEX of $NNODES"; exit $NODE_RANK', 3))
+    status = bench.ended(handle)
+    assert [node.exit_code for node in status] == [0, 1, 2]
+    assert sorted(bench.log()) == [f"hello from {index} of 3" for index in range(3)]
+    outcomes = [read_outcome(bench.store.run("run"), JOB, 1, index) for index in range(3)]
+    assert [(o.exit_code, o.reason) for o in outcomes if o] == [
+        (0, "done"),
+        (1, "container exited with code 1"),
+        (2, "container exited with code 2"),
+    ]
+    bench.engine.stop(handle, 1.0)
+    assert bench.left() == (0, 0)
+    assert [node.exit_code for node in bench.engine.observe(handle)] == [0, 1, 2], "told to the end"
+
+
+def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_told(bench: Bench) -> None:
+    script = (
+        "import os, socket, sys, time\n"
+        "here, main = os.environ['MUSTER_ADDRESS'], os.environ['MASTER_ADDR']\n"
+        "if os.environ['NODE_RANK'] == '0':\n"
+        "    assert 'AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS' not in os.environ and here == main\n"
+        "    s = socket.create_server((here, int(os.environ['MASTER_PORT']))); c, peer = s.accept(); print('met', peer[0])\n"
+        "else:\n"
+        "    assert os.environ['AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS'] == main != here\n"
+        "    for _ in range(100):\n"
+        "        try: socket.create_connection((main, int(os.environ['MASTER_PORT']))); break\n"
+        "        except OSError: time.sleep(0.1)\n"
+    )
+    gang = bench.gang(f"exec python3 -c '{script.replace(chr(39), chr(34))}'", 2, main=1)
+    handle = bench.launch(gang)
+    assert [node.exit_code for node in bench.ended(handle)] == [0, 0], bench.log()
+    addresses = json.loads(handle)["addresses"]
+    assert bench.log() == [f"met {addresses[0]}"] and addresses[0] != addresses[1]
+    # a second gang has another network, and reaches nobody here
+    other = bench.launch(bench.gang(attempt=2))
+    assert not set(json.loads(other)["addresses"]) & set(addresses)
+
+
+def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> None:
+    (bench.home / "data").mkdir()
+    (bench.home / "data" / "file").write_text("found")
+    files = host_files()
+    files["volumes"] += [{"name": "d", "host": {"sourcePath": str(bench.home / "data")}}]
+    files["volumes"] += [{"name": "efs", "efsVolumeConfiguration": {"fileSystemId": "fs-1"}}]
+    files["mountPoints"] += [{"sourceVolume": "d", "containerPath": "/data", "readOnly": True}]
+    files["mountPoints"] += [{"sourceVolume": "efs", "containerPath": "/mnt/efs"}]
+    script = (
+        "cat /data/file; echo; touch /data/x 2>/dev/null && echo writable; ls /mnt/efs; id -u; ulimit -n; "
+        "df -k /dev/shm | tail -1 | tr -s ' ' | cut -d' ' -f2; touch /no 2>/dev/null || echo read-only"
+    )
+    handle = bench.launch(
+        bench.gang(
+            script,
+            1,
+            user="1234",
+            ulimits=[{"name": "nofile", "softLimit": 321, "hardLimit": 321}],
+            linuxParameters={"sharedMemorySize": 96},
+            readonlyRootFilesystem=True,
+            **files,
+        )
+    )
+    [container] = bench.engine._containers(f"{JOB}/1/1").values()
+    host = container.attrs["HostConfig"]
+    assert (host["NanoCpus"], host["Memory"]) == (500_000_000, 256 * 2**20)
+    assert [node.exit_code for node in bench.ended(handle)] == [0]
+    assert bench.log() == ["found", "runs", "store.json", "1234", "321", str(96 * 1024), "read-only"]
+
+
+def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("exec python3 -c 'x = bytearray(300 << 20); print(len(x))'", 1, memory=64))
+    [node] = bench.ended(handle)
+    if node.exit_code == 0:
+        pytest.skip("THIS KERNEL DOES NOT LIMIT MEMORY")
+    assert (node.exit_code, node.detail) == (137, "OutOfMemoryError: Container killed due to memory usage")
+
+
+def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: Bench) -> None:
+    gang = bench.gang("for i in 1 2 3 4 5 6; do echo line $i; sleep 0.3; done", 2)
+    handle = bench.launch(gang)
+    wait_for(lambda: bench.log(), 10, "the first line")
+    successor = bench.another()
+    assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
+    assert bench.left() == (2, 1)
+    assert [node.exit_code for node in bench.ended(handle, successor)] == [0, 0]
+
+
+def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
+    polite = bench.launch(bench.gang('trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done', 2))
+    wait_for(lambda: bench.log().count("ready") == 2, 20, "both are ready")
+    bench.engine.stop(polite, 10.0)
+    assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75]
+    assert bench.log().count("saved") == 2
+    stubborn = bench.launch(bench.gang('trap "" TERM; echo ready; while :; do sleep 0.05; done', 1, attempt=2))
+    wait_for(lambda: "ready" in bench.log(2), 20, "it is ready")
+    started = time.monotonic()
+    bench.engine.stop(stubborn, 1.0)
+    assert time.monotonic() - started > 0.9
+    assert [node.exit_code for node in bench.engine.observe(stubborn)] == [137] and bench.left() == (0, 0)
+
+
+@pytest.mark.parametrize("blow", [lambda c: c.kill(), lambda c: c.remove(force=True)])
+def test_a_container_that_is_killed_or_removed_is_a_node_that_ended(bench: Bench, blow: Callable[[Any], None]) -> None:
+    handle = bench.launch(bench.gang(nodes=2))
+    blow(bench.engine._containers(f"{JOB}/1/1")[1])
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 10, "its end is seen")
+    assert bench.engine.observe(handle)[0].running
+    assert bench.engine.observe(handle)[1].exit_code in (137, None)
+
+
+def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(bench: Bench) -> None:
+    gang = bench.gang(image="muster-test-missing:1")
+
+    def refused() -> str | None:
+        try:
+            bench.engine.launch(bench.engine.plan(gang))
+        except NotYet as wait:
+            assert str(wait) == "pulling image muster-test-missing:1"
+            return None
+        except EngineError as error:
+            return str(error)
+        raise AssertionError("it was launched")
+
+    assert wait_for(refused, 60, "the pull fails").startswith("CannotPullContainerError: Error response from daemon: ")
+    assert bench.left() == (0, 0)
+
+
+def test_a_command_that_is_not_in_the_image_fails_and_leaves_nothing(bench: Bench) -> None:
+    gang = bench.gang()
+    gang = Gang(**{**gang.__dict__, "commands": [["no-such-program"]] * 2})
+    with pytest.raises(EngineError, match=r"CannotStartContainerError: Error response from daemon: .*no-such-program"):
+        bench.engine.launch(bench.engine.plan(gang))
+    assert bench.left() == (0, 0)
+
+
+def test_with_muster_in_the_image_the_supervisor_writes_log_and_outcome(bench: Bench) -> None:
+    script = "echo rank $RANK of $WORLD_SIZE in $MUSTER_STORE; exit 3"
+    handle = bench.launch(bench.gang(script, 1, image=SUPERVISED))
+    [node] = bench.ended(handle)
+    outcome = read_outcome(bench.store.run("run"), JOB, 1, 0)
+    assert node.exit_code == 3 and outcome is not None, (node, bench.log())
+    assert (outcome.exit_code, outcome.reason) == (3, "rank 0 exited with code 3")
+    assert "rank 0 of 1 in /muster/store" in bench.log()

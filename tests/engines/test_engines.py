@@ -1,0 +1,35 @@
+"""Choosing an engine: mistakes are one line, before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orchestrator.engines import ENGINES, make_engine
+from orchestrator.engines.base import EngineError
+from tests.conftest import run_muster
+
+
+def test_an_unknown_engine_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
+    assert (
+        refused.returncode == 1
+        and refused.stderr == f"muster: there is no engine 'dokcer'; there are {', '.join(ENGINES)}\n"
+    )
+    assert not (tmp_path / "muster.db").exists(), "nothing was made"
+
+
+def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
+    refused = run_muster(
+        "serve", "--port", "0", "--engine", "docker", home=tmp_path, DOCKER_HOST="unix:///nowhere.sock"
+    )
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
+    assert refused.stderr.startswith("muster: no Docker Engine answers (")
+    assert refused.stderr.endswith("start it (systemctl start docker), or set DOCKER_HOST\n")
+
+
+def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
+    assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
+    with pytest.raises(EngineError, match="there is no engine 'slurm'"):
+        make_engine("slurm", tmp_path)
