@@ -97,6 +97,38 @@ class Plan:
     nodes: Sequence[NodePlan]
 
 
+def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan]:
+    """What each node of ``gang`` is told, where node ``i`` has ``addresses[i]`` and the main node's ``port`` is where they meet."""
+    plans = []
+    for index, placement in enumerate(gang.placements):
+        contract = NodeContract(
+            job=gang.job,
+            attempt=gang.attempt,
+            node_index=index,
+            node_count=len(gang.placements),
+            main_index=gang.main,
+            master_address=addresses[gang.main],
+            master_port=port,
+            run=gang.run,
+            store=gang.store,
+            epoch=gang.epoch,
+            job_epoch=gang.job_epoch,
+            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
+            grace=gang.grace,
+            queue=gang.queue,
+            compute_environment=gang.pool,
+            is_gang=gang.is_gang,
+            array=gang.array,
+            cpus=placement.cpus,
+            stall_timeout=gang.stall_timeout,
+            address=addresses[index],
+            bus=gang.bus,
+            bus_token=gang.bus_token,
+        )
+        plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
+    return plans
+
+
 @dataclass(frozen=True)
 class NodeStatus:
     """What the engine knows of one node."""

@@ -7,6 +7,7 @@ Containers and networks carry the gang's name as a label: a restarted controller
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -24,10 +25,19 @@ from docker.models.images import Image
 from docker.models.networks import Network
 from docker.types import DeviceRequest, IPAMConfig, IPAMPool, Mount, Ulimit
 
-from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodePlan, NodeStatus, NotYet, Plan
+from orchestrator.engines.base import (
+    EngineError,
+    Gang,
+    GangStatus,
+    Host,
+    NodePlan,
+    NodeStatus,
+    NotYet,
+    Plan,
+    node_plans,
+)
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
-from shared_store.contract import NodeContract
 from shared_store.layout import Store
 from shared_store.logs import format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
@@ -284,32 +294,8 @@ def _facts(gang: Gang) -> dict[str, Any]:
 
 
 def _nodes(gang: Gang, addresses: Sequence[str]) -> list[NodePlan]:
-    nodes = []
-    for index, placement in enumerate(gang.placements):
-        contract = NodeContract(
-            job=gang.job,
-            attempt=gang.attempt,
-            node_index=index,
-            node_count=len(gang.placements),
-            main_index=gang.main,
-            master_address=addresses[gang.main],
-            master_port=_PORT,
-            run=gang.run,
-            store=STORE,
-            epoch=gang.epoch,
-            job_epoch=gang.job_epoch,
-            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
-            grace=gang.grace,
-            queue=gang.queue,
-            compute_environment=gang.pool,
-            is_gang=gang.is_gang,
-            array=gang.array,
-            cpus=placement.cpus,
-            stall_timeout=gang.stall_timeout,
-            address=addresses[index],
-        )
-        nodes.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
-    return nodes
+    """The controller's bus listens on its machine alone, where containers do not reach it."""
+    return node_plans(dataclasses.replace(gang, store=STORE, bus=None, bus_token=None), addresses, _PORT)
 
 
 def _subnet(gang: str, salt: int) -> str:

@@ -17,10 +17,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodePlan, NodeStatus, Plan
+from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
-from shared_store.contract import NodeContract
 from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
 
@@ -54,34 +53,7 @@ class LocalEngine:
 
     def plan(self, gang: Gang) -> Plan:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
-        nodes = []
-        for index, placement in enumerate(gang.placements):
-            contract = NodeContract(
-                job=gang.job,
-                attempt=gang.attempt,
-                node_index=index,
-                node_count=len(gang.placements),
-                main_index=gang.main,
-                master_address=addresses[gang.main],
-                master_port=_FIRST_PORT,
-                run=gang.run,
-                store=gang.store,
-                epoch=gang.epoch,
-                job_epoch=gang.job_epoch,
-                ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
-                grace=gang.grace,
-                queue=gang.queue,
-                compute_environment=gang.pool,
-                is_gang=gang.is_gang,
-                array=gang.array,
-                cpus=placement.cpus,
-                stall_timeout=gang.stall_timeout,
-                address=addresses[index],
-                bus=gang.bus,
-                bus_token=gang.bus_token,
-            )
-            nodes.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
-        return Plan(gang, nodes)
+        return Plan(gang, node_plans(gang, addresses, _FIRST_PORT))
 
     def launch(self, plan: Plan) -> str:
         gang = plan.gang
