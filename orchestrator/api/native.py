@@ -17,14 +17,18 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
-from orchestrator.api import auth, runs
+from orchestrator.api import auth, rules, runs
+from orchestrator.api.batch import validate
 from orchestrator.api.context import find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import find_job
 from orchestrator.definition import gang_needs
+from orchestrator.engines.base import Gang
+from orchestrator.gangs import GRACE
 from orchestrator.jobs import Status
+from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.tables import Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower
@@ -39,6 +43,13 @@ _POLL = 0.05
 """Seconds between two looks at a log that is followed."""
 _HEARTBEAT = 5.0
 """Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
+
+
+class PlanRequest(BaseModel):
+    """A job that is not submitted."""
+
+    definition: dict[str, Any] = Field(description="a RegisterJobDefinition request of type multinode")
+    queue: str = "default"
 
 
 class ResumeRequest(BaseModel):
@@ -77,6 +88,51 @@ def capacity(request: Request) -> dict[str, Any]:
         "store": str(controller.store.path),
         "queues": queues,
     }
+
+
+@router.post("/plan")
+def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
+    controller = _controller(request)
+    definition = validate("RegisterJobDefinition", body.definition)
+    if definition["type"] != "multinode" or "nodeProperties" not in definition:
+        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
+    needs, hosts = rules.check_nodes(definition["nodeProperties"], complete=True), controller.engine.capacity()
+    placements = place(needs.shape, hosts)
+    if placements is None:
+        raise ClientError(str(never_fits(needs.shape, hosts)))
+    planned = controller.engine.plan(
+        Gang(
+            job="job",
+            attempt=1,
+            epoch=1,
+            job_epoch=1,
+            run=needs.setting("MUSTER_RUN") or "run",
+            store=str(controller.store.path),
+            queue=body.queue,
+            pool="default",
+            main=needs.main,
+            commands=[node.command for node in needs.nodes],
+            environments=[node.environment for node in needs.nodes],
+            placements=placements,
+            grace=GRACE,
+            directory=needs.setting("MUSTER_DIRECTORY") or None,
+            containers=[node.container for node in needs.nodes],
+        )
+    )
+    nodes = [
+        {
+            "index": node.contract.node_index,
+            "rank": node.contract.node_rank,
+            "image": needs.nodes[node.contract.node_index].container.get("image"),
+            **asdict(node.placement),
+            "address": node.contract.address,
+            "command": list(node.command),
+            "environment": {**node.environment, **node.contract.to_env()},
+        }
+        for node in planned.nodes
+    ]
+    return {"engine": controller.engine.name, "nodes": nodes}
 
 
 @router.get("/jobs/{reference}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 import time
 from collections.abc import Mapping
@@ -68,11 +69,17 @@ def submit(
     spec: SpecArgument,
     set_: SetOption = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would start where; --json: with all variables. Nothing starts.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
     loaded = specfile.load(spec, set_)
     with Client.connect() as client:
+        if dry_run:
+            _show_plan(client, loaded, as_json)
+            return
         submitted = submit_spec(client, loaded, spec)
         if as_json:
             typer.echo(json.dumps(submitted))
@@ -82,6 +89,27 @@ def submit(
                 typer.echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
+    """What the controller's engine would start for ``spec``, if all hosts were free."""
+    definition = compile_definition(spec, os.getcwd())
+    plan = client.post("/api/plan", {"definition": definition, "queue": spec.queue})
+    if as_json:
+        typer.echo(json.dumps({**plan, "registerJobDefinition": definition}, indent=1))
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("NODE", "RANK", "HOST", "CPUS", "GPUS", "MEMORY", "ADDRESS", "IMAGE"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("COMMAND", overflow="fold")
+    for node in plan["nodes"]:
+        image = node["image"] if plan["engine"] != "local" else "-"
+        table.add_row(
+            *(str(node["index"]), str(node["rank"]), node["host"], f"{node['cpus']:g}", ",".join(node["gpus"]) or "-"),
+            *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
+        )
+    typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
+    Console(soft_wrap=True).print(table)
 
 
 def list_jobs(

@@ -1,0 +1,45 @@
+"""``muster submit --dry-run``: what would start where, and nothing starts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from orchestrator.client import ApiError
+from tests.conftest import Serving
+
+SPEC = "job_specs/cartpole.yaml"
+
+
+def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Serving, tmp_path: Path) -> None:
+    shown = server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=0.1")
+    assert shown.returncode == 0, shown.stderr
+    lines = shown.stdout.splitlines()
+    assert lines[0] == "cartpole on the local engine, queue default; nothing was started"
+    assert len(lines) == 5 and all("python -P -m worker.train" in line for line in lines[2:])
+    plan = json.loads(server.muster("submit", SPEC, "--dry-run", "--json", "--set", "resources.cpus=0.1").stdout)
+    assert [node["rank"] for node in plan["nodes"]] == [0, 1, 2]
+    told = plan["nodes"][1]["environment"]
+    assert told["MASTER_ADDR"] == plan["nodes"][0]["address"] != plan["nodes"][1]["address"]
+    assert (told["AWS_BATCH_JOB_NODE_INDEX"], told["NNODES"]) == ("1", "3")
+    assert plan["registerJobDefinition"]["nodeProperties"]["numNodes"] == 3
+    assert server.client.batch("DescribeJobDefinitions")["jobDefinitions"] == []
+    assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
+
+
+def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
+    refused = server.muster("submit", SPEC, "--dry-run", "--set", "resources.cpus=900")
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1
+    assert "each node needs 900 CPUs" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [{}, {"jobDefinitionName": "a", "type": "container"}, {"jobDefinitionName": "a", "type": "multinode"}, {"type": 3}],
+)
+def test_what_is_no_gang_is_refused(server: Serving, definition: dict) -> None:
+    with pytest.raises(ApiError) as refusal:
+        server.client.post("/api/plan", {"definition": definition})
+    assert refusal.value.status == 400 and "\n" not in str(refusal.value)
