@@ -54,7 +54,7 @@ torture: $(READY)
 	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300)
 
 bits: $(READY)
-	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/engines
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py

@@ -20,9 +20,9 @@ from tests.engines.conftest import PATH, SUPERVISED, host_files
 CHANGES = ("nodes=2", "train.iterations=24", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 
 
-def submit(serving: Serving, run: str) -> str:
+def submit(serving: Serving, run: str, *changes: str) -> str:
     """Cart-pole on two nodes as run ``run``, in the image of this machine's files; returns the job id."""
-    spec = specfile.load(REPOSITORY / "job_specs" / "cartpole.yaml", list(CHANGES))
+    spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), [*CHANGES, *changes])
     request = compile_definition(spec, str(REPOSITORY))
     container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
     container |= {"image": SUPERVISED, **host_files()}
@@ -71,7 +71,7 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
                 container.remove(force=True)
     local = Serving(tmp_path, "--cpus", "4")
     try:
-        spec = specfile.load(REPOSITORY / "job_specs" / "cartpole.yaml", list(CHANGES))
+        spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), list(CHANGES))
         request = compile_definition(spec, str(REPOSITORY))
         container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
         container["environment"].append({"name": "MUSTER_RUN", "value": "undocked"})
@@ -87,3 +87,28 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         text=True,
     )
     assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
+
+
+@pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="three minutes: MUSTER_LONG=1, in make bits")
+def test_a_node_that_is_cut_off_is_noticed_by_its_silence_and_the_gang_goes_on(
+    docker_client: Any, tmp_path: Path
+) -> None:
+    docker = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
+    run = Store(tmp_path / "store").run("cut")
+    job = ""
+    try:
+        job = submit(docker, "cut", "stall_timeout=15s")
+        wait_for(lambda: run.path.exists() and len(read_metrics(run)) >= 5, 120, "some iterations")
+        [network] = [n for n in docker_client.networks.list(filters={"label": "muster.gang"}) if job in n.name]
+        network.reload()
+        [child] = [c for c in network.containers if c.labels["muster.node"] == "1"]
+        network.disconnect(child)
+        done = docker.wait(job, timeout=240)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], docker.log(job)[-20:])
+        first = done["attempts"][0]["statusReason"]
+        assert len(done["attempts"]) == 2 and "made no progress for 1" in first, first
+    finally:
+        docker.close()
+        for container in docker_client.containers.list(all=True, filters={"label": "muster.gang"}):
+            if job and container.labels["muster.gang"].startswith(job):
+                container.remove(force=True)
