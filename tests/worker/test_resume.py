@@ -18,6 +18,7 @@ torch.set_num_threads(1)
 REPOSITORY = Path(__file__).parents[2]
 SETTINGS = {
     "Cartpole": {},
+    "CartpolePixels": {},
     "Ant": {"episode_seconds": 0.5},
     "Humanoid": {"episode_seconds": 0.5},
     "Quadruped": {"episode_seconds": 0.5, "command_seconds": 0.14},

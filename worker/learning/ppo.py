@@ -25,7 +25,7 @@ from rsl_rl.algorithms.ppo import PPO as RslPPO
 from rsl_rl.storage.rollout_storage import RolloutStorage
 
 from worker.distributed import Gang
-from worker.learning import linear
+from worker.learning import linear, moments
 from worker.learning.models import GROUP, build_models, example_observations
 from worker.learning.randomness import mix_seed
 from worker.learning.recording import Recorded
@@ -338,15 +338,12 @@ class PPO(RslPPO):
 
     def _gather_moments(self) -> None:
         """Count, sum and sum of squares of advantages and of observations, beside the caller's extras, to be summed over the ranks."""
-        advantages, size = self.storage.advantages, self._moments
+        advantages = self.storage.advantages
         self._sums[0].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
         self._sums[1] = advantages.sum(dtype=torch.float64)
         self._sums[2] = advantages.double().square().sum()
-        if size:
-            # around the running mean, which all ranks share: keeps the squares small
-            offsets = (self._observations - self.actor.obs_normalizer._mean).flatten(0, 1)
-            self._sums[3 : 3 + size] = offsets.sum(0, dtype=torch.float64)
-            self._sums[3 + size : 3 + 2 * size] = offsets.square_().sum(0, dtype=torch.float64)
+        if self.actor.obs_normalization:
+            moments.gather(self._observations, self.actor.obs_normalizer, self._sums[3 : 3 + 2 * self._moments])
 
     def update(self) -> torch.Tensor:
         """All epochs and minibatches; returns the mean :data:`LOSSES`, shape (4,), on the device."""
@@ -384,7 +381,9 @@ class PPO(RslPPO):
 
     def _close(self) -> None:
         """After the last minibatch."""
-        self._update_normalizer()
+        if self.actor.obs_normalization:
+            with torch.no_grad():
+                moments.merge(self.actor.obs_normalizer, self._sums[0], self._sums[3 : 3 + 2 * self._moments])
         torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
 
     def _compute_gradients(self) -> None:
@@ -419,22 +418,6 @@ class PPO(RslPPO):
         higher = (self._rate * RATE_STEP).clamp(max=RATE_LIMITS[1])
         small = (kl < self.desired_kl / 2.0) & (kl > 0.0)
         self._rate.copy_(torch.where(kl > self.desired_kl * 2.0, lower, torch.where(small, higher, self._rate)))
-
-    @torch.no_grad()
-    def _update_normalizer(self) -> None:
-        """Merge this iteration's observations of all ranks into the running moments (Chan et al. 1979), as rsl-rl does."""
-        if not self.actor.obs_normalization:
-            return
-        norm, size = self.actor.obs_normalizer, self._moments
-        added = self._sums[0]
-        offset = self._sums[3 : 3 + size] / added
-        variance = (self._sums[3 + size : 3 + 2 * size] / added - offset.square()).clamp(min=0.0)
-        norm.count.add_(added.long())
-        rate = added / norm.count
-        # with δ the batch mean less the running one: var += rate · (batch var − var + (1 − rate) · δ²)
-        norm._var.add_(rate * (variance - norm._var + (1.0 - rate) * offset.square()))
-        norm._mean.add_(rate * offset)
-        norm._std.copy_(norm._var.sqrt())
 
     # -- state --------------------------------------------------------------------------------------------------------
 
