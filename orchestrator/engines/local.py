@@ -71,8 +71,13 @@ class LocalEngine:
                 ended = index not in running and read_outcome(run, gang.job, gang.attempt, index) is not None
                 pid = 0 if ended else running.get(index) or self._start(plan, index, port)
                 nodes[index] = {"pid": pid, "start": _start_time(pid), "address": plan.nodes[index].contract.address}
-        except BaseException:
-            _end(gang.name)  # never half a gang
+        except BaseException:  # never half a gang
+            for node in nodes.values():
+                # by its pid: for a moment after it was started a process has no environment yet by which it would be found
+                if child := self._children.get(int(str(node["pid"]))):
+                    child.kill()
+                    child.wait()
+            _end(gang.name)
             raise
         return json.dumps({"gang": gang.name, "nodes": [nodes[index] for index in range(len(nodes))]})
 
