@@ -308,7 +308,8 @@ def warm_marker(task: type, device: str) -> Path | None:
     with contextlib.suppress(TypeError, OSError):
         import inspect
 
-        parts.append(Path(inspect.getfile(task)).read_text())
+        # its kernels may lie in the modules of its bases
+        parts.extend(Path(inspect.getfile(each)).read_text() for each in task.__mro__ if each is not object)
     version = metadata.version(
         "warp-lang"
     )  # below it Warp keeps its own; a folder of this name beside it would make it warn

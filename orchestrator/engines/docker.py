@@ -156,10 +156,10 @@ class DockerEngine:
             pass
         except (APIError, DockerException) as error:
             raise EngineError(f"CannotInspectContainerError: image {name!r}: {error}") from error
-        pull = self._pulls.setdefault(name, self._puller.submit(self._client.images.pull, name))
+        pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
         if not pull.done():
+            self._pulls[name] = pull
             raise NotYet(f"pulling image {name}")
-        del self._pulls[name]
         try:
             return pull.result()
         except (APIError, DockerException) as error:

@@ -90,12 +90,11 @@ class LocalEngine:
     def stop(self, handle: str, grace: float) -> None:
         state = json.loads(handle)
         deadline = time.monotonic() + grace
-        for node in state.get("nodes", []):
+        nodes = state.get("nodes", [])  # none where another engine started it
+        for node in nodes:
             if _alive(node["pid"], node["start"]):
                 _signal(node["pid"], signal.SIGTERM)
-        while (
-            any(_alive(node["pid"], node["start"]) for node in state.get("nodes", [])) and time.monotonic() < deadline
-        ):
+        while any(_alive(node["pid"], node["start"]) for node in nodes) and time.monotonic() < deadline:
             time.sleep(0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
         _end(state["gang"])

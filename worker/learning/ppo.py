@@ -134,7 +134,8 @@ class PPO(RslPPO):
             self._images = self._observations.flatten(0, 1)
         features = self.actor._get_latent_dim()
         self._latents = empty(steps, worlds, features)
-        self._terminal = empty(steps, worlds, features if self._images is None else 0)
+        packed = features if self._images is None else 0  # of images the features change with every minibatch
+        self._terminal = empty(steps, worlds, packed)
         self._time_outs = empty(steps, worlds, 1)
         self._std = empty(actions)
         mean = empty(steps, worlds, actions)
@@ -142,12 +143,13 @@ class PPO(RslPPO):
         self._noise = empty(steps, self.share.total, actions)
         self._noise_source = torch.Generator(self.device)
         self._order_source = torch.Generator(self.device)
-        self._columns = [features if self._images is None else 0, actions, actions, 1, 1, 1, 1]
+        self._columns = [packed, actions, actions, 1, 1, 1, 1]
         self._samples = empty(steps * worlds, sum(self._columns))
         self._last_observations = torch.zeros_like(self._observations[0])
-        self._moments = features if self.actor.obs_normalization else 0
-        self._sums = empty(3 + 2 * self._moments + extras, dtype=torch.float64)
-        self.extra = self._sums[3 + 2 * self._moments :]
+        end = 3 + (2 * features if self.actor.obs_normalization else 0)
+        self._sums = empty(end + extras, dtype=torch.float64)
+        self._observation_sums = self._sums[3:end]
+        self.extra = self._sums[end:]
         """The caller's own numbers, shape (extras,), float64: :meth:`compute_returns` sums them over the ranks."""
 
     def _allocate_gradients(self) -> None:
@@ -343,7 +345,7 @@ class PPO(RslPPO):
         self._sums[1] = advantages.sum(dtype=torch.float64)
         self._sums[2] = advantages.double().square().sum()
         if self.actor.obs_normalization:
-            moments.gather(self._observations, self.actor.obs_normalizer, self._sums[3 : 3 + 2 * self._moments])
+            moments.gather(self._observations, self.actor.obs_normalizer, self._observation_sums)
 
     def update(self) -> torch.Tensor:
         """All epochs and minibatches; returns the mean :data:`LOSSES`, shape (4,), on the device."""
@@ -383,7 +385,7 @@ class PPO(RslPPO):
         """After the last minibatch."""
         if self.actor.obs_normalization:
             with torch.no_grad():
-                moments.merge(self.actor.obs_normalizer, self._sums[0], self._sums[3 : 3 + 2 * self._moments])
+                moments.merge(self.actor.obs_normalizer, self._sums[0], self._observation_sums)
         torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
 
     def _compute_gradients(self) -> None:

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from newton.sensors import SensorCamera
 
-from worker.simulation.episodes import STEP, EpisodeArrays
+from worker.simulation.episodes import STEP, EpisodeArrays, numbered_stream
 from worker.simulation.worlds import Worlds
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 _SKY = 0x00D0B090
 """What the camera sees where there is nothing: packed as alpha, blue, green, red."""
 _STREAM = wp.constant(-100)
-"""The scene is drawn from this random stream and below; episodes draw from 0 up, physics from -1 down."""
+"""The scene is drawn from this random stream and below, the physics from those above it."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,7 @@ def _draw_scene(
 ):
     """Where one world's camera stands, and the colours of its shapes: drawn once, from the seed and the world alone."""
     world = wp.tid()
-    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
-    stream = wp.rand_init(int(key), _STREAM)
+    stream = numbered_stream(episodes, world, _STREAM)
     shift = wp.vec3f(wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0))
     turn = wp.vec3f(wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0), wp.randf(stream, -1.0, 1.0))
     turned = wp.quat_rpy(angle * turn[0], angle * turn[1], angle * turn[2])
@@ -98,8 +97,7 @@ def _draw_scene(
 def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array(dtype=wp.float32)):
     """How bright one world's image is."""
     world = wp.tid()
-    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
-    light[world] = wp.randf(wp.rand_init(int(key), _STREAM - 1), ends[0], ends[1])
+    light[world] = wp.randf(numbered_stream(episodes, world, _STREAM - 1), ends[0], ends[1])
 
 
 @wp.kernel
@@ -163,9 +161,8 @@ class Camera:
         self.images: torch.Tensor = wp.to_torch(self._images)
         self._poses = wp.zeros(count, dtype=wp.transformf, device=self._device)
         self._light = wp.ones(count, dtype=wp.float32, device=self._device)
-        shapes = (
-            int((model.shape_world.numpy() >= 0).sum()) // count
-        )  # those of the ground come last and belong to no world
+        # those of the ground come last and belong to no world
+        shapes = int((model.shape_world.numpy() >= 0).sum()) // count
         colors = model.shape_color[: shapes * count].reshape((count, shapes))
         wp.launch(
             _draw_scene,

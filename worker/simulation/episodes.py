@@ -74,12 +74,18 @@ def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
 
 
 @wp.func
+def numbered_stream(episodes: EpisodeArrays, world: int, number: int) -> wp.uint32:
+    """The generator ``number`` of one world. Episodes draw from 0 up, what is drawn once in the life of a world from -1 down."""
+    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
+    return wp.rand_init(int(key), number)
+
+
+@wp.func
 def random_stream(episodes: EpisodeArrays, world: int) -> wp.uint32:
     """A fresh generator for one world, a function of (seed, global world index, streams drawn before) alone."""
     drawn = episodes.random[world, 2]
     episodes.random[world, 2] = drawn + 1
-    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
-    return wp.rand_init(int(key), drawn)
+    return numbered_stream(episodes, world, drawn)
 
 
 @wp.func

@@ -12,7 +12,7 @@ import newton
 import torch
 import warp as wp
 
-from worker.simulation.episodes import STEP, STEPS, EpisodeArrays, random_stream
+from worker.simulation.episodes import STEP, STEPS, EpisodeArrays, numbered_stream, random_stream
 from worker.simulation.worlds import WorldArrays, Worlds
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ FACTORS = ("mass", "friction", "damping", "gains", "gravity")
 def _draw_factors(episodes: EpisodeArrays, ends: wp.array(dtype=wp.vec2), factors: wp.array2d(dtype=wp.float32)):
     """Uniform factors of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
     world, factor = wp.tid()
-    key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
-    # episodes draw from the streams 0, 1, 2, … of the same key
-    stream = wp.rand_init(int(key), -1 - factor)
+    stream = numbered_stream(episodes, world, -1 - factor)
     factors[world, factor] = wp.randf(stream, ends[factor][0], ends[factor][1])
 
 

@@ -37,12 +37,27 @@ class WorldArrays:
     fastest: float
 
 
+FIRST_COORDINATE = wp.constant(7)
+"""Joint coordinates of a free root joint: position, quaternion xyzw; those of the hinges follow."""
+FIRST_DOF = wp.constant(6)
+"""Joint velocities of a free root joint: linear, angular; those of the hinges follow."""
+
+
 @wp.func
 def root_rotation(worlds: WorldArrays, world: int) -> wp.quat:
     """Rotation from a world's first body, which hangs on a free joint, to the world frame."""
     return wp.quat(
         worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
     )
+
+
+@wp.func
+def root_velocities(worlds: WorldArrays, world: int):
+    """Linear [m/s] and angular [rad/s] velocity of a world's first body, which hangs on a free joint, in its own frame."""
+    rotation = root_rotation(worlds, world)
+    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
+    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
+    return wp.quat_rotate_inv(rotation, linear), wp.quat_rotate_inv(rotation, angular)
 
 
 @wp.func

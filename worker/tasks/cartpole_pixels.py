@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from worker.simulation.camera import CameraConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import PPOConfig
+from worker.tasks.config import PPOConfig, nested
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,7 @@ class CartpolePixelsConfig(CartpoleConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.camera, Mapping):  # as keyword of a Gymnasium environment
-            try:
-                object.__setattr__(self, "camera", CameraConfig(**self.camera))
-            except TypeError as error:
-                raise ValueError(f"camera: {error}") from error
+        object.__setattr__(self, "camera", nested("camera", CameraConfig, self.camera))
 
 
 class CartpolePixels(Cartpole):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
@@ -134,8 +134,7 @@ def _check_curriculum(curriculum: Mapping[str, Any], terms: Mapping[str, float])
         raise ValueError(f"curriculum: expected a mapping from names to points, got {curriculum!r}")
     for name, points in curriculum.items():
         if name != "level" and name not in terms:
-            near = difflib.get_close_matches(str(name), ["level", *terms], n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
+            hint = _hint(name, ["level", *terms])
             raise ValueError(f"curriculum: there is no {name!r}; {hint}there are level, {', '.join(terms)}")
         shaped = isinstance(points, list | tuple) and points and all(isinstance(p, list | tuple) for p in points)
         if not shaped or not all(len(point) == 2 and all(map(_is_finite, point)) for point in points):
@@ -154,6 +153,25 @@ def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
         if before[0] <= iteration < after[0]:
             return before[1] + (after[1] - before[1]) * (iteration - before[0]) / (after[0] - before[0])
     return points[0][1] if iteration < points[0][0] else points[-1][1]
+
+
+def _hint(name: object, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"did you mean {near[0]}? " if near else ""
+
+
+def nested(where: str, kind: type[Any], value: Any) -> Any:
+    """``value``, or, where it is a mapping of its fields, the ``kind`` of configuration made of it.
+
+    Raises:
+        ValueError: A field is unknown or out of range.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    try:
+        return kind(**value)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def reward_weights(**weights: float) -> Any:
@@ -209,17 +227,11 @@ class TaskConfig:
             raise ValueError(f"nan_limit: expected a share of 0 or more, got {self.nan_limit!r}")
         for name, weight in self.rewards.items():
             if name not in known:
-                near = difflib.get_close_matches(str(name), known, n=1)
-                hint = f"did you mean {near[0]}? " if near else ""
                 raise ValueError(
-                    f"rewards: {type(self).__name__} has no term {name!r}; {hint}its terms are {', '.join(known)}"
+                    f"rewards: {type(self).__name__} has no term {name!r}; {_hint(name, known)}its terms are {', '.join(known)}"
                 )
             if not _is_finite(weight):
                 raise ValueError(f"rewards.{name}: expected a finite number as the weight, got {weight!r}")
         weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
-        if isinstance(self.randomize, Mapping):
-            try:
-                object.__setattr__(self, "randomize", Randomization(**self.randomize))
-            except TypeError as error:
-                raise ValueError(f"randomize: {error}") from error
+        object.__setattr__(self, "randomize", nested("randomize", Randomization, self.randomize))

@@ -21,7 +21,7 @@ from worker.simulation.episodes import (
     end_step,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays, is_sound, root_rotation
+from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
 from worker.tasks.task import Task
 
@@ -29,10 +29,6 @@ wp.set_module_options({"enable_backward": False})
 
 JOINTS = wp.constant(12)
 """Hinges, in the order of the joint coordinates and of the drives: hip, thigh and knee of each leg."""
-FIRST_COORDINATE = wp.constant(7)
-"""Joint coordinates of the trunk's free joint: position, quaternion xyzw."""
-FIRST_DOF = wp.constant(6)
-"""Joint velocities of the trunk's free joint: linear, angular."""
 COMMAND = wp.constant(0)
 """First of three columns of ``memory``: the commanded velocities forward and to the left [m/s], turning left [rad/s]."""
 COUNTDOWN = wp.constant(3)
@@ -205,10 +201,7 @@ def write_observation(
 ):
     """Velocities and the direction of gravity in the trunk's frame, the command, joints, the action that led here."""
     rotation = root_rotation(worlds, world)
-    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
-    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
-    linear = wp.quat_rotate_inv(rotation, linear)
-    angular = wp.quat_rotate_inv(rotation, angular)
+    linear, angular = root_velocities(worlds, world)
     gravity = wp.quat_rotate_inv(rotation, wp.vec3(0.0, 0.0, -1.0))
     for axis in range(3):
         observations[world, axis] = linear[axis]
@@ -252,10 +245,7 @@ def has_fallen(parameters: QuadrupedParameters, worlds: WorldArrays, world: int)
 def add_rewards(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
     """Every reward term of a step, as long as the step took."""
     rotation = root_rotation(worlds, world)
-    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
-    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
-    linear = wp.quat_rotate_inv(rotation, linear)
-    angular = wp.quat_rotate_inv(rotation, angular)
+    linear, angular = root_velocities(worlds, world)
     gravity = wp.quat_rotate_inv(rotation, wp.vec3(0.0, 0.0, -1.0))
     forward = linear[0] - episodes.memory[world, COMMAND]
     left = linear[1] - episodes.memory[world, COMMAND + 1]

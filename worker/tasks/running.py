@@ -20,16 +20,12 @@ from worker.simulation.episodes import (
     end_step,
     random_stream,
 )
-from worker.simulation.worlds import WorldArrays, is_sound, root_rotation
+from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
 from worker.tasks.config import PPOConfig, TaskConfig
 from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
-FIRST_COORDINATE = wp.constant(7)
-"""Joint coordinates of the torso's free joint: position, quaternion xyzw."""
-FIRST_DOF = wp.constant(6)
-"""Joint velocities of the torso's free joint: linear, angular."""
 TORSO = wp.constant(11)
 """Observations of the torso; three of each joint follow them."""
 
@@ -125,10 +121,8 @@ def write_observation(
 ):
     """Torso height, velocities in the torso frame, attitude, then joints, then the action that led here."""
     rotation = root_rotation(worlds, world)
-    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
-    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
-    linear = wp.quat_rotate_inv(rotation, linear)
-    angular = wp.quat_rotate_inv(rotation, angular) * parameters.angular_velocity_scale
+    linear, angular = root_velocities(worlds, world)
+    angular = angular * parameters.angular_velocity_scale
     forward = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))
     left = wp.quat_rotate(rotation, wp.vec3(0.0, 1.0, 0.0))
     up = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))
