@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
@@ -27,6 +27,17 @@ class Host:
     """Ids, as ``CUDA_VISIBLE_DEVICES`` takes them."""
     memory: int
     """MiB."""
+    single: bool = False
+    """Takes one node of a gang at most."""
+
+    def left(self, cpus: float, gpus: tuple[str, ...], memory: int) -> Host:
+        """The same host with that much of it."""
+        return Host(self.name, cpus, gpus, memory, self.single)
+
+
+def engine_of(host: str) -> str:
+    """Name of the engine that a host belongs to: hosts are called ``<engine>/<name>``, that of the local one ``localhost``."""
+    return host.partition("/")[0] if "/" in host else "local"
 
 
 @dataclass(frozen=True)
@@ -73,6 +84,15 @@ class Gang:
     bus: str | None = None
     bus_token: str | None = None
     """Where the controller's bus router listens, and its password."""
+    title: str = ""
+    """What the user calls the job."""
+    timeout: int | None = None
+    """Of the attempt [s]."""
+    priority: int = 0
+    """The job's, inside its queue."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Tags ``muster:<option>`` of its compute environment, and over them those of its queue: what engines that have queues
+    of their own are told."""
 
     @property
     def name(self) -> str:
@@ -95,6 +115,8 @@ class Plan:
 
     gang: Gang
     nodes: Sequence[NodePlan]
+    document: str = ""
+    """What another scheduler will be given: an sbatch script, a request in JSON."""
 
 
 def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan]:
@@ -139,6 +161,8 @@ class NodeStatus:
     """128 + n for signal n; None while it runs, or where nobody saw the end."""
     detail: str = ""
     """What the node's supervisor said on stderr, where it could not say it in the store."""
+    waiting: str = ""
+    """Why the node, which counts as running, has not been started yet by an engine that queues."""
 
 
 GangStatus = Sequence[NodeStatus]
@@ -148,13 +172,17 @@ class Engine(Protocol):
     """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart."""
 
     name: str
+    queues: bool
+    """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
+    address: str | None
+    """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
 
     def capacity(self) -> Sequence[Host]:
-        """Every host with all that it has, free or not."""
+        """Every host with all that it has, free or not. Their names begin with the engine's and a slash."""
         ...
 
     def plan(self, gang: Gang) -> Plan:
-        """What :meth:`launch` would do. Pure."""
+        """What :meth:`launch` would do. Pure. Raises EngineError where the engine can't do what the gang asks for."""
         ...
 
     def launch(self, plan: Plan) -> str:

@@ -57,6 +57,7 @@ class DockerEngine:
     """One machine's Docker Engine."""
 
     name = "docker"
+    queues = False
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:

@@ -32,6 +32,8 @@ class LocalEngine:
     """One machine as an engine."""
 
     name = "local"
+    queues = False
+    address = None
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:

@@ -62,7 +62,7 @@ def less(host: Host, taken: Iterable[Placement]) -> Host:
     for placement in taken:
         cpus, memory = cpus - placement.cpus, memory - placement.memory
         gone.update(placement.gpus)
-    return Host(host.name, cpus, tuple(gpu for gpu in host.gpus if gpu not in gone) if gone else host.gpus, memory)
+    return host.left(cpus, tuple(gpu for gpu in host.gpus if gpu not in gone) if gone else host.gpus, memory)
 
 
 def needs(shape: Shape) -> str:
@@ -100,7 +100,8 @@ def _room(node: NodeShape, host: Host) -> int:
     by_cpus = (host.cpus + EPSILON) // node.cpus if node.cpus > 0 else inf
     by_gpus = len(host.gpus) // node.gpus if node.gpus else inf
     by_memory = host.memory // node.memory if node.memory > 0 else inf
-    return int(min(by_cpus, by_gpus, by_memory, 1_000_000))  # a node that takes nothing fits any number of times
+    most = 1 if host.single else 1_000_000
+    return int(min(by_cpus, by_gpus, by_memory, most))  # a node that takes nothing fits any number of times
 
 
 def _seats(node: NodeShape, free: Sequence[Host], enough: int) -> int:
@@ -131,7 +132,8 @@ def _pack(shape: Shape, count: int, free: Sequence[Host], tight: bool) -> tuple[
                     for k in range(len(here))
                 ]
                 placements.update(zip(here, seated, strict=True))
-                left[position] = less(host, seated)
+                # -1: even a node that takes nothing finds no room beside another
+                left[position] = host.left(-1.0, (), 0) if host.single else less(host, seated)
         if waiting:
             return None
     return tuple(placements[index] for index in range(count))

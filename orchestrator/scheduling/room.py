@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
 
-from orchestrator.engines.base import Host, Placement
+from orchestrator.engines.base import Host, Placement, engine_of
 from orchestrator.scheduling.placement import affordable, less, place
 from orchestrator.scheduling.snapshot import Shape, Snapshot
 
@@ -42,7 +42,7 @@ class Spare:
         for placement in seat.placements:
             if host := self.hosts.get(placement.host):
                 cpus, memory = host.cpus - placement.cpus, host.memory - placement.memory
-                self.hosts[host.name] = Host(host.name, cpus, host.gpus[len(placement.gpus) :], memory)
+                self.hosts[host.name] = host.left(cpus, host.gpus[len(placement.gpus) :], memory)
             if seat.pool == self.pool:
                 self.cpus -= placement.cpus
 
@@ -75,7 +75,7 @@ class Room:
         members = {}
         for name, pool in snapshot.pools.items():
             allowed = total.keys() if pool.hosts is None else set(pool.hosts)
-            members[name] = tuple(host for host in total if host in allowed)
+            members[name] = tuple(host for host in total if host in allowed and pool.engine in (None, engine_of(host)))
         cpus = {name: inf if pool.max_cpus is None else pool.max_cpus for name, pool in snapshot.pools.items()}
         room = cls(total, members, dict(total), cpus)
         taken: dict[str, list[Placement]] = {}
@@ -104,9 +104,7 @@ class Room:
             if host := self.hosts.get(placement.host):
                 known = self.total[host.name].gpus
                 gpus = host.gpus + tuple(gpu for gpu in placement.gpus if gpu in known)
-                self.hosts[host.name] = Host(
-                    host.name, host.cpus + placement.cpus, gpus, host.memory + placement.memory
-                )
+                self.hosts[host.name] = host.left(host.cpus + placement.cpus, gpus, host.memory + placement.memory)
 
     def totals(self, pool: str) -> list[Host]:
         """The pool's hosts with all that they have."""
@@ -127,4 +125,4 @@ class Room:
 
 
 def _smaller(free: Host, spare: Host) -> Host:
-    return Host(free.name, min(free.cpus, spare.cpus), free.gpus[: len(spare.gpus)], min(free.memory, spare.memory))
+    return free.left(min(free.cpus, spare.cpus), free.gpus[: len(spare.gpus)], min(free.memory, spare.memory))

@@ -109,6 +109,8 @@ class Pool:
     hosts: tuple[str, ...] | None
     """None: all that the engine has."""
     max_cpus: float | None
+    engine: str | None = None
+    """Only hosts of this one; None: of any."""
 
 
 @dataclass(frozen=True)
