@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orchestrator.engines.base import Engine, EngineError
 
-ENGINES = ("local", "docker")
+ENGINES = ("local", "docker", "ray", "slurm", "aws-batch")
 
 
 def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> Engine:
@@ -16,8 +16,8 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
     Args:
         name: One of :data:`ENGINES`.
         home: ``$MUSTER_HOME``.
-        cpus: CPU cores to hand out; all by default.
-        gpus: Ids of the GPUs to hand out; all by default.
+        cpus: CPU cores of this machine to hand out, where the engine runs nodes on it; all by default.
+        gpus: Ids of its GPUs to hand out; all by default.
 
     Raises:
         EngineError: There is none, it is not installed, or it does not answer; one line with what to do.

@@ -51,6 +51,8 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
             return [container for container in found if container.labels["muster.gang"].startswith(job)]
 
         wait_for(lambda: iterations() >= 6, 120, "some iterations")
+        saved = docker.client.post(f"/api/jobs/{job}/checkpoint", {})  # the bus reaches into containers
+        assert "checkpoint 000000" in str(saved)
         [child] = [container for container in nodes() if container.labels["muster.node"] == "1"]
         child.kill()
         wait_for(
