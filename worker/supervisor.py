@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from shared_store.contract import ContractError, NodeContract
-from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.logs import format_line
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
@@ -301,7 +301,7 @@ def main(argv: list[str]) -> int:
     try:
         contract = NodeContract.from_env(os.environ)
         run = Store(contract.store).run(contract.run)
-        check_epoch(run, contract.epoch)
+        find_epoch(run, contract.epoch)
         supervisor = Supervisor(contract, run, argv[1:])
     except (ContractError, StoreError, ValueError) as error:
         print(f"muster supervisor: {error}", file=sys.stderr)

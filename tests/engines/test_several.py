@@ -51,7 +51,10 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
         assert "on the docker engine, queue docker" in shown[0] and docker in shown[2]
 
         lines(served, "submit", str(spec))
-        assert served.wait("where")["queue"] == "default" and served.log("where") == [f"on {socket.gethostname()}", "node 0 ended: done"]
+        assert served.wait("where")["queue"] == "default" and served.log("where") == [
+            f"on {socket.gethostname()}",
+            "node 0 ended: done",
+        ]
         job = submit_plainly(served, "docker")
         assert served.wait(job)["status"] == "SUCCEEDED", served.detail(job)
         assert served.log(job) == ["on node-0"]
