@@ -32,4 +32,8 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
         except ModuleNotFoundError as error:
             raise EngineError("the docker engine is not installed: pip install 'muster[docker]'") from error
         return DockerEngine(home, cpus, gpus)
+    if name == "ray":
+        from orchestrator.engines.ray import RayEngine
+
+        return RayEngine(home)
     raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")
