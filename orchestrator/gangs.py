@@ -100,7 +100,10 @@ class Gangs:
         try:
             attempt.handle = self.engine.launch(self.engine.plan(self._gang(session, job, attempt, needs)))
         except NotYet as wait:
-            job.status_reason = str(wait)
+            if job.stop_reason is None or wait.unknown:
+                job.status_reason = str(wait)
+            else:  # nothing of it was started: there is nothing to stop
+                self._close(session, job, attempt, Verdict(Ending.STOPPED, job.stop_reason), [])
         except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
