@@ -22,9 +22,9 @@ STAGE = 16
 """Iterations on each engine."""
 
 
-def submit(serving: Serving, run: str, engine: str, iterations: int) -> str:
+def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str) -> str:
     """Go on with ``run`` until it has that many iterations; returns the job id."""
-    changes = [*SMALL, f"train.iterations={iterations}"]
+    changes = [*SMALL, f"train.iterations={iterations}", *more]
     spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), changes)
     queue = serving.client.get("/api/capacity")["engines"][engine]
     request = compile_definition(spec, str(REPOSITORY))

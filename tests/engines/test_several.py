@@ -6,15 +6,16 @@ import socket
 from pathlib import Path
 
 import pytest
-import yaml
 
 from tests.conftest import Serving
 from tests.engines.conftest import PLAIN, host_files
+from tests.engines.test_docker_faults import plain
 
-JOB = """
+SCRIPT = "echo on $(hostname)"
+JOB = f"""
 name: where
-command: [sh, -c, "echo on $(hostname)"]
-resources: {cpus: 0.1, memory: 64MiB}
+command: [sh, -c, "{SCRIPT}"]
+resources: {{cpus: 0.1, memory: 64MiB}}
 """
 
 
@@ -22,18 +23,6 @@ def lines(served: Serving, *arguments: str) -> list[str]:
     done = served.muster(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
-
-
-def submit_plainly(served: Serving, queue: str) -> str:
-    """The same job in an image of this machine's files; returns its id."""
-    container = {"image": PLAIN, **host_files(), "command": yaml.safe_load(JOB)["command"]}
-    container["resourceRequirements"] = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
-    arn = served.client.batch(
-        "RegisterJobDefinition", jobDefinitionName="plain", type="multinode", nodeProperties=properties
-    )["jobDefinitionArn"]
-    job: str = served.client.batch("SubmitJob", jobName="plain", jobQueue=queue, jobDefinition=arn)["jobId"]
-    return job
 
 
 @pytest.mark.usefixtures("docker_client")
@@ -55,7 +44,7 @@ def test_a_job_goes_to_the_engine_that_it_names_and_else_to_the_first(tmp_path: 
             f"on {socket.gethostname()}",
             "node 0 ended: done",
         ]
-        job = submit_plainly(served, "docker")
+        job = plain(served, PLAIN, SCRIPT, "docker", **host_files())
         assert served.wait(job)["status"] == "SUCCEEDED", served.detail(job)
         assert served.log(job) == ["on node-0"]
         assert served.detail(job)["attempts"][0]["nodes"][0]["host"] == docker
