@@ -1,6 +1,7 @@
 # What a container of compose.yaml runs: sh cluster.sh head | worker | controller; and how its health is: sh cluster.sh healthy.
 set -eu
-store_memory=80000000   # bytes for Ray's object store, which Muster does not use; the least that Ray takes
+# what Muster does not use of Ray: its object store (the least that Ray takes) and its copies of logs
+small="--object-store-memory=80000000 --include-log-monitor=false"
 
 begin() {
   echo "$1" >/tmp/role
@@ -11,13 +12,13 @@ case "${1:-}" in
 head)
   begin head
   exec ray start --head --block --port=6379 --node-ip-address="${RAY_HEAD%:*}" --node-name=head --num-cpus=0 \
-    --include-dashboard=false --object-store-memory=$store_memory
+    --include-dashboard=false $small
   ;;
 worker)
   begin worker
   export WARP_CACHE_PATH=/muster/kernels
   until ray start --block --address="$RAY_HEAD" --node-name="$(hostname)" --num-cpus="$MUSTER_WORKER_CPUS" \
-    --memory="$MUSTER_WORKER_MEMORY" --object-store-memory=$store_memory; do
+    --memory="$MUSTER_WORKER_MEMORY" $small; do
     echo "no Ray head at $RAY_HEAD yet; trying again" >&2
     sleep 2
   done
@@ -25,7 +26,7 @@ worker)
 controller)
   begin controller
   # Drivers run on a node of the cluster: this one, which has no CPUs for jobs. It ends when the head is away for too long.
-  join() { ray start --address="$RAY_HEAD" --node-name=controller --num-cpus=0 --object-store-memory=$store_memory; }
+  join() { ray start --address="$RAY_HEAD" --node-name=controller --num-cpus=0 $small; }
   until join; do sleep 2; done
   (while sleep 5; do grep -qs '^raylet' /proc/[0-9]*/comm || join || true; done) &
   exec muster serve --engine ray --host 0.0.0.0 --port 8080 --store /muster/store
