@@ -69,6 +69,7 @@ class RayEngine:
             )
         self.address = address_towards(self.head)
         self._drivers: dict[str, subprocess.Popen[bytes]] = {}
+        self._next_let_go = 0.0
         self._grown: dict[str, Sequence[str]] = {}
         """Hosts of the gangs for which machines were to be added."""
         self._clear_away()
@@ -151,6 +152,9 @@ class RayEngine:
         driven = folder.is_driven() or state["phase"] == "stopped"
         if not driven:  # its last words may have come in between
             state = read_json(folder.state(gang)) or state
+        if state["phase"] == "placing" and time.monotonic() > self._next_let_go:
+            self._next_let_go = time.monotonic() + 1.0
+            self._let_go(_job(gang))
         status = []
         for node in state["nodes"]:
             if node["running"] and driven:
@@ -233,6 +237,7 @@ class RayEngine:
                     [*command, str(self._watch.seen.get("join")), str(commands)],
                     env={**self._environment, "MUSTER_JOB_ID": job, "MUSTER_STORE": str(self.home)},
                     pass_fds=(commands,),
+                    cwd=folder.path,  # Ray has workers look for modules where their driver was started
                     stdin=subprocess.DEVNULL,
                     stdout=said,
                     stderr=said,
@@ -247,7 +252,7 @@ class RayEngine:
         for other, process in list(self._drivers.items()):
             if process.poll() is not None:
                 del self._drivers[other]
-        for path in (self.home / "ray").iterdir():
+        for path in (self.home / "ray").glob("*"):
             if path.name != job:
                 Folder(path).send({"do": "leave"})
 

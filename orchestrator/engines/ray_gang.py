@@ -63,8 +63,8 @@ class Gang:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether a node that was asked to end has not answered yet."""
-        return any(kind == "stop" for kind, _ in self.asked.values())
+        """Whether a node that was asked to end, or that is to say how it ended, has not answered yet."""
+        return any(kind in ("stop", "wait") for kind, _ in self.asked.values())
 
     def end(self, index: int, code: int | None, detail: str) -> None:
         node = self.nodes[index]
