@@ -21,7 +21,7 @@ class RayCluster:
     def __init__(self, home: Path, head_options: tuple[str, ...] = (), **env: str) -> None:
         """``head_options``, ``env``: more of them for the head."""
         self.home, self.head_options, self.head_env = home, head_options, env
-        self.address = f"{self.network()}.1:6379"
+        self.address, self.modules = f"{self.network()}.1:6379", home / "modules"
         token = home / "token"
         token.write_text("a-token-that-is-long-enough-for-a-test")
         token.chmod(0o600)

@@ -14,7 +14,7 @@ import pytest
 
 from tests.conftest import wait_for
 from tests.engines.ray_cluster import RayCluster
-from tests.engines.test_ray import Bench
+from tests.engines.test_ray import Bench, long
 
 pytest.importorskip("ray", reason="NO RAY: the ray engine is not tested (pip install 'muster[ray]')")
 _HEAD = "f" * 51 + "00000"
@@ -72,6 +72,7 @@ def growing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RayClus
     cluster.close()
 
 
+@long
 def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path) -> None:
     bench = Bench(growing, tmp_path)
 

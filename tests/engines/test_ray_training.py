@@ -47,7 +47,9 @@ def test_it_survives_the_loss_of_a_machine_and_of_the_controller_with_the_bits_o
         lost = serving.detail(job)["attempts"][0]["nodes"][1]["host"].removeprefix("ray/")
         ray_cluster.kill(lost)
         wait_for(
-            lambda: serving.detail(job)["status"] == "RUNNING" and len(serving.detail(job)["attempts"]) == 2, 90, "again"
+            lambda: serving.detail(job)["status"] == "RUNNING" and len(serving.detail(job)["attempts"]) == 2,
+            90,
+            "again",
         )
         serving.kill()
         serving.start()
@@ -59,7 +61,7 @@ def test_it_survives_the_loss_of_a_machine_and_of_the_controller_with_the_bits_o
     finally:
         serving.close()
         if lost:
-            ray_cluster.add(lost)
+            ray_cluster.add(lost, PYTHONPATH=str(ray_cluster.modules))
     local = Serving(tmp_path, "--cpus", "4")
     try:
         job = submit(local, "near")
