@@ -8,11 +8,13 @@ tables, and for each job a driver, which outlives the controller and is found ag
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -23,15 +25,15 @@ from typing import Any
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
 from orchestrator.engines.mounts import mounts_of, with_mounts
 from orchestrator.engines.ray_cluster import Watch, address_towards, grows_to, ray_environment
-from orchestrator.engines.ray_folder import LEASE, Folder
+from orchestrator.engines.ray_folder import LEASE, NEW, Folder
 from shared_store.files import read_json, write_json
 
 DEFAULT_ADDRESS = "127.0.0.1:6379"
+_SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
+"""Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
 _KEPT = 7 * 86400.0
 """Seconds for which a job's folder is kept when it is over."""
 _PORT = 29500
-_NEW = "ray/+"
-"""Names of hosts that the autoscaler could add begin so."""
 
 
 class RayEngine:
@@ -63,12 +65,12 @@ class RayEngine:
             raise EngineError(str(seen["error"]))
         if not seen["join"]:
             self._watch.close()
-            raise EngineError(
-                f"this machine is no node of the Ray cluster at {self.head}; drivers run on one: "
-                f"`ray start --address={self.head} --num-cpus=0` makes it one"
-            )
+            raise EngineError(_not_a_node(self.head))
         self.address = address_towards(self.head)
         self._drivers: dict[str, subprocess.Popen[bytes]] = {}
+        self._next_let_go = 0.0
+        self._suspects: dict[str, float] = {}
+        """Until when (monotonic [s]), by node id."""
         self._grown: dict[str, Sequence[str]] = {}
         """Hosts of the gangs for which machines were to be added."""
         self._clear_away()
@@ -84,7 +86,7 @@ class RayEngine:
         hosts = [Host(name, m["cpus"], _ids(m["gpus"]), m["memory"], single=True) for name, m in machines.items()]
         for shape in [*self._grows, *self._watch.seen.get("grows", [])]:
             like = [m for m in machines.values() if (m["cpus"], m["gpus"]) == (shape["cpus"], shape["gpus"])]
-            names = (f"{_NEW}{number}" for number in range(1, 10_000))
+            names = (f"{NEW}{number}" for number in range(1, 10_000))
             taken = {host.name for host in hosts}
             free = (name for name in names if name not in taken)
             for _ in range(shape["most"] - len(like)):
@@ -93,7 +95,12 @@ class RayEngine:
 
     def _machines(self) -> dict[str, dict[str, Any]]:
         """The cluster's machines that have CPUs, by host name."""
-        nodes = [node for node in self._watch.seen.get("nodes", []) if node["cpus"] > 0]
+        now = time.monotonic()
+        nodes = [
+            node
+            for node in self._watch.seen.get("nodes", [])
+            if node["cpus"] > 0 and self._suspects.get(node["id"], 0.0) < now
+        ]
         names = [node["name"] for node in nodes]
         taken = self._taken()
         found = {}
@@ -108,7 +115,7 @@ class RayEngine:
         for gang, hosts in self._grown.items():
             state = read_json(Folder.of(self.home, _job(gang)).state(gang)) or {}
             for host, node in zip(hosts, state.get("nodes", ()), strict=False):
-                if host.startswith(_NEW) and node["ray_node"]:
+                if host.startswith(NEW) and node["ray_node"]:
                     names[node["ray_node"]] = host
         return names
 
@@ -125,8 +132,10 @@ class RayEngine:
         folder = Folder.of(self.home, gang.job)
         facts = {"ray": gang.name, "hosts": [placement.host for placement in gang.placements]}
         if not folder.state(gang.name).exists():
-            if self._watch.problem():
-                raise NotYet(f"{self._watch.problem()}; waiting for it")
+            if problem := self._watch.problem():
+                raise NotYet(f"{problem}; waiting for it")
+            if not self._watch.seen["join"]:
+                raise NotYet(f"{_not_a_node(self.head)}; waiting for it")
             folder.make()
             write_json(folder.plan(gang.name), self._document(plan))
             folder.plan(gang.name).chmod(0o600)
@@ -145,18 +154,28 @@ class RayEngine:
         state = read_json(folder.state(gang))
         if state is None:
             if folder.plan(gang).exists():
+                driver = self._drivers.get(_job(gang))
+                if driver is not None and driver.poll():  # one that left with 0 did so before it was asked
+                    said = folder.said.read_text(errors="replace").strip().rpartition("\n")[2]
+                    return [NodeStatus(False, "", 1, f"its driver can't run: {said}")] * count
                 self._drive(folder, gang)
                 return [NodeStatus(True, "", waiting="its driver is starting")] * count
             return [NodeStatus(False, "", None)] * count
         driven = folder.is_driven() or state["phase"] == "stopped"
         if not driven:  # its last words may have come in between
             state = read_json(folder.state(gang)) or state
+        if state["phase"] == "placing" and time.monotonic() > self._next_let_go:
+            self._next_let_go = time.monotonic() + 1.0
+            self._let_go(_job(gang))
         status = []
         for node in state["nodes"]:
             if node["running"] and driven:
                 status.append(NodeStatus(True, node["address"], waiting="" if node["started"] else state["why"]))
             else:
                 status.append(NodeStatus(False, node["address"], node["code"], node["detail"]))
+            if driven and state["phase"] == "running" and not node["running"] and node["code"] is None:
+                until = time.monotonic() + (_SUSPECT_IF_SILENT if node.get("silent") else _SUSPECT)
+                self._suspects.setdefault(node["ray_node"], until)
         return status
 
     def stop(self, handle: str, grace: float) -> None:
@@ -165,16 +184,18 @@ class RayEngine:
             return
         gang = str(facts["ray"])
         folder = Folder.of(self.home, _job(gang))
-        asked = 0.0
+        asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE
         while (state := read_json(folder.state(gang))) is None or state["phase"] != "stopped":
             if state is None and not folder.plan(gang).exists():
                 break
             now = time.monotonic()
+            if now > patience and state is not None:  # frozen; its actors have missed it for long enough
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(state["driver"], signal.SIGKILL)
             if now - asked > 2.0:
                 asked = now
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
-                    break
             time.sleep(0.02)
         self._grown.pop(gang, None)
 
@@ -186,14 +207,15 @@ class RayEngine:
     def _outwait(folder: Folder, gang: str) -> None:
         """The driver died. Ray ends the actors of a dead driver, and an actor that hears of none for a while ends itself."""
         folder.plan(gang).unlink(missing_ok=True)
-        try:
+        with contextlib.suppress(OSError):  # there is no sign of life of one that never joined the cluster
             age = time.time() - folder.alive.stat().st_mtime
-        except OSError:
-            return  # it never joined the cluster
-        time.sleep(min(max(0.0, LEASE + 1.0 - age), LEASE + 1.0))
+            time.sleep(min(max(0.0, LEASE + 1.0 - age), LEASE + 1.0))
+        if state := read_json(folder.state(gang)):
+            nodes = [{**node, "running": False} for node in state["nodes"]]
+            write_json(folder.state(gang), {**state, "nodes": nodes, "phase": "stopped"})
 
     def _note(self, facts: Mapping[str, Any]) -> None:
-        if any(host.startswith(_NEW) for host in facts["hosts"]):
+        if any(host.startswith(NEW) for host in facts["hosts"]):
             self._grown[str(facts["ray"])] = facts["hosts"]
 
     def _document(self, plan: Plan) -> dict[str, Any]:
@@ -233,6 +255,7 @@ class RayEngine:
                     [*command, str(self._watch.seen.get("join")), str(commands)],
                     env={**self._environment, "MUSTER_JOB_ID": job, "MUSTER_STORE": str(self.home)},
                     pass_fds=(commands,),
+                    cwd=folder.path,  # Ray has workers look for modules where their driver was started
                     stdin=subprocess.DEVNULL,
                     stdout=said,
                     stderr=said,
@@ -247,7 +270,7 @@ class RayEngine:
         for other, process in list(self._drivers.items()):
             if process.poll() is not None:
                 del self._drivers[other]
-        for path in (self.home / "ray").iterdir():
+        for path in (self.home / "ray").glob("*"):
             if path.name != job:
                 Folder(path).send({"do": "leave"})
 
@@ -256,6 +279,13 @@ class RayEngine:
         for path in (self.home / "ray").glob("*"):
             if time.time() - path.stat().st_mtime > _KEPT and not Folder(path).is_driven():
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _not_a_node(head: str) -> str:
+    return (
+        f"this machine is no node of the Ray cluster at {head}, and drivers run on one: "
+        f"`ray start --address={head} --num-cpus=0` makes it one"
+    )
 
 
 def _ids(count: int) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from typing import Any
 import ray
 
 from orchestrator.engines import ray_node
-from orchestrator.engines.ray_folder import Folder
+from orchestrator.engines.ray_folder import NEW, Folder
 from orchestrator.engines.ray_gang import Gang, bundle_of
 
 _LINGER = 15.0
@@ -109,6 +109,11 @@ class Driver:
             gang.place(self.group)
         elif time.monotonic() > self._next_look:
             self._next_look = time.monotonic() + 1.0
+            there = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+            if gone := [node for node in gang.plan["nodes"] if node["pin"] and node["pin"] not in there]:
+                for node in gone:  # any other machine that has room will do
+                    node["pin"] = None
+                self._place(gang)
             gang.why = _why_waiting(gang.plan["nodes"])
 
     def _obey(self) -> bool:
@@ -176,6 +181,8 @@ def _why_waiting(nodes: list[Mapping[str, Any]]) -> str:
     if new:
         gpus = f", {new[0]['gpus']} GPUs" if new[0]["gpus"] else ""
         shape = f"{new[0]['cpus']:g} CPUs{gpus}, {new[0]['memory']} MiB"
+        if gone := [node["host"] for node in new if not node["host"].startswith(NEW)]:
+            return f"waits for {', '.join(gone)} to come back to the Ray cluster, or for another node with {shape}"
         return f"waits for {len(new)} more node{'s' if len(new) > 1 else ''} with {shape}: Ray's autoscaler was asked"
     return "waits for its placement group"
 

@@ -17,6 +17,9 @@ from typing import Any
 LEASE = 20.0
 """Seconds without a sign of life between a driver and an actor after which each gives the other up: an actor ends its node."""
 
+NEW = "ray/+"
+"""Names of hosts that the autoscaler could add begin so."""
+
 
 class Folder:
     """One job's folder."""

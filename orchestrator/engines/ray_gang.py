@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -52,7 +53,7 @@ class Gang:
 
     def tell(self) -> None:
         """Write the state file where something changed."""
-        state = {"gang": self.name, "phase": self.phase, "why": self.why, "nodes": self.nodes}
+        state = {"gang": self.name, "driver": os.getpid(), "phase": self.phase, "why": self.why, "nodes": self.nodes}
         if state != self.told:
             write_json(self.folder.state(self.name), state)
             self.told = json.loads(json.dumps(state))
@@ -63,8 +64,8 @@ class Gang:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether a node that was asked to end has not answered yet."""
-        return any(kind == "stop" for kind, _ in self.asked.values())
+        """Whether a node that was asked to end, or that is to say how it ended, has not answered yet."""
+        return any(kind in ("stop", "wait") for kind, _ in self.asked.values())
 
     def end(self, index: int, code: int | None, detail: str) -> None:
         node = self.nodes[index]
@@ -167,7 +168,7 @@ class Gang:
                 self.fail(f"node {index} on {host}: {answer['problem']}")
             elif answer["version"] != __version__:
                 self.fail(
-                    f"node {index} on {host} has Muster {answer['version']}, the controller {__version__}: install the same"
+                    f"node {index} on {host} has Muster {answer['version']}, the controller {__version__}: install the same on both"
                 )
         elif kind == "start":
             if answer:
@@ -191,6 +192,7 @@ class Gang:
                 if not self.nodes[index]["running"]:
                     self.heard[index] = now
             elif now - self.heard[index] > (_STARTING if self.phase == "starting" else LEASE):
+                self.nodes[index]["silent"] = True
                 self.end(index, None, "")
 
     def clear(self) -> None:
