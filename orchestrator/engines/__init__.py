@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orchestrator.engines.base import Engine, EngineError
 
-ENGINES = ("local", "docker")
+ENGINES = ("local", "docker", "slurm")
 
 
 def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> Engine:
@@ -32,4 +32,8 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
         except ModuleNotFoundError as error:
             raise EngineError("the docker engine is not installed: pip install 'muster[docker]'") from error
         return DockerEngine(home, cpus, gpus)
+    if name == "slurm":
+        from orchestrator.engines.slurm import SlurmEngine
+
+        return SlurmEngine()
     raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")

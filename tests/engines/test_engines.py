@@ -31,5 +31,5 @@ def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
 
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
     assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
-    with pytest.raises(EngineError, match="there is no engine 'slurm'"):
-        make_engine("slurm", tmp_path)
+    with pytest.raises(EngineError, match="there is no engine 'slumr'"):
+        make_engine("slumr", tmp_path)
