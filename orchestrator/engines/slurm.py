@@ -34,8 +34,8 @@ _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """What sbatch says where it would take the job later."""
 _LOOK = 0.3
 """Seconds between two looks at a job that is being stopped."""
-_AGAIN = 5.0
-"""Seconds after which what is still there is killed once more: it may have been starting."""
+_AGAIN = 2.0
+"""Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
 _FORGOTTEN = "0"
 """Number of a job that Slurm does not know any more."""
 _SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit code (\d+)|(.+))$", re.MULTILINE)
@@ -121,8 +121,11 @@ class SlurmEngine:
                     # to the script alone, which tells the nodes: it knows whether they have been started yet
                     _cancel("--batch", "--signal=USR1", number)
                     asked = True
+                elif now >= deadline and not killed:
+                    # the step at once; to end the job, Slurm asks once more and waits for KillWait
+                    _cancel("--signal=KILL", f"{number}.0")
+                    killed = now
                 elif now >= deadline and now - killed > _AGAIN:
-                    _cancel("--signal=KILL", number)
                     _cancel(number)
                     killed = now
             except Unreachable:

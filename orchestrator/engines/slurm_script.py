@@ -44,11 +44,11 @@ step=
 trap leave USR1
 trap : TERM
 
-meeting=$(PYTHON -P -m worker.slurm_node meet) || exit
+meeting=$(@python@ -P -m worker.slurm_node meet) || exit
 [ -z "$asked" ] || exit 75
-srun --export=ALL --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per-node=1 SHAPE --mpi=none --label \\
-  --kill-on-bad-exit=0 --wait=0 PYTHON -P -m worker.slurm_node node "$meeting" <<'MUSTER' &
-NODES
+srun --export=ALL --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per-node=1 @shape@ --mpi=none --label \\
+  --kill-on-bad-exit=0 --wait=0 @python@ -P -m worker.slurm_node node "$meeting" <<'MUSTER' &
+@nodes@
 MUSTER
 step=$!
 [ -z "$asked" ] || leave
@@ -72,8 +72,10 @@ def render(gang: Gang) -> str:
     directives = "\n".join(f"#SBATCH {name}={_quote(value)}" for name, value in _directives(gang).items())
     shape = f"--cpus-per-task={_cpus(gang)}"
     # safe in a here-document: a line of this JSON never is a bare word
-    body = _BODY.replace("PYTHON", shlex.quote(sys.executable)).replace("SHAPE", shape)
-    return f"#!/bin/bash\n{directives}\n#SBATCH --no-requeue\n{body.replace('NODES', json.dumps(_told(gang), indent=1), 1)}"
+    body = _BODY.replace("@python@", shlex.quote(sys.executable)).replace("@shape@", shape)
+    return (
+        f"#!/bin/bash\n{directives}\n#SBATCH --no-requeue\n{body.replace('@nodes@', json.dumps(_told(gang), indent=1))}"
+    )
 
 
 def _check(gang: Gang) -> None:

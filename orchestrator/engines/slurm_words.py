@@ -59,7 +59,8 @@ def waiting(job: SlurmJob) -> str:
     words = _WAITS.get(reason)
     if words is None and (reason.startswith(("QOS", "Assoc", "MaxJobs", "QOSJob"))):
         words = "a limit of the account or QOS is reached"
-    return f"Slurm: {words or 'waits'} ({job.reason}; job {job.number})"
+    named = "" if reason == "None" else f"{job.reason}; "
+    return f"Slurm: {words or 'waits'} ({named}job {job.number})"
 
 
 def ending(job: SlurmJob, output: str) -> tuple[int, str]:
