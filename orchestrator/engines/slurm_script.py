@@ -35,12 +35,16 @@ _NOTICE = 30.0
 _BODY = """
 # USR1 means: tell every node to save and leave. It comes from Slurm before the time limit, and from the controller.
 # TERM is Slurm's way to end all at once: the nodes have had it too, and get until KillWait.
-asked=
+asked= step=
 leave() {
   asked=1
-  [ -z "$step" ] || until scancel --signal=TERM "$SLURM_JOB_ID.0" 2>/dev/null || ! kill -0 "$step" 2>/dev/null; do sleep 0.2; done
+  for try in 1 2 3 4 5 6 7 8 9 10; do
+    [ -n "$step" ] && kill -0 "$step" 2>/dev/null || return
+    scancel --signal=TERM "$SLURM_JOB_ID.0" 2>/dev/null && return
+    sleep 0.3
+  done
+  scancel "$SLURM_JOB_ID"  # a slurmctld that was killed forgets a young step, but not the job
 }
-step=
 trap leave USR1
 trap : TERM
 

@@ -61,7 +61,7 @@ ReturnToService=2
 OverTimeLimit=0
 GresTypes=gpu
 {nodes}
-PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP PriorityTier=1 PreemptMode=CANCEL GraceTime={preempt_grace}
+PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE DefaultTime={default_time} State=UP PriorityTier=1 PreemptMode=CANCEL GraceTime={preempt_grace}
 PartitionName=urgent Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=10 PreemptMode=OFF
 PartitionName=short Nodes=ALL MaxTime=1 State=UP PriorityTier=1
 PartitionName=closed Nodes=ALL MaxTime=INFINITE State=DOWN
@@ -86,7 +86,14 @@ def _free_ports(count: int) -> list[int]:
 class SlurmCluster:
     """The daemons, and where their configuration is."""
 
-    def __init__(self, home: Path, kill_wait: int = 5, min_job_age: int = 300, preempt_grace: int = 20) -> None:
+    def __init__(
+        self,
+        home: Path,
+        kill_wait: int = 5,
+        min_job_age: int = 300,
+        preempt_grace: int = 20,
+        default_time: str = "INFINITE",
+    ) -> None:
         self.home = home
         self.conf = home / "slurm.conf"
         self.daemons: dict[str, subprocess.Popen[bytes]] = {}
@@ -110,6 +117,7 @@ class SlurmCluster:
                 kill_wait=kill_wait,
                 min_job_age=min_job_age,
                 preempt_grace=preempt_grace,
+                default_time=default_time,
             )
         )
         for number in range(GPUS):  # what Slurm hands out are device files, whatever is behind them

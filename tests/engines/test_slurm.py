@@ -5,26 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import signal
 import time
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
+from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.logs import LogFollower
-from shared_store.outcomes import read_outcome
+from shared_store.layout import StoreError
 from tests.conftest import wait_for
+from tests.engines.slurm_bench import POLITE, Bench
 from tests.engines.slurm_cluster import GPUS, NODES, SlurmCluster, need_slurm
-
-WAIT = "echo ready; exec sleep 600"
-POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+from worker import slurm_node
 
 
 @pytest.fixture(scope="module")
@@ -38,64 +32,6 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:
     finally:
         found.close()
     assert not found.processes()
-
-
-class Bench:
-    """An engine on the cluster, a store, and the gangs that were submitted."""
-
-    def __init__(self, cluster: SlurmCluster, home: Path) -> None:
-        self.cluster, self.store = cluster, Store(home / "store").open()
-        self.run = self.store.run("run")
-        self.run.create({"run": "run"})
-        raise_epoch(self.run, 1)
-        self.engine = SlurmEngine()
-        self.job = str(uuid.uuid4())
-        self.handles: list[str] = []
-
-    def gang(self, script: str = WAIT, nodes: int = 1, *, cpus: float = 0.5, gpus: int = 0, **changes: Any) -> Gang:
-        gang = Gang(
-            job=self.job + changes.pop("suffix", ""),
-            attempt=1,
-            epoch=1,
-            job_epoch=1,
-            run="run",
-            store=str(self.store.path),
-            queue="default",
-            pool="slurm",
-            main=0,
-            commands=[["bash", "-c", script]] * nodes,
-            environments=[{"GREETING": "hello", "MUSTER_ON_CHILD_FAILURE": "restart"}] * nodes,
-            placements=[Placement("slurm/any", tuple(map(str, range(gpus))), cpus, 64)] * nodes,
-            grace=5.0,
-            directory=None,
-        )
-        return dataclasses.replace(gang, **changes)
-
-    def launch(self, gang: Gang) -> str:
-        handle = self.engine.launch(self.engine.plan(gang))
-        self.handles.append(handle)
-        return handle
-
-    def ended(self, handle: str, engine: SlurmEngine | None = None) -> list[NodeStatus]:
-        def over() -> list[NodeStatus] | None:
-            status = list((engine or self.engine).observe(handle))
-            return status if not any(node.running for node in status) else None
-
-        return wait_for(over, 60, "the gang's end")  # type: ignore[no-any-return]
-
-    def log(self, suffix: str = "") -> list[str]:
-        return [line.text for line in LogFollower(self.run, self.job + suffix).drain()]
-
-    def ready(self, handle: str, nodes: int = 1, suffix: str = "") -> None:
-        wait_for(lambda: self.log(suffix).count("ready") == nodes, 30, "all are ready")
-        wait_for(lambda: all(node.address for node in self.engine.observe(handle)), 10, "Slurm says so")
-
-    def state(self, handle: str) -> str:
-        number = json.loads(handle)["slurm"]
-        return self.cluster.run("squeue", "-h", "-t", "all", "-j", number, "-o", "%T")
-
-    def processes(self, command: bytes) -> list[int]:
-        return self.cluster.processes(command)
 
 
 @pytest.fixture
@@ -318,82 +254,33 @@ def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: Bench) -> 
         assert not bench.processes(b"worker.supervisor") and not any(n.running for n in bench.engine.observe(handle))
 
 
-def ranks(bench: Bench) -> list[int]:
-    return bench.processes(b"sleep\x00600")
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"directory": "/no/such/place"}, "[Errno 2] No such file or directory: '/no/such/place'"),
+        # what a node with another disk at that path finds: no such epoch
+        pytest.param(
+            {"epoch": 2},
+            "store {store} has no epoch 2 of run run: it must be the controller's, on a shared file system",
+            marks=pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="it waits for NFS: MUSTER_LONG=1"),
+        ),
+    ],
+)
+def test_what_a_node_does_not_have_is_one_line_with_its_name(
+    bench: Bench, changes: dict[str, Any], problem: str
+) -> None:
+    for node, name in zip(bench.ended(bench.launch(bench.gang(nodes=2, **changes))), NODES, strict=False):
+        assert node.exit_code == 2
+        assert node.detail == f"muster: node {name}: {problem.format(store=bench.store.path)}"
 
 
-def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(nodes=3))
-    bench.ready(handle, 3)
-    parents = {pid: int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) for pid in ranks(bench)}
-    nodes = {
-        Path(f"/proc/{pid}/environ").read_bytes().partition(b"\0AWS_BATCH_JOB_NODE_INDEX=")[2][:1]: pid
-        for pid in parents
-    }
-    os.kill(nodes[b"0"], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[0].running, 20, "its end is seen")
-    outcome = read_outcome(bench.run, bench.job, 1, 0)
-    assert outcome and (outcome.exit_code, outcome.reason) == (137, "rank 0 was killed by SIGKILL")
-    assert [node.running for node in bench.engine.observe(handle)] == [False, True, True], "the others go on"
-    os.kill(parents[nodes[b"1"]], signal.SIGKILL)
-    wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
-    assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
-    wait_for(lambda: ranks(bench) == [nodes[b"2"]], 5, "its rank went with it")
-    step = int(Path(f"/proc/{parents[nodes[b'2']]}/stat").read_text().rpartition(")")[2].split()[1])
-    assert b"slurmstepd" in Path(f"/proc/{step}/cmdline").read_bytes()
-    os.kill(step, signal.SIGKILL)
-    wait_for(lambda: not ranks(bench), 5, "supervisor and rank went with it")
-
-
-def test_a_store_that_a_node_does_not_see_is_one_line_with_the_node_s_name(bench: Bench) -> None:
-    # what a node with another disk at that path would find: no such epoch
-    handle = bench.launch(bench.gang(nodes=2, epoch=2))
-    [first, second] = bench.ended(handle)
-    for node, name in ((first, "n1"), (second, "n2")):
-        assert node.exit_code == 2 and node.detail == (
-            f"muster: node {name}: store {bench.store.path} has no epoch 2 of run run: "
-            "it must be the controller's, on a shared file system"
-        )
-    lost = dataclasses.replace(bench.gang(suffix="2"), directory="/no/such/place")
-    [node] = bench.ended(bench.launch(lost))
-    assert node.detail == "muster: node n1: [Errno 2] No such file or directory: '/no/such/place'"
-
-
-def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(POLITE, 2))
-    bench.ready(handle, 2)
-    bench.cluster.kill("slurmctld")
-    with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
-        bench.launch(bench.gang(suffix="2"))
-    assert all(node.running for node in bench.engine.observe(handle)), "no news is no end"
-    with pytest.raises(EngineError, match=r"^slurmctld does not answer \(.*\); see `scontrol ping`$"):
-        SlurmEngine()
-    bench.cluster.start("slurmctld")
-    wait_for(lambda: "UP" in bench.cluster.run("scontrol", "ping"), 30, "it is back")
-
-    def launched() -> str | None:
-        try:
-            return bench.launch(bench.gang("exit 4", suffix="2"))
-        except NotYet:
-            return None
-
-    second = wait_for(launched, 30, "it is submitted")
-    assert [node.exit_code for node in bench.ended(second)] == [4]
-    bench.engine.stop(handle, 30.0)
-    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
-
-
-def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: Bench) -> None:
-    # Slurm announces up to a minute early: with 90 s of notice, a limit of one minute is announced at once
-    handle = bench.launch(bench.gang(POLITE, 2, options={"time": "1"}))
-    assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
-    assert bench.log().count("saved") == 2 and "TIMEOUT" not in bench.state(handle)
-
-
-def test_a_partition_with_priority_preempts_and_the_nodes_save_and_leave(bench: Bench) -> None:
-    low = bench.launch(bench.gang(POLITE, 3, cpus=4))
-    bench.ready(low, 3)
-    high = bench.launch(bench.gang(nodes=3, cpus=4, suffix="2", options={"partition": "urgent"}))
-    assert [node.exit_code for node in bench.ended(low)] == [75, 75, 75]
-    assert bench.log().count("saved") == 3
-    bench.ready(high, 3, "2")
+def test_a_node_that_does_not_see_the_controller_s_store_says_so(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slurm_node, "_PATIENCE", 0.2)
+    [plan] = bench.engine.plan(bench.gang()).nodes
+    slurm_node.check_store(plan.contract)
+    with pytest.raises(StoreError, match=r"has no epoch 2 of run run: it must be the controller's, on a shared file"):
+        slurm_node.check_store(dataclasses.replace(plan.contract, epoch=2))
+    with pytest.raises(StoreError, match=r"^store /nowhere is not there: it must be the controller's"):
+        slurm_node.check_store(dataclasses.replace(plan.contract, store="/nowhere"))
