@@ -56,8 +56,8 @@ srun --export=ALL --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES"
 MUSTER
 step=$!
 [ -z "$asked" ] || leave
-while wait "$step"; code=$?; kill -0 "$step" 2>/dev/null; do :; done
-exit "$code"
+while wait "$step"; kill -0 "$step" 2>/dev/null; do :; done  # a signal, too, ends a wait
+wait "$step"
 """
 
 

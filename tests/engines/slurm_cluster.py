@@ -120,9 +120,13 @@ class SlurmCluster:
                 default_time=default_time,
             )
         )
-        for number in range(GPUS):  # what Slurm hands out are device files, whatever is behind them
-            os.mknod(home / "devices" / f"gpu{number}", 0o666 | stat.S_IFCHR, os.makedev(1, 3))
-        (home / "gres.conf").write_text(f"NodeName={','.join(NODES)} Name=gpu File={home}/devices/gpu[0-{GPUS - 1}]\n")
+        gpus = f"{home}/devices/gpu[0-{GPUS - 1}]"
+        try:
+            for number in range(GPUS):  # what Slurm hands out are device files, whatever is behind them
+                os.mknod(home / "devices" / f"gpu{number}", 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        except PermissionError:
+            gpus = f"/dev/tty[0-{GPUS - 1}]"
+        (home / "gres.conf").write_text(f"NodeName={','.join(NODES)} Name=gpu File={gpus}\n")
 
     # -- daemons ------------------------------------------------------------------------------------------------------
 
