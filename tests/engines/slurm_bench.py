@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 import uuid
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,13 @@ class Bench:
     def state(self, handle: str) -> str:
         number = json.loads(handle)["slurm"]
         return self.cluster.run("squeue", "-h", "-t", "all", "-j", number, "-o", "%T")
+
+    def saved(self, handle: str) -> None:
+        """Wait until slurmctld has saved that the job runs: it does so every few seconds, and forgets the rest when it is killed."""
+        number, state = json.loads(handle)["slurm"], self.cluster.home / "state" / "job_state"
+        asked = time.time()
+        self.cluster.run("scontrol", "update", f"jobid={number}", "admincomment=seen")
+        wait_for(lambda: state.exists() and state.stat().st_mtime > asked, 30, "the state is saved")
 
     def processes(self, command: bytes) -> list[int]:
         return self.cluster.processes(command)

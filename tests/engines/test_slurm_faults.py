@@ -126,6 +126,7 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
 def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
     handle = bench.launch(bench.gang(POLITE, 2))
     bench.ready(handle, 2)
+    bench.saved(handle)
     bench.cluster.kill("slurmctld")
     with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
         bench.launch(bench.gang(suffix="2"))
