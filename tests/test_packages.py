@@ -19,7 +19,7 @@ FORBIDDEN = {
     "shared_store": HEAVY | {"worker", "orchestrator"},
     "worker": {"orchestrator"},
 }
-LIGHT_IN_WORKER = ("supervisor.py", "rank.py", "processes.py", "network.py", "__init__.py")
+LIGHT_IN_WORKER = ("supervisor.py", "rank.py", "processes.py", "network.py", "slurm_node.py", "__init__.py")
 
 
 def imported(path: Path) -> set[str]:
@@ -44,7 +44,7 @@ def test_no_module_imports_what_its_room_may_not(package: str) -> None:
 def test_the_supervisor_imports_no_torch() -> None:
     for name in LIGHT_IN_WORKER:
         assert not imported(REPOSITORY / "worker" / name) & HEAVY, name
-    code = "import sys, worker.supervisor, orchestrator.cli; print(*sys.modules)"
+    code = "import sys, worker.supervisor, worker.slurm_node, orchestrator.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not set(loaded) & HEAVY
 

@@ -13,7 +13,7 @@ _SIOCGIFADDR = 0x8915
 def interface_of(address: str | None, peer: str) -> str | None:
     """Name of the interface that holds ``address``, or, without one, of that which leads to ``peer``; None if none does."""
     try:
-        found = ipaddress.ip_address(address or _address_towards(peer))
+        found = ipaddress.ip_address(address or address_towards(peer))
     except (OSError, ValueError):
         return None
     if found.is_loopback:
@@ -24,7 +24,7 @@ def interface_of(address: str | None, peer: str) -> str | None:
     return None
 
 
-def _address_towards(peer: str) -> str:
+def address_towards(peer: str) -> str:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect((peer, 9))  # sends nothing: it only asks the kernel for the route
         return str(probe.getsockname()[0])

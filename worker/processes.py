@@ -34,6 +34,14 @@ def die_with_parent() -> Callable[[], None]:
     return tie
 
 
+def follow_parent() -> None:
+    """Have this process, and what it becomes by exec, killed by the kernel when its parent dies."""
+    parent = os.getppid()
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
 def adopt_orphans() -> None:
     """Have descendants whose parent dies re-parented to this process instead of to init, so that they can be found."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)

@@ -36,4 +36,8 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
         from orchestrator.engines.ray import RayEngine
 
         return RayEngine(home)
+    if name == "slurm":
+        from orchestrator.engines.slurm import SlurmEngine
+
+        return SlurmEngine()
     raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")

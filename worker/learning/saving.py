@@ -6,6 +6,7 @@ import io
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -155,15 +156,24 @@ class Saver:
             pass  # it has just died: the answer that does not come says so
 
     def _start(self) -> None:
-        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it."""
+        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it.
+
+        Slurm sends SIGTERM to every process of a step, whatever its session: the writer ignores it from its first instant.
+        """
         self._answers = b""
+        tie = die_with_parent()
+
+        def prepare() -> None:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            tie()
+
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "worker.saver"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=self._memory,
             start_new_session=True,
-            preexec_fn=die_with_parent(),
+            preexec_fn=prepare,
         )
 
     def _take_answer(self, seconds: float | None) -> bool:

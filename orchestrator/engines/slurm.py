@@ -1,0 +1,225 @@
+"""The Slurm engine: a gang is one Slurm job with one task a node; queueing, shares, limits and preemption are Slurm's.
+
+Every start of a gang is a submission of its own (``--no-requeue``). ``scontrol requeue`` and ``RequeueExit`` would start the same script
+again, with the epoch of an attempt that is over: the fenced nodes would leave at once. So a gang that was preempted or came to its
+time limit leaves with 75, and the controller submits a new attempt with a new epoch; ``SLURM_RESTART_COUNT`` stays unset.
+
+One ``srun`` step with ``--kill-on-bad-exit=0``: to Slurm, 75 is a bad exit, and a child's death means nothing with ``on_child_failure:
+ignore``. Who judges is the controller, as on every engine, from the outcomes in the store; of a node that left none, from what
+``srun`` says of its task in the job's output. Then it stops the gang, as a whole.
+
+A child of a job array is a single-node job here, which the controller starts: dependencies, retries and states are AWS's, which
+Slurm's arrays do not have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
+from orchestrator.engines.slurm_commands import Hosts, Jobs, SlurmJob, Unreachable, address_of_this_machine, call
+from orchestrator.engines.slurm_script import output_path, render
+from orchestrator.engines.slurm_words import OVER, QUEUED, ending, waiting
+from shared_store.layout import Store
+from shared_store.outcomes import read_outcome
+
+_FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
+"""What sbatch says where it would take the job later."""
+_LOOK = 0.3
+"""Seconds between two looks at a job that is being stopped."""
+_AGAIN = 2.0
+"""Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
+_FORGOTTEN = "0"
+"""Number of a job that Slurm does not know any more."""
+_SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit code (\d+)|(.+))$", re.MULTILINE)
+_SIGNALS = {"Killed": 137, "Terminated": 143, "Segmentation fault": 139, "Aborted": 134, "Out Of Memory": 137}
+_MEETING = re.compile(r"^muster: meeting (\{.*\})$", re.MULTILINE)
+
+
+class SlurmEngine:
+    """A Slurm cluster, by the commands of this machine."""
+
+    name = "slurm"
+    queues = True
+
+    def __init__(self) -> None:
+        """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""
+        self._hosts = Hosts()
+        self.address = address_of_this_machine()
+        self._jobs = Jobs()
+        self._submitted: dict[str, float] = {}
+        self._submitting = threading.Lock()
+
+    def capacity(self) -> Sequence[Host]:
+        return self._hosts.get()
+
+    def plan(self, gang: Gang) -> Plan:
+        """With the whole script; the nodes' addresses are known when Slurm has placed them."""
+        shown = dataclasses.replace(gang, bus_token="…") if gang.bus_token else gang
+        return Plan(gang, node_plans(gang, [""] * len(gang.placements), 0), render(shown))
+
+    def launch(self, plan: Plan) -> str:
+        gang = plan.gang
+        script = render(gang)
+        facts = {
+            "gang": gang.name,
+            "job": gang.job,
+            "attempt": gang.attempt,
+            "run": gang.run,
+            "store": gang.store,
+            "nodes": len(gang.placements),
+            "main": gang.main,
+            "native": any(environment.get("MUSTER_ON_CHILD_FAILURE") for environment in gang.environments),
+            "output": output_path(gang),
+        }
+        if trouble := self._jobs.away():
+            raise NotYet(f"Slurm: {trouble}")
+        with self._submitting:  # one look and one submission at a time
+            try:
+                number = self._find(facts) or self._submit(gang, script)
+            except Unreachable as error:
+                raise NotYet(f"Slurm: {error}") from error
+            self._submitted[number] = time.monotonic()
+        return json.dumps({**facts, "slurm": number})
+
+    def observe(self, handle: str) -> GangStatus:
+        facts = json.loads(handle)
+        if "slurm" not in facts:
+            return [NodeStatus(False, "", None, "another engine started it") for _ in facts.get("nodes", [])]
+        count = facts["nodes"]
+        try:
+            job = self._job(facts)
+        except Unreachable as error:
+            return [NodeStatus(True, "", waiting=f"Slurm: {error}")] * count
+        if job is not None and job.state in QUEUED:
+            return [NodeStatus(True, "", waiting=waiting(job))] * count
+        said = _said(facts)
+        return [_node(facts, job, said, index) for index in range(count)]
+
+    def stop(self, handle: str, grace: float) -> None:
+        facts = json.loads(handle)
+        if "slurm" not in facts:
+            return
+        number, deadline, asked, killed = facts["slurm"], time.monotonic() + grace, False, 0.0
+        while True:
+            try:
+                job = self._job(facts, _LOOK)
+                if job is None or job.state in OVER:
+                    self._submitted.pop(number, None)
+                    return
+                now = time.monotonic()
+                if job.state in QUEUED:
+                    _cancel(number)
+                elif not asked and grace > 0:
+                    # to the script alone, which tells the nodes: it knows whether they have been started yet
+                    _cancel("--batch", "--signal=USR1", number)
+                    asked = True
+                elif now >= deadline and not killed:
+                    # the step at once; to end the job, Slurm asks once more and waits for KillWait
+                    _cancel("--signal=KILL", f"{number}.0")
+                    killed = now
+                elif now >= deadline and now - killed > _AGAIN:
+                    _cancel(number)
+                    killed = now
+            except Unreachable:
+                pass  # a cluster that does not answer can't say that the job is over
+            time.sleep(_LOOK)
+
+    # -- jobs ---------------------------------------------------------------------------------------------------------
+
+    def _find(self, facts: Mapping[str, Any]) -> str | None:
+        """The number of a gang that was submitted before: its controller died, or sbatch's answer was lost. Raises EngineError."""
+        for job in self._jobs.fresh().values():
+            if job.comment == facts["gang"]:
+                return job.number
+        run = Store(facts["store"]).run(facts["run"])
+        if run.outcome(facts["job"], facts["attempt"], facts["main"]).exists():
+            return _FORGOTTEN  # it ran and ended long ago: not a second time
+        return None
+
+    @staticmethod
+    def _submit(gang: Gang, script: str) -> str:
+        Path(output_path(gang)).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            return call("sbatch", "--parsable", text=script).strip().partition(";")[0]
+        except Unreachable:
+            raise
+        except EngineError as error:
+            if _FULL.search(str(error)):
+                raise NotYet(f"Slurm takes no more jobs now: {error}") from error
+            where = gang.options.get("partition")
+            raise EngineError(
+                f"Slurm refuses the job{f' for partition {where}' if where else ''}: {error}; "
+                "`muster submit --dry-run` shows what it is asked for"
+            ) from error
+
+    def _job(self, facts: Mapping[str, Any], age: float = 1.0) -> SlurmJob | None:
+        """None where Slurm has forgotten it. Raises Unreachable."""
+        number = facts["slurm"]
+        job = self._jobs.get(number, self._submitted.get(number, 0.0), age)
+        return job if job is not None and job.comment == facts["gang"] else None
+
+
+def _cancel(*arguments: str) -> None:
+    try:
+        call("scancel", *arguments)
+    except Unreachable:
+        raise
+    except EngineError:
+        pass  # it ended meanwhile
+
+
+def _said(facts: Mapping[str, Any]) -> str:
+    """The job's output so far."""
+    try:
+        return Path(facts["output"]).read_text(errors="replace")
+    except OSError:
+        return ""
+
+
+def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int) -> NodeStatus:
+    """How one node is, by its outcome, else by what srun says of its task, else by its job."""
+    task = 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
+    meeting = _MEETING.search(said)
+    address = json.loads(meeting[1])["addresses"][task] if meeting else ""
+    outcome = read_outcome(Store(facts["store"]).run(facts["run"]), facts["job"], facts["attempt"], index)
+    if outcome is not None:
+        return NodeStatus(False, address, outcome.exit_code)
+    # what the node's own processes said before they could say it in the store
+    own = re.findall(rf"^\s*{'0*' + str(task)}: (muster.*)$", said, re.MULTILINE)
+    for tasks, code, how in _SAID.findall(said):
+        if _among(task, tasks):
+            status = int(code) if code else _SIGNALS.get(how.removesuffix(" (core dumped)"), 137)
+            return NodeStatus(False, address, status, own[-1] if own else "")
+    if job is not None and job.state not in OVER:
+        return NodeStatus(True, address)
+    if not meeting and (
+        early := re.findall(
+            r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", said, re.MULTILINE
+        )
+    ):
+        return NodeStatus(False, address, 2, own[-1] if own else early[-1])
+    if own:
+        return NodeStatus(False, address, 2, own[-1])
+    if job is None:
+        return NodeStatus(False, address, None, "Slurm has forgotten the job, and the node left no outcome")
+    code_, detail = ending(job, facts["output"])
+    # where a host is gone, a job of the Batch API is told so in AWS's words
+    gone = job.state in ("NODE_FAIL", "PREEMPTED", "BOOT_FAIL") and not facts["native"]
+    return NodeStatus(False, address, None, "") if gone else NodeStatus(False, address, code_, detail)
+
+
+def _among(task: int, tasks: str) -> bool:
+    """Whether srun's ``0-2,5`` names the task."""
+    for part in tasks.split(","):
+        first, _, last = part.partition("-")
+        if int(first) <= task <= int(last or first):
+            return True
+    return False

@@ -1,0 +1,144 @@
+"""A training on Slurm: the loss of a node whose ranks live on, of the controller, and the same bits as on the local engine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from orchestrator import specfile
+from orchestrator.definition import compile_definition, compile_submission
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.conftest import REPOSITORY, Serving, wait_for
+from tests.engines.slurm_cluster import SlurmCluster, need_slurm
+
+CHANGES = ("nodes=2", "train.iterations=24", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
+
+
+@pytest.fixture
+def cluster(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SlurmCluster]:
+    need_slurm()
+    found = SlurmCluster(tmp_path / "slurm", default_time=getattr(request, "param", "INFINITE"))
+    monkeypatch.setenv("SLURM_CONF", str(found.conf))
+    try:
+        found.start()
+        found.ready()
+        yield found
+    finally:
+        found.close()
+    assert not found.processes()
+
+
+def environment(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/environ").read_bytes()
+    except OSError:
+        return b""
+
+
+def submit(serving: Serving, run: str, *changes: str) -> str:
+    """Cart-pole on two nodes as run ``run``; returns the job id."""
+    spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), [*CHANGES, *changes])
+    request = compile_definition(spec, str(REPOSITORY))
+    container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    container["environment"].append({"name": "MUSTER_RUN", "value": run})
+    arn = serving.client.batch("RegisterJobDefinition", **request)["jobDefinitionArn"]
+    job: str = serving.client.batch("SubmitJob", **compile_submission(spec, arn))["jobId"]
+    return job
+
+
+def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_the_local_engine(
+    cluster: SlurmCluster, tmp_path: Path
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    slurm = Serving(home, "--engine", "slurm")
+    run = Store(home / "store").run("queued")
+
+    def iterations() -> int:
+        return len(read_metrics(run)) if run.path.exists() else 0
+
+    try:
+        job = submit(slurm, "queued")
+        wait_for(lambda: iterations() >= 6, 120, "some iterations")
+        # the main node is on n1; n2 hangs with all that is on it, as a machine that swaps does
+        frozen = [pid for pid in cluster.processes(b"worker.") if b"SLURMD_NODENAME=n2" in environment(pid)]
+        assert len(frozen) >= 2, "supervisor and rank"
+        for pid in frozen:
+            os.kill(pid, signal.SIGSTOP)
+        cluster.kill("n2")
+        wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
+        assert all(b"SLURMD_NODENAME=n2" in environment(pid) for pid in frozen), "what ran there is still there"
+        slurm.kill()
+        slurm.start()
+        wait_for(lambda: slurm.detail(job)["status"] == "RUNNING", 60, "it runs again")
+        for pid in frozen:
+            os.kill(pid, signal.SIGCONT)
+        done = slurm.wait(job, timeout=180)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], slurm.log(job)[-20:])
+        assert [attempt["number"] for attempt in done["attempts"]] == [1, 2], done["attempts"]
+        assert any("resumed from checkpoint" in line for line in slurm.log(job))
+        wait_for(lambda: not cluster.processes(b"worker."), 30, "no process is left")
+    finally:
+        slurm.close()
+    local = Serving(home, "--cpus", "4")
+    try:
+        job = submit(local, "unqueued")
+        assert local.wait(job, timeout=180)["status"] == "SUCCEEDED"
+    finally:
+        local.close()
+    compared = subprocess.run(
+        [sys.executable, "-P", "-m", "worker.compare", "queued", "unqueued"],
+        env={**os.environ, "MUSTER_STORE": str(home / "store")},
+        capture_output=True,
+        text=True,
+    )
+    assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
+
+
+long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
+
+
+@long
+@pytest.mark.parametrize("cluster", ["2"], indirect=True)
+def test_at_the_time_limit_it_saves_leaves_and_is_submitted_anew(cluster: SlurmCluster, tmp_path: Path) -> None:
+    """Two minutes a submission: the notice comes half a minute after the start."""
+    taken_back(tmp_path, iterations=500)
+
+
+@long
+def test_when_it_is_preempted_it_saves_leaves_and_is_submitted_anew(cluster: SlurmCluster, tmp_path: Path) -> None:
+    def preempt() -> None:
+        script = ["--nodes=3", "--cpus-per-task=4", "--output=/dev/null", "--wrap", "sleep 5"]
+        cluster.run("sbatch", "--partition=urgent", *script)
+
+    taken_back(tmp_path, iterations=150, then=preempt)
+
+
+def taken_back(tmp_path: Path, iterations: int, then: Callable[[], None] = lambda: None) -> None:
+    """A training that Slurm ends in between, by ``then`` or by itself: no iteration is lost."""
+    home = tmp_path / "home"
+    home.mkdir()
+    slurm = Serving(home, "--engine", "slurm")
+    run = Store(home / "store").run("taken")
+    try:
+        job = submit(slurm, "taken", f"train.iterations={iterations}", "checkpoint.every=100000")
+        wait_for(lambda: run.path.exists() and len(read_metrics(run)) >= 6, 120, "some iterations")
+        then()
+        done = slurm.wait(job, timeout=300)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], slurm.log(job)[-20:])
+        first = done["attempts"][0]
+        assert (first["exitCode"], first["statusReason"]) == (75, "checkpointed and left on request"), first
+        assert len(done["attempts"]) >= 2
+        left = slurm.log(job)
+        assert any("resumed from checkpoint" in line for line in left), left[-20:]
+        numbers = [record["iteration"] for record in read_metrics(run)]
+        assert numbers == sorted(set(numbers)) and len(numbers) == iterations, "no iteration was done twice"
+    finally:
+        slurm.close()
