@@ -19,7 +19,15 @@ FORBIDDEN = {
     "shared_store": HEAVY | {"worker", "orchestrator"},
     "worker": {"orchestrator"},
 }
-LIGHT_IN_WORKER = ("supervisor.py", "rank.py", "processes.py", "network.py", "__init__.py")
+LIGHT_IN_WORKER = (
+    "supervisor.py",
+    "aws_node.py",
+    "lifeline.py",
+    "rank.py",
+    "processes.py",
+    "network.py",
+    "__init__.py",
+)
 
 
 def imported(path: Path) -> set[str]:

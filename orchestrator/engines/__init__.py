@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orchestrator.engines.base import Engine, EngineError
 
-ENGINES = ("local", "docker")
+ENGINES = ("local", "docker", "aws-batch")
 
 
 def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> Engine:
@@ -32,4 +32,10 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
         except ModuleNotFoundError as error:
             raise EngineError("the docker engine is not installed: pip install 'muster[docker]'") from error
         return DockerEngine(home, cpus, gpus)
+    if name == "aws-batch":
+        try:
+            from orchestrator.engines.aws_batch import AwsBatchEngine
+        except ModuleNotFoundError as error:
+            raise EngineError("the aws-batch engine is not installed: pip install 'muster[aws]'") from error
+        return AwsBatchEngine(home)
     raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")
