@@ -152,6 +152,10 @@ def take_run(contract: NodeContract, description: Mapping[str, object], line: Ma
         if isinstance(line, ChildEnd):
             line.attach()
         time.sleep(0.1)
+    if isinstance(line, ChildEnd):
+        line.attach(
+            now=True
+        )  # before anything runs that could fail: the main node listens since before it took the run
 
 
 def main(argv: list[str]) -> int:

@@ -22,6 +22,8 @@ _IDLE, _INTERVAL, _PROBES = 5, 5, 3
 """Keepalive: a host that is gone is noticed after ``_IDLE + _INTERVAL * _PROBES`` seconds."""
 _RETRY = 0.5
 """Seconds between two tries to reach the main node."""
+_ARRIVAL = 1800.0
+"""Seconds that a child may take to come after the main node: its instance pulls an image of many gigabytes."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class MainEnd:
         self._server = socket.create_server((contract.address or contract.master_address, PORT), backlog=256)
         self._server.setblocking(False)
         self._lines: list[_Line] = []
+        self._missing = set(range(contract.node_count)) - {contract.node_index}
+        self._deadline = time.monotonic() + _ARRIVAL
 
     def lost(self) -> Loss | None:
         """The first child that was found to have failed since the last call; None while all is well."""
@@ -53,11 +57,16 @@ class MainEnd:
             self._lines.append(_Line(connection))
         found = None
         for line in list(self._lines):
-            if line.read():
-                continue
-            self._lines.remove(line)
-            if found is None and line.told.get("gang") == self._gang:
-                found = _loss(line.told)
+            there = line.read()
+            ours = line.told.get("gang") == self._gang
+            if ours:
+                self._missing.discard(line.told["node"])
+            if not there:
+                self._lines.remove(line)
+                if ours and found is None:
+                    found = _loss(line.told)
+        if found is None and self._missing and time.monotonic() > self._deadline:
+            found = Loss(f"node {min(self._missing)} has not come within {_ARRIVAL:.0f} s of the main node", 1)
         return found
 
 
@@ -104,9 +113,9 @@ class ChildEnd:
         self._connection: socket.socket | None = None
         self._next = 0.0
 
-    def attach(self) -> None:
-        """Reach the main node, which may not listen yet; at most one try in half a second."""
-        if self._connection is None and time.monotonic() >= self._next:
+    def attach(self, now: bool = False) -> None:
+        """Reach the main node, which may not listen yet; at most one try in half a second, or one ``now``."""
+        if self._connection is None and (now or time.monotonic() >= self._next):
             self._next = time.monotonic() + _RETRY
             with contextlib.suppress(OSError):
                 self._connection = socket.create_connection((self._contract.master_address, PORT), timeout=1.0)
@@ -114,8 +123,7 @@ class ChildEnd:
 
     def tell(self, exit_code: int, reason: str) -> None:
         """The last word: how the node ended."""
-        self._next = 0.0
-        self.attach()
+        self.attach(now=True)
         self._say(code=exit_code, reason=reason)
 
     def _say(self, **words: object) -> None:

@@ -24,7 +24,7 @@ from orchestrator.engines.aws_logs import GangLogs, NodeLog
 from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
 from shared_store.layout import Store
-from shared_store.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
 
 _OVER = ("SUCCEEDED", "FAILED")
 _PORT = 29500
@@ -32,6 +32,8 @@ _CAPACITY_AGE = 60.0
 """Seconds for which AWS's answer about its size is kept."""
 _STRAGGLE = 180.0
 """Seconds after a job's end within which AWS says of every node that it ended, too."""
+_BLAME = 60.0
+"""Seconds that a failed main node waits for its children's ends: AWS ends them now, and one may have been the cause."""
 _FIXED = 6.0
 """Seconds that an outcome on a shared volume may take to be seen."""
 _REMEMBERED = 256
@@ -202,9 +204,14 @@ class AwsBatchEngine:
         if parent["status"] in _OVER and watched.over_since is None:
             watched.over_since = time.monotonic()
         straggled = watched.over_since is not None and time.monotonic() - watched.over_since > _STRAGGLE
-        return [
+        status = [
             self._node(facts, watched, index, nodes.get(index) or parent, parent, straggled) for index in range(count)
         ]
+        main = facts["main"]
+        failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
+        if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
+            status[main] = NodeStatus(True, status[main].address)
+        return status
 
     def _describe(self, facts: Mapping[str, Any]) -> tuple[dict[str, Any] | None, dict[int, dict[str, Any]]]:
         """The job, and its nodes by index: those that AWS tells of."""
@@ -236,23 +243,20 @@ class AwsBatchEngine:
         code = container.get("exitCode")
         code = 0 if code is None and status == "SUCCEEDED" else code
         reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
-        if code is not None and not self._settled(facts, watched, index, log, int(code), str(reason)):
+        ended = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
+        seen = Outcome(index, facts["epoch"], code or 0, None, str(reason) or _exited(code), None, ended, ended)
+        if code is not None and not self._settled(facts, watched, log, seen):
             return NodeStatus(True, address)  # it has ended, but how is still on its way
         return NodeStatus(False, address, code, str(reason))
 
-    def _settled(
-        self, facts: Mapping[str, Any], watched: _Watched, index: int, log: NodeLog | None, code: int, reason: str
-    ) -> bool:
+    def _settled(self, facts: Mapping[str, Any], watched: _Watched, log: NodeLog | None, seen: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here where nobody else did."""
         run = Store(facts["store"]).run(facts["run"])
-        if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
+        if read_outcome(run, facts["job"], facts["attempt"], seen.node) is not None:
             return True
-        since = time.monotonic() - watched.ended[index]
+        since = time.monotonic() - watched.ended[seen.node]
         if not (log.whole if log is not None else since > _FIXED):
             return False
-        ended = time.time()
-        said = reason if reason and code else "done" if code == 0 else f"container exited with code {code}"
-        seen = Outcome(index, facts["epoch"], code, None, said, None, ended, ended)
         if run.path.exists():
             write_outcome(run, facts["job"], facts["attempt"], (log.outcome if log else None) or seen)
         return True
@@ -312,6 +316,10 @@ def _waiting(
         f"AWS Batch gets {count} instance{'s' if count > 1 else ''} for queue {queue} ({status}); "
         "if that lasts, see `muster aws status` for limits and the account's quota of vCPUs"
     )
+
+
+def _exited(code: int | None) -> str:
+    return f"container exited with code {code}" if code else "done"
 
 
 def _is_transient(error: ClientError) -> bool:

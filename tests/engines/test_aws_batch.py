@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,12 +45,15 @@ class Bench:
         self.volume = Store(home / "efs").open()
         self.store = self.volume if config.get("store_is_shared") else Store(home / "store").open()
         settings = {"store": str(self.volume.path), "poll": 0.1, "store_is_shared": False, **config}
-        save_config(home, AwsConfig("us-east-1", "default", "muster", endpoint_url=aws.url, **settings))
+        told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
+        save_config(home, AwsConfig(**told))
         self.engine = AwsBatchEngine(home)
         self.handles: list[str] = []
         self.run = self.store.run("run")
 
-    def gang(self, script: str = WAIT, nodes: int = 2, *, attempt: int = 1, native: bool = True, **changes: Any) -> Gang:
+    def gang(
+        self, script: str = WAIT, nodes: int = 2, *, attempt: int = 1, native: bool = True, **changes: Any
+    ) -> Gang:
         environment = {"GREETING": "hello", **({"MUSTER_ON_CHILD_FAILURE": "restart"} if native else {})}
         self.run.create({"run": "run"})
         if read_epoch(self.run) < attempt:
@@ -174,3 +176,203 @@ def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: Bench) 
     outcome = bench.outcome(0)
     assert node.exit_code == 3 and outcome.exit_code == 3
     assert outcome.error is not None and outcome.error.message == "RuntimeError: no", outcome
+
+
+def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tmp_path: Path) -> None:
+    bench = Bench(aws, tmp_path, image="1.dkr.ecr/muster:2", file_system="fs-1", access_point="fsap-1", efa=True)
+    gang = bench.gang(nodes=3, timeout=100, placements=[Placement("h", ("0", "1"), 3.5, 4096)] * 3)
+    plan = bench.engine.plan(gang)
+    document = json.loads(plan.document)
+    definition, submission = document["RegisterJobDefinition"], document["SubmitJob"]
+    [entry] = definition["nodeProperties"]["nodeRangeProperties"]
+    container = entry["container"]
+    assert (entry["targetNodes"], container["image"]) == ("0:2", "1.dkr.ecr/muster:2")
+    assert container["command"] == ["python", "-P", "-m", "worker.aws_node", "--", "sh", "-c", WAIT]
+    amounts = {each["type"]: each["value"] for each in container["resourceRequirements"]}
+    assert amounts == {"VCPU": "4", "MEMORY": "4096", "GPU": "2"}, "AWS takes whole vCPUs only"
+    assert container["linuxParameters"]["sharedMemorySize"] == 2048
+    assert container["linuxParameters"]["devices"][0]["hostPath"] == "/dev/infiniband/uverbs0"
+    assert container["volumes"][0]["efsVolumeConfiguration"] == {
+        "fileSystemId": "fs-1",
+        "transitEncryption": "ENABLED",
+        "authorizationConfig": {"accessPointId": "fsap-1", "iam": "ENABLED"},
+    }
+    assert container["mountPoints"][0]["containerPath"] == str(bench.volume.path)
+    assert container["logConfiguration"]["options"] == {"awslogs-group": "/aws/batch/job"}
+    assert definition["retryStrategy"] == {"attempts": 1} and submission["timeout"] == {"attemptDurationSeconds": 700}
+    names = {each["name"] for each in container["environment"]}
+    assert not any(name.startswith("AWS_BATCH") for name in names), "reserved on AWS"
+    again = json.loads(bench.engine.plan(bench.gang(nodes=3, attempt=2, placements=gang.placements)).document)
+    assert again["RegisterJobDefinition"] == definition, "one definition for all attempts"
+    tagged = bench.gang(nodes=1, options={"job-queue": "night", "image": "other:1", "share": "alice"}, priority=7)
+    changed = json.loads(bench.engine.plan(tagged).document)["SubmitJob"]
+    assert (changed["jobQueue"], changed["shareIdentifier"], changed["schedulingPriorityOverride"]) == (
+        "night",
+        "alice",
+        7,
+    )
+
+
+def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: Bench) -> None:
+    kinds = [["sh", "-c", f"echo kind {kind}"] for kind in (0, 0, 1)]
+    handle = bench.launch(bench.gang(nodes=3, commands=kinds, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 3))
+    bench.ended(handle)
+    assert [line for line in bench.log() if line == "kind 0"] and bench.outcome(0).exit_code == 0
+    many = [["echo", str(kind)] for kind in range(6)]
+    with pytest.raises(EngineError, match="of 6 kinds; AWS Batch takes at most 5"):
+        bench.engine.plan(bench.gang(nodes=6, commands=many))
+
+
+def test_what_was_submitted_by_a_controller_that_died_is_found(bench: Bench) -> None:
+    gang = bench.gang()
+    handle = bench.launch(gang)
+    successor = AwsBatchEngine(bench.home)
+    assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
+    bench.ready(2)
+    assert len(bench.processes()) == len({*bench.processes()}) and len(processes_of(bench.volume.path)) == 2
+    bench.engine.stop(handle, 1.0)
+    second = bench.gang("exit 0", attempt=2)
+    assert json.loads(bench.launch(second))["aws"] != json.loads(handle)["aws"]
+    definitions = bench.aws.client.batch("DescribeJobDefinitions", jobDefinitionName=f"muster-{gang.title}")
+    assert len(definitions["jobDefinitions"]) == 2, "another command is another revision"
+
+
+def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(TRAP, 2))
+    bench.ready(2)
+    bench.engine.stop(handle, 10.0)
+    assert bench.processes() == []
+    assert bench.outcome(0).exit_code == 75 and bench.log().count("saved") == 2, bench.log()
+    assert [node.running for node in bench.engine.observe(handle)] == [False, False]
+
+
+@pytest.mark.parametrize("store", ["bench", "workstation"])
+def test_a_child_whose_supervisor_is_killed_ends_the_gang(request: pytest.FixtureRequest, store: str) -> None:
+    """AWS itself would let it run for ever; no controller looks meanwhile."""
+    bench = request.getfixturevalue(store)
+    handle = bench.launch(bench.gang(nodes=3))
+    bench.ready(3)
+    os.kill(_supervisor(bench, 2), signal.SIGKILL)
+    wait_for(lambda: bench.processes() == [], 30, "the end of all nodes without a controller")
+    status = bench.ended(handle)
+    assert all(node.exit_code for node in status), status
+    assert bench.outcome(0).reason == "node 2 vanished: its supervisor or its host died"
+    assert bench.outcome(0).exit_code == 143 and bench.log().count("ready") == 3
+
+
+def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_does_not(bench: Bench) -> None:
+    failing = "echo ready; case $NODE_RANK in 0) exec sleep 600;; 1) exit 0;; 2) sleep 1; exit 3;; esac"
+    bench.ended(bench.launch(bench.gang(failing, 3)))
+    assert bench.outcome(0).reason == "node 2: rank 2 exited with code 3"
+    assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
+
+
+def test_where_a_child_s_death_is_ignored_it_is(bench: Bench) -> None:
+    script = "[ $NODE_RANK = 1 ] && exit 3; sleep 3; echo done without it"
+    handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
+    assert bench.ended(handle)[0].exit_code == 0
+    assert bench.log() == ["done without it"] and bench.outcome(1).exit_code == 3
+
+
+def test_an_image_without_muster_runs_as_it_is(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("echo plain $GREETING $AWS_BATCH_JOB_NODE_INDEX; exit 4", 1, native=False))
+    [node] = bench.ended(handle)
+    assert node.exit_code == 4
+    wait_for(lambda: "plain hello 0" in bench.log(), 10, "its log")
+    assert bench.outcome(0).exit_code == 4
+
+
+def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workstation: Bench) -> None:
+    handle = workstation.launch(workstation.gang("echo rank $RANK; exit $RANK", 2))
+    assert [node.exit_code for node in workstation.ended(handle)][1] == 1
+    assert sorted(workstation.log())[:2] == ["rank 0", "rank 1"] and len(workstation.log()) == 2
+    assert workstation.outcome(1).reason == "rank 1 exited with code 1"
+
+
+def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: Bench) -> None:
+    volume = bench.volume.run("run")
+    volume.create({"run": "run"})
+    raise_epoch(volume, 9)
+    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
+    assert node.exit_code == 3 and read_epoch(volume) == 9
+    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    assert not any("wrote" in line for line in lines)
+    assert any("the run now belongs to epoch 9" in line for line in lines), lines
+
+
+def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
+
+    def reason() -> str:
+        [node] = bench.engine.observe(handle)
+        assert node.running
+        return node.waiting if "500" in node.waiting else ""
+
+    said = wait_for(reason, 10, "the reason")
+    assert said.startswith("AWS Batch: ") and "CPUs" in said
+    host = bench.engine.capacity()[0]
+    assert (host.name, host.single) == ("aws-batch/default", False) and host.cpus > 0
+    away = Bench(bench.aws, bench.home, endpoint_url="http://127.0.0.1:9")
+    [node] = away.engine.observe(handle)
+    assert node.running and "does not answer" in node.waiting
+    with pytest.raises(NotYet, match="does not answer"):
+        away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
+
+
+def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match=r"aws\.json is missing: .*muster aws up"):
+        AwsBatchEngine(tmp_path)
+    (tmp_path / "aws.json").write_text('{"regoin": "eu-west-1"}')
+    with pytest.raises(EngineError, match="unknown key regoin; valid: .*region"):
+        AwsBatchEngine(tmp_path)
+
+
+YAML = """
+name: survivor
+nodes: 3
+resources: {{cpus: 0.1, memory: 32MiB}}
+retry: {{attempts: 3}}
+command: [sh, -c, 'echo ready $AWS_BATCH_JOB_ATTEMPT; while [ ! -e {gate}/$AWS_BATCH_JOB_ATTEMPT ]; do sleep 0.05; done; echo done']
+"""
+
+
+def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench: Bench) -> None:
+    (bench.home / "job.yaml").write_text(YAML.format(gate=bench.home))
+    controller = Serving(bench.home, "--engine", "aws-batch", "--store", str(bench.home / "store"))
+    try:
+        submitted = controller.muster("submit", str(bench.home / "job.yaml"))
+        assert submitted.returncode == 0, submitted.stderr
+        job = json.loads(controller.muster("list", "--json").stdout)[0]["jobId"]
+        wait_for(lambda: controller.log(job).count("ready 1") == 3, 60, "attempt 1 is ready")
+        os.kill(_rank(bench, 2), signal.SIGKILL)
+        wait_for(lambda: controller.log(job).count("ready 2") == 3, 60, "attempt 2 is ready")
+        controller.kill()
+        (bench.home / "2").touch()
+        wait_for(lambda: not processes_of(bench.volume.path), 30, "the gang ends while nobody looks")
+        controller.start()
+        detail = controller.wait(job)
+        assert detail["status"] == "SUCCEEDED", detail
+        assert detail["attempts"][0]["statusReason"].startswith("node 2: rank 2 was killed by SIGKILL"), detail
+        log = controller.log(job)
+        assert [log.count(line) for line in ("ready 1", "ready 2", "done")] == [3, 3, 3], log
+    finally:
+        controller.close()
+
+
+def _supervisor(bench: Bench, node: int) -> int:
+    return next(
+        pid for pid in processes_of(bench.aws.home) if _is(pid, node) and b"worker.aws_node" in _words(pid)[4:5]
+    )
+
+
+def _rank(bench: Bench, node: int) -> int:
+    return next(pid for pid in processes_of(bench.volume.path) if _is(pid, node))
+
+
+def _words(pid: int) -> list[bytes]:
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    return [b"", *words] if b"worker.aws_node" in words[:4] else words
+
+
+def _is(pid: int, node: int) -> bool:
+    return f"AWS_BATCH_JOB_NODE_INDEX={node}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
