@@ -273,7 +273,7 @@ class AwsBatchEngine:
                 NodeLog(path, told, copied=not (told and shared))
                 for path, told in zip(paths, facts["supervised"], strict=True)
             ]
-            watched.logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll)
+            watched.logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
             watched.logs.start(facts["gang"])
         node = watched.logs.saw(index, stream, over)
         return node if node.copied else None

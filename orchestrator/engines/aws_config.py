@@ -46,6 +46,8 @@ class AwsConfig:
     """What the compute environment may grow to, until AWS has said it."""
     poll: float = 2.0
     """Seconds between two looks at a gang, and at its logs."""
+    quiet: float = 6.0
+    """Seconds without a line after a node's end, after which its log is whole: AWS's log driver sends every five."""
     endpoint_url: str | None = None
     stack: str | None = None
     profile: str | None = None
@@ -88,6 +90,7 @@ def save_config(home: Path, config: AwsConfig) -> Path:
 
 def on_network(path: Path) -> bool:
     """Whether ``path`` lies on an NFS mount, as EFS is."""
+    path = path.resolve()
     best, kind = "", ""
     for line in Path("/proc/self/mountinfo").read_text().splitlines():
         left, _, right = line.partition(" - ")

@@ -18,8 +18,6 @@ from botocore.exceptions import BotoCoreError, ClientError
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import FirstError, Outcome
 
-_QUIET = 6.0
-"""Seconds without a line after a node's end, after which its log is whole: the log driver sends every five."""
 _PACE = 0.05
 """Seconds between two requests: CloudWatch answers 25 a second for the whole account."""
 _PAGE = 10_000
@@ -75,10 +73,10 @@ class NodeLog:
             return None
         return message + "\n"
 
-    def settle(self) -> None:
-        """Whether all is there: the outcome has come, or nothing has for a while after the end."""
-        quiet = self.ended is not None and time.monotonic() - max(self.ended, self.heard) > _QUIET
-        self.whole = self.outcome is not None or quiet
+    def settle(self, quiet: float) -> None:
+        """Whether all is there: the outcome has come, or nothing has for ``quiet`` seconds after the end."""
+        silent = self.ended is not None and time.monotonic() - max(self.ended, self.heard) > quiet
+        self.whole = self.outcome is not None or silent
 
 
 def read_outcome_line(text: str) -> Outcome | None:
@@ -101,6 +99,8 @@ class GangLogs:
     nodes: list[NodeLog]
     poll: float
     """Seconds between two rounds."""
+    quiet: float
+    """Seconds without a line after which an ended node's log is whole."""
     _wake: threading.Event = field(default_factory=threading.Event)
     _closed: bool = False
 
@@ -154,4 +154,4 @@ class GangLogs:
                 time.sleep(_PACE)
         except (ClientError, BotoCoreError, OSError):
             pass  # not there yet, throttled, away, or the disk is full: the next round
-        node.settle()
+        node.settle(self.quiet)

@@ -44,7 +44,7 @@ class Bench:
         self.aws, self.home = aws, home
         self.volume = Store(home / "efs").open()
         self.store = self.volume if config.get("store_is_shared") else Store(home / "store").open()
-        settings = {"store": str(self.volume.path), "poll": 0.1, "store_is_shared": False, **config}
+        settings = {"store": str(self.volume.path), "poll": 0.1, "quiet": 1.0, "store_is_shared": False, **config}
         told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
         save_config(home, AwsConfig(**told))
         self.engine = AwsBatchEngine(home)
