@@ -18,6 +18,7 @@ from typing import Any
 import boto3
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
+from botocore.parsers import ResponseParserError
 
 from orchestrator.engines.aws_config import load_config, on_network
 from orchestrator.engines.aws_logs import GangLogs, NodeLog
@@ -90,7 +91,7 @@ class AwsBatchEngine:
         if not asked or time.monotonic() - asked > _CAPACITY_AGE:
             try:
                 host = self._host(self._max_vcpus(queue))
-            except (ClientError, BotoCoreError):
+            except (ClientError, BotoCoreError, ResponseParserError):
                 pass  # as before
             self._hosts[queue] = (time.monotonic(), host)
         return [host]
@@ -112,7 +113,7 @@ class AwsBatchEngine:
             raise EngineError(f"AWS Batch: {_words(error)}") from None
         except NoCredentialsError as error:
             raise EngineError(f"AWS: {error}; see `aws configure`") from None
-        except BotoCoreError as error:
+        except (BotoCoreError, ResponseParserError) as error:
             raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
         facts = {
             **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main")},
@@ -148,7 +149,7 @@ class AwsBatchEngine:
                 if not asked:
                     self._batch.terminate_job(jobId=facts["aws"], reason="ended by Muster")
                     asked = True
-            except (ClientError, BotoCoreError) as error:
+            except (ClientError, BotoCoreError, ResponseParserError) as error:
                 if isinstance(error, ClientError) and not _is_transient(error) and not self._describe(facts)[0]:
                     break  # AWS has forgotten the job
             watched.status, watched.at = self._look(facts, watched), time.monotonic()
@@ -196,7 +197,7 @@ class AwsBatchEngine:
         count = len(facts["addresses"])
         try:
             parent, nodes = self._describe(facts)
-        except (ClientError, BotoCoreError) as error:
+        except (ClientError, BotoCoreError, ResponseParserError) as error:
             said = _words(error) if isinstance(error, ClientError) else str(error)
             return watched.status or [NodeStatus(True, "", waiting=f"AWS Batch does not answer: {said}")] * count
         if parent is None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from botocore.exceptions import BotoCoreError, ClientError
+from botocore.parsers import ResponseParserError
 
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import FirstError, Outcome
@@ -152,6 +153,6 @@ class GangLogs:
                     break
                 node.token = page["nextForwardToken"]
                 time.sleep(_PACE)
-        except (ClientError, BotoCoreError, OSError):
+        except (ClientError, BotoCoreError, ResponseParserError, OSError):
             pass  # not there yet, throttled, away, or the disk is full: the next round
         node.settle(self.quiet)

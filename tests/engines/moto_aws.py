@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from moto.batch import models as batch
+from moto.ec2.models import ec2_backends
+from moto.ec2.models.route_tables import RouteTable
+from moto.efs.models import AccessPoint
 from moto.server import ThreadedMotoServer
 
 
@@ -36,6 +39,8 @@ def _definition(
 def moto_server() -> Iterator[str]:
     """The URL of a moto that has no account's state yet."""
     original = batch.JobDefinition.create_from_cloudformation_json
+    AccessPoint.physical_resource_id = property(lambda point: point.access_point_id)  # what `Ref` of one gives
+    RouteTable.delete = lambda table, account, region: ec2_backends[account][region].route_tables.pop(table.id, None)
     batch.JobDefinition.create_from_cloudformation_json = classmethod(_definition)
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

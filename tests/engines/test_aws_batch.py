@@ -289,6 +289,19 @@ def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workst
     assert workstation.outcome(1).reason == "rank 1 exited with code 1"
 
 
+@pytest.mark.skipif(
+    os.geteuid() != 0, reason="NOT TESTED: the EFS volume of a definition is a mount, and mounting needs root"
+)
+def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path: Path) -> None:
+    bench = Bench(aws, tmp_path, file_system="fs-1", store=str(tmp_path / "mount"))
+    handle = bench.launch(bench.gang("echo $MUSTER_STORE; touch $MUSTER_STORE/models", 2, run="mounted"))
+    assert [node.exit_code for node in bench.ended(handle)] == [0, 0]
+    volume = Store(aws.home / "store")  # what lies on the file system of whatever plays AWS
+    assert read_epoch(volume.run("mounted")) == 1 and (volume.path / "models").exists()
+    assert list((tmp_path / "mount").iterdir()) == [], "nobody else sees it there"
+    close(bench)
+
+
 def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: Bench) -> None:
     volume = bench.volume.run("run")
     volume.create({"run": "run"})
@@ -323,7 +336,7 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"aws\.json is missing: .*muster aws up"):
         AwsBatchEngine(tmp_path)
     (tmp_path / "aws.json").write_text('{"regoin": "eu-west-1"}')
-    with pytest.raises(EngineError, match="unknown key regoin; valid: .*region"):
+    with pytest.raises(EngineError, match=r"unknown key regoin; valid: .*region"):
         AwsBatchEngine(tmp_path)
 
 
