@@ -26,7 +26,7 @@ from tests.conftest import REPOSITORY, run_muster
 from tests.engines.moto_aws import moto_server
 
 # both are in the template, and moto says that it can't make them
-pytestmark = pytest.mark.filterwarnings("ignore:Tried to parse AWS::EC2::(PlacementGroup|SecurityGroupEgress)")
+pytestmark = pytest.mark.filterwarnings("ignore:Tried to parse AWS")
 
 TEMPLATE = REPOSITORY / "containers" / "aws" / "muster.yaml"
 REGION = "us-east-1"
