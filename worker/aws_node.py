@@ -49,9 +49,7 @@ class AwsSupervisor(supervisor.Supervisor):
 
     def _watch(self) -> None:
         super()._watch()
-        if isinstance(self._line, ChildEnd):
-            self._line.attach()
-        elif self._line is not None and (loss := self._line.lost()) and self._loss is None:
+        if isinstance(self._line, MainEnd) and (loss := self._line.lost()) and self._loss is None:
             self._loss = loss
             self.write(None, "e", f"{loss.reason}; ending the gang")
             self.stop(loss.reason, _PEER_GRACE)
@@ -146,16 +144,17 @@ def take_run(contract: NodeContract, description: Mapping[str, object], line: Ma
             raise_epoch(run, contract.epoch)
         return
     deadline = time.monotonic() + _PATIENCE
-    while read_epoch(run) < contract.epoch:
+    taken = attached = False
+    while not (taken and attached):  # both before anything runs that could fail
+        taken = taken or read_epoch(run) >= contract.epoch
+        attached = line is None or isinstance(line, MainEnd) or line.attach()
         if time.monotonic() > deadline:
-            raise StoreError(f"the main node has not taken run {run.name} within {_PATIENCE:.0f} s; see its log")
-        if isinstance(line, ChildEnd):
-            line.attach()
-        time.sleep(0.1)
-    if isinstance(line, ChildEnd):
-        line.attach(
-            now=True
-        )  # before anything runs that could fail: the main node listens since before it took the run
+            lacking = "taken the run" if attached else "answered"
+            raise StoreError(
+                f"the main node, {contract.master_address}, has not {lacking} within {_PATIENCE:.0f} s: see its log; "
+                "does the security group let the nodes of a gang talk to each other?"
+            )
+        time.sleep(0.0 if taken and attached else 0.1)
 
 
 def main(argv: list[str]) -> int:

@@ -20,8 +20,6 @@ PORT = 29499
 """Where the main node listens: below the port of torch.distributed."""
 _IDLE, _INTERVAL, _PROBES = 5, 5, 3
 """Keepalive: a host that is gone is noticed after ``_IDLE + _INTERVAL * _PROBES`` seconds."""
-_RETRY = 0.5
-"""Seconds between two tries to reach the main node."""
 _ARRIVAL = 1800.0
 """Seconds that a child may take to come after the main node: its instance pulls an image of many gigabytes."""
 
@@ -111,19 +109,17 @@ class ChildEnd:
     def __init__(self, contract: NodeContract) -> None:
         self._contract = contract
         self._connection: socket.socket | None = None
-        self._next = 0.0
 
-    def attach(self, now: bool = False) -> None:
-        """Reach the main node, which may not listen yet; at most one try in half a second, or one ``now``."""
-        if self._connection is None and (now or time.monotonic() >= self._next):
-            self._next = time.monotonic() + _RETRY
+    def attach(self) -> bool:
+        """Reach the main node, which may not listen yet; whether it is reached."""
+        if self._connection is None:
             with contextlib.suppress(OSError):
                 self._connection = socket.create_connection((self._contract.master_address, PORT), timeout=1.0)
                 self._say(gang=self._contract.gang, node=self._contract.node_index)
+        return self._connection is not None
 
     def tell(self, exit_code: int, reason: str) -> None:
         """The last word: how the node ended."""
-        self.attach(now=True)
         self._say(code=exit_code, reason=reason)
 
     def _say(self, **words: object) -> None:
