@@ -15,6 +15,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from shared_store.contract import ContractError, NodeContract
@@ -293,8 +294,11 @@ class Supervisor:
         return outcome.exit_code
 
 
-def main(argv: list[str]) -> int:
-    """Entry point; exit codes: the node's (0, 75, 128 + n, the program's), 2 for a wrong call, 3 where fenced off."""
+def main(argv: list[str], make: Callable[[NodeContract, Run, list[str]], Supervisor] = Supervisor) -> int:
+    """Entry point; exit codes: the node's (0, 75, 128 + n, the program's), 2 for a wrong call, 3 where fenced off.
+
+    ``make``: an engine's own kind of supervisor.
+    """
     if len(argv) < 2 or argv[0] != "--":
         print("usage: python -m worker.supervisor -- COMMAND [ARG …]", file=sys.stderr)
         return 2
@@ -302,7 +306,7 @@ def main(argv: list[str]) -> int:
         contract = NodeContract.from_env(os.environ)
         run = Store(contract.store).run(contract.run)
         find_epoch(run, contract.epoch)
-        supervisor = Supervisor(contract, run, argv[1:])
+        supervisor = make(contract, run, argv[1:])
     except (ContractError, StoreError, ValueError) as error:
         print(f"muster supervisor: {error}", file=sys.stderr)
         return 2

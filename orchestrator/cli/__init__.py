@@ -9,7 +9,7 @@ import sys
 
 import typer
 
-from orchestrator.cli import doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
+from orchestrator.cli import aws, doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
 from orchestrator.client import ApiError, Unreachable
 from orchestrator.home import ServerError
 from orchestrator.spec import SpecError
@@ -34,6 +34,7 @@ queues.register(app)
 keys.register(app)
 tasks.register(app)
 doctor.register(app)
+aws.register(app)
 
 
 def _version(wanted: bool) -> None:

@@ -40,4 +40,10 @@ def make_engine(name: str, home: Path, cpus: float | None = None, gpus: Sequence
         from orchestrator.engines.slurm import SlurmEngine
 
         return SlurmEngine()
+    if name == "aws-batch":
+        try:
+            from orchestrator.engines.aws_batch import AwsBatchEngine
+        except ModuleNotFoundError as error:
+            raise EngineError("the aws-batch engine is not installed: pip install 'muster[aws]'") from error
+        return AwsBatchEngine(home)
     raise EngineError(f"there is no engine {name!r}; there are {', '.join(ENGINES)}")
