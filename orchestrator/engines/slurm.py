@@ -74,7 +74,7 @@ class SlurmEngine:
             "attempt": gang.attempt,
             "run": gang.run,
             "store": gang.store,
-            "nodes": len(gang.placements),
+            "addresses": [""] * len(gang.placements),
             "main": gang.main,
             "native": any(environment.get("MUSTER_ON_CHILD_FAILURE") for environment in gang.environments),
             "output": output_path(gang),
@@ -92,8 +92,11 @@ class SlurmEngine:
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
         if "slurm" not in facts:
-            return [NodeStatus(False, "", None, "another engine started it") for _ in facts.get("nodes", [])]
-        count = facts["nodes"]
+            return [
+                NodeStatus(False, "", None, "another engine started it")
+                for _ in facts.get("nodes", facts.get("addresses"))
+            ]
+        count = len(facts["addresses"])
         try:
             job = self._job(facts)
         except Unreachable as error:
@@ -199,7 +202,7 @@ def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int)
             status = int(code) if code else _SIGNALS.get(how.removesuffix(" (core dumped)"), 137)
             return NodeStatus(False, address, status, own[-1] if own else "")
     if job is not None and job.state not in OVER:
-        return NodeStatus(True, address)
+        return NodeStatus(True, address, waiting="" if meeting else f"Slurm: starts on {job.hosts} (job {job.number})")
     if not meeting and (
         early := re.findall(
             r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", said, re.MULTILINE

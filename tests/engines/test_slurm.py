@@ -70,7 +70,9 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     environments = [
         {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart", "NODE": str(i)} for i in range(3)
     ]
-    gang = bench.gang(show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS)
+    gang = bench.gang(
+        show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS, title='a "job" \\ é $HOME #1'
+    )
     handle = bench.launch(gang)
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(json.loads(handle)["output"]).read_text()
     told = sorted((json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"]))
@@ -82,6 +84,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
     for env in told:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
+        assert env["SLURM_JOB_NAME"] == gang.title
         assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], told[0]["MASTER_PORT"])
         assert env["CUDA_VISIBLE_DEVICES"] == "0,1", "as Slurm set it"
         assert env["FROM_THE_CONTROLLER"] == "kept" and env["MUSTER_GANG"] == f"{bench.job}/1/1"
@@ -162,6 +165,9 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: Bench) -> None:
     wait_for(lambda: waits("the partition is down", closed), 20, "its reason")
     long = bench.launch(bench.gang(suffix="6", options={"partition": "short"}, timeout=3600))
     wait_for(lambda: waits("more time than the partition allows", long), 20, "its reason")
+    bench.cluster.run("scancel", json.loads(closed)["slurm"])
+    [node] = bench.ended(closed)
+    assert node.detail.startswith("it was cancelled in Slurm, not by Muster (job "), node
     bench.engine.stop(small, 5.0)
     assert bench.state(small) == "CANCELLED" and not bench.engine.observe(small)[0].running
     bench.engine.stop(big, 0.0)
