@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from orchestrator.engines import slurm_script
 from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
 from shared_store.layout import StoreError
@@ -278,6 +280,22 @@ def test_what_a_node_does_not_have_is_one_line_with_its_name(
     for node, name in zip(bench.ended(bench.launch(bench.gang(nodes=2, **changes))), NODES, strict=False):
         assert node.exit_code == 2
         assert node.detail == f"muster: node {name}: {problem.format(store=bench.store.path)}"
+
+
+def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "executable", "/no/python")
+        handle = bench.launch(bench.gang(nodes=2))
+    for node in bench.ended(handle):
+        assert not node.running and node.detail.endswith("/no/python: No such file or directory"), node
+    monkeypatch.setattr(slurm_script, "output_path", lambda gang: "/nowhere/slurm.out")
+    [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
+    assert (
+        node.detail.startswith("Slurm could not start it on n1: is ")
+        and "file system that all nodes share" in node.detail
+    )
 
 
 def test_a_node_that_does_not_see_the_controller_s_store_says_so(
