@@ -16,6 +16,8 @@ import pytest
 from orchestrator.engines import slurm_script
 from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
+from orchestrator.engines.slurm_commands import SlurmJob
+from orchestrator.engines.slurm_words import ending, waiting
 from shared_store.layout import StoreError
 from tests.conftest import wait_for
 from tests.engines.slurm_bench import POLITE, Bench
@@ -308,3 +310,34 @@ def test_a_node_that_does_not_see_the_controller_s_store_says_so(
         slurm_node.check_store(dataclasses.replace(plan.contract, epoch=2))
     with pytest.raises(StoreError, match=r"^store /nowhere is not there: it must be the controller's"):
         slurm_node.check_store(dataclasses.replace(plan.contract, store="/nowhere"))
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "words"),
+    [
+        (
+            "PENDING",
+            "QOSMaxCpuPerUserLimit",
+            "Slurm: a limit of the account or QOS is reached (QOSMaxCpuPerUserLimit; job 5)",
+        ),
+        ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", "Slurm: nodes that it needs are down, drained or reserved"),
+        ("PENDING", "SomethingNew", "Slurm: waits (SomethingNew; job 5)"),
+        ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
+    ],
+)
+def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason: str, words: str) -> None:
+    assert waiting(SlurmJob("5", state, reason, "n1", "")).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("state", "code", "words"),
+    [
+        ("PREEMPTED", 75, "preempted by Slurm, and did not leave in time (job 5)"),
+        ("TIMEOUT", 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)"),
+        ("OUT_OF_MEMORY", 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
+        ("NODE_FAIL", 137, "Slurm lost a node of n1 (job 5)"),
+        ("SOMETHING_NEW", 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
+    ],
+)
+def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(state: str, code: int, words: str) -> None:
+    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (code, words)

@@ -61,6 +61,8 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
     slurm = Serving(home, "--engine", "slurm")
     run = Store(home / "store").run("queued")
 
+    local: Serving | None = None
+
     def iterations() -> int:
         return len(read_metrics(run)) if run.path.exists() else 0
 
@@ -73,6 +75,9 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         for pid in frozen:
             os.kill(pid, signal.SIGSTOP)
         cluster.kill("n2")
+        # meanwhile the same on the local engine, undisturbed
+        local = Serving(tmp_path / "local", "--store", str(home / "store"), "--cpus", "4")
+        other = submit(local, "unqueued")
         wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
         assert all(b"SLURMD_NODENAME=n2" in environment(pid) for pid in frozen), "what ran there is still there"
         slurm.kill()
@@ -85,14 +90,11 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         assert [attempt["number"] for attempt in done["attempts"]] == [1, 2], done["attempts"]
         assert any("resumed from checkpoint" in line for line in slurm.log(job))
         wait_for(lambda: not cluster.processes(b"worker."), 30, "no process is left")
+        assert local.wait(other, timeout=180)["status"] == "SUCCEEDED"
     finally:
         slurm.close()
-    local = Serving(home, "--cpus", "4")
-    try:
-        job = submit(local, "unqueued")
-        assert local.wait(job, timeout=180)["status"] == "SUCCEEDED"
-    finally:
-        local.close()
+        if local is not None:
+            local.close()
     compared = subprocess.run(
         [sys.executable, "-P", "-m", "worker.compare", "queued", "unqueued"],
         env={**os.environ, "MUSTER_STORE": str(home / "store")},
