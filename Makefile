@@ -2,13 +2,14 @@
 # make test   lint and the whole test suite
 # make torture N=300   kill everything at random moments; every run must end with the same bits
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
+# make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
 # make fuzz N=10000    malformed requests, drawn at random; none may be answered with a 500
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bits fuzz torture env clean
+.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -68,6 +69,42 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[worker,aws,dev]'
 	touch $(READY)
+
+# the image, and a cluster of containers of it: containers/compose.yaml
+NODES     ?= 3
+EXTRAS    ?= worker,ray
+IMAGE     ?= muster
+BUILD     ?=
+REVISION  := $(shell git rev-parse HEAD 2>/dev/null)
+COMPOSE    = $(shell docker compose version >/dev/null 2>&1 && echo docker compose || echo docker-compose) \
+             --project-name muster --env-file $(CURDIR)/.cluster/environment -f containers/compose.yaml
+
+image:
+	docker build -f containers/Dockerfile -t $(IMAGE) --build-arg EXTRAS=$(EXTRAS) --build-arg REVISION=$(REVISION) $(BUILD) .
+
+push:
+	@test -n "$(REGISTRY)" || { echo "make push needs REGISTRY, such as REGISTRY=registry.example.com:5000/robots" >&2; exit 2; }
+	@docker image inspect $(IMAGE) >/dev/null 2>&1 || { echo "there is no image $(IMAGE); make image builds it" >&2; exit 2; }
+	version=$$(docker image inspect -f '{{index .Config.Labels "org.opencontainers.image.version"}}' $(IMAGE)) && \
+	for tag in $$version latest; do \
+	  docker tag $(IMAGE) $(REGISTRY)/muster:$$tag && docker push $(REGISTRY)/muster:$$tag || exit 1; done
+
+.cluster/environment:
+	mkdir -p .cluster
+	umask 077; random() { od -An -N24 -tx1 /dev/urandom | tr -d ' \n'; }; \
+	printf 'RAY_AUTH_TOKEN=%s\nMUSTER_TOKEN=%s\nMUSTER_WORK=%s\n' "$$(random)" "$$(random)" "$(CURDIR)" >$@
+
+cluster: .cluster/environment
+	docker image inspect $(IMAGE) >/dev/null 2>&1 || $(MAKE) image
+	$(COMPOSE) up --detach --scale worker=$(NODES)
+	@echo "waiting for the controller"; for i in $$(seq 60); do \
+	  $(COMPOSE) exec -T controller sh /muster/cluster.sh healthy 2>/dev/null && break; \
+	  test $$i -lt 60 || { $(COMPOSE) logs --tail=20; echo "the controller does not answer; its log is above" >&2; exit 1; }; sleep 2; done
+	@echo "It is up. For muster on this machine:"
+	@echo "  export MUSTER_URL=http://127.0.0.1:8080 $$(grep MUSTER_TOKEN .cluster/environment)"
+
+cluster-down: .cluster/environment
+	$(COMPOSE) down --timeout 45 $(if $(VOLUMES),--volumes)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -10,12 +10,13 @@ from sqlalchemy.orm import Session
 
 from orchestrator.accounting import usage_now
 from orchestrator.definition import gang_needs
-from orchestrator.engines.base import Host, Placement
+from orchestrator.engines.base import Host, Placement, engine_of
+from orchestrator.pools import pool_engine
 from orchestrator.scheduling import FairShare, Leading, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
 from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
 
 HOSTS_TAG = "muster:hosts"
-"""Tag that names the hosts of a compute environment, with commas between; all of the engine's without it."""
+"""Tag that names the hosts of a compute environment, with commas between; all of its engine's without it."""
 DEFAULT_DECAY = 600
 """``shareDecaySeconds`` where it is not set, or 0 (AWS's API model)."""
 
@@ -26,20 +27,25 @@ def take_snapshot(
     waiting: Sequence[Waiting],
     active: Sequence[str],
     leading: Mapping[str, Leading] | None = None,
+    first: str = "local",
+    queueing: Collection[str] = (),
 ) -> Snapshot:
     """Everything that the pass depends on, as it is now.
 
     Args:
         session: The session.
-        hosts: All that the engine has.
+        hosts: All that the engines have.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
         leading: What the last pass found at the head of each queue.
+        first: The controller's first engine.
+        queueing: Engines that queue by themselves: what runs there takes nothing away from what is handed to them.
     """
     policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
     queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
-    pools = {each.name: read_pool(each) for each in session.scalars(select(ComputeEnvironment))}
+    pools = {each.name: read_pool(each, first) for each in session.scalars(select(ComputeEnvironment))}
     holding = open_attempts(session, active)
+    counted = [(job, attempt) for job, attempt in holding if engine_of(attempt.nodes[0]["host"]) not in queueing]
     decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
     return Snapshot(
         now=now(),
@@ -47,7 +53,7 @@ def take_snapshot(
         pools=pools,
         queues=queues,
         waiting=waiting,
-        running=[_running(job, attempt) for job, attempt in holding],
+        running=[_running(job, attempt) for job, attempt in counted],
         usage=usage_now(session, decays, holding),
         leading=leading or {},
     )
@@ -79,11 +85,13 @@ def _fair_share(document: Mapping[str, Any]) -> FairShare:
     return FairShare(decay, document.get("computeReservation", 0), weights)
 
 
-def read_pool(environment: ComputeEnvironment) -> Pool:
+def read_pool(environment: ComputeEnvironment, first: str) -> Pool:
+    """``first``: the engine of an environment that names none."""
     named = environment.tags.get(HOSTS_TAG)
     hosts = tuple(name.strip() for name in named.split(",")) if named else None
     most = (environment.document.get("computeResources") or {}).get("maxvCpus")
-    return Pool(environment.name, environment.state == "ENABLED", hosts, float(most) if most is not None else None)
+    cpus = float(most) if most is not None else None
+    return Pool(environment.name, environment.state == "ENABLED", hosts, cpus, pool_engine(environment.tags, first))
 
 
 def placements_of(attempt: Attempt) -> tuple[Placement, ...]:

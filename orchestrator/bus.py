@@ -13,7 +13,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,18 @@ class BusError(Exception):
 
 
 class Bus:
-    """A Zenoh router on loopback with a password; its port and password stay the same for a home directory.
+    """A Zenoh router with a password, on loopback and where nodes on other machines (or in containers) see this one.
+
+    Its port and password stay the same for a home directory.
 
     They must: nodes that outlive a controller look for its successor where they found it.
     """
 
-    def __init__(self, home: Path) -> None:
+    def __init__(self, home: Path, addresses: Sequence[str] = ()) -> None:
+        """``addresses``: of this machine, to listen on beside loopback."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on the network's thread) when a node came or went."""
-        self._home = home
+        self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
         self._gone: dict[Node, float | None] = {}
         """Since when (monotonic [s]) each node that was ever here is gone; None while it is here."""
@@ -75,7 +78,7 @@ class Bus:
         config = zenoh.Config()
         settings = {
             "mode": "router",
-            "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
+            "listen/endpoints": [f"tcp/{address}:{port}" for address in ("127.0.0.1", *self._addresses)],
             "scouting/multicast/enabled": False,
             "transport/shared_memory/enabled": False,
             "transport/auth/usrpwd/dictionary_file": str(users),

@@ -18,7 +18,7 @@ from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.bus import Bus
 from orchestrator.database import Database, DatabaseError
-from orchestrator.engines.base import Engine
+from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs
 from orchestrator.jobs import Ending, Status
 from orchestrator.roster import Roster
@@ -42,12 +42,12 @@ log = logging.getLogger("muster.controller")
 
 
 class Controller:
-    """Drives every job of a database to its end on one engine."""
+    """Drives every job of a database to its end."""
 
     def __init__(
         self,
         database: Database,
-        engine: Engine,
+        engine: Several,
         store: Store,
         bus: Bus,
         interval: float = 0.2,
@@ -214,7 +214,15 @@ class Controller:
             self._board, self._passed = None, (version, started, 0.0)
             return
         with self.database.session() as session:
-            snapshot = take_snapshot(session, self.engine.capacity(), waiting, self.roster.active(), self._leading)
+            snapshot = take_snapshot(
+                session,
+                self.engine.capacity(),
+                waiting,
+                self.roster.active(),
+                self._leading,
+                self.engine.names[0],
+                self.engine.queueing,
+            )
         decisions = decide(snapshot)
         self._board, self._leading = decisions.board, decisions.leading
         self._passed = (version, started, time.monotonic() - started)

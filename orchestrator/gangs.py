@@ -19,11 +19,13 @@ from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus, NotYet
+from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
+from orchestrator.engines.several import Several
 from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.pools import options_of
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
-from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
+from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
@@ -43,9 +45,9 @@ _SHORTEST_REQUEUE = 10_000
 
 
 class Gangs:
-    """Drives attempts on one engine; ``changed`` is called (from any thread) when one of them should be looked at."""
+    """Drives attempts; ``changed`` is called (from any thread) when one of them should be looked at."""
 
-    def __init__(self, engine: Engine, store: Store, bus: Bus, changed: Callable[[], None]) -> None:
+    def __init__(self, engine: Several, store: Store, bus: Bus, changed: Callable[[], None]) -> None:
         self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
         self._stops: dict[tuple[str, int], Future[None]] = {}
         self._finished: dict[tuple[str, int], float] = {}
@@ -96,15 +98,19 @@ class Gangs:
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         needs = gang_needs(job.node_properties)
         try:
-            attempt.handle = self.engine.launch(self.engine.plan(self._gang(job, attempt, needs)))
+            attempt.handle = self.engine.launch(self.engine.plan(self._gang(session, job, attempt, needs)))
         except NotYet as wait:
-            job.status_reason = str(wait)
+            if job.stop_reason is None or wait.unknown:
+                job.status_reason = str(wait)
+            else:  # nothing of it was started: there is nothing to stop
+                self._close(session, job, attempt, Verdict(Ending.STOPPED, job.stop_reason), [])
         except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
 
-    def _gang(self, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+    def _gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
         nodes = needs.nodes[: len(attempt.nodes)]
+        pool, queue = session.get(ComputeEnvironment, attempt.pool or "local"), session.get(JobQueue, job.queue)
         return Gang(
             job=job.id,
             attempt=attempt.number,
@@ -126,6 +132,10 @@ class Gangs:
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,
             bus_token=self.bus.token,
+            title=job.name,
+            timeout=job.timeout,
+            priority=job.priority,
+            options=options_of(pool.tags if pool else {}, queue.tags if queue else {}),
         )
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> None:
@@ -136,7 +146,9 @@ class Gangs:
         status = self.engine.observe(attempt.handle)
         ends = self._ends(job, attempt, status)
         main = gang_needs(job.node_properties).main
-        if job.status == Status.STARTING and (status[main].running or ends[main]):
+        if job.status == Status.STARTING and status[main].waiting:
+            job.status_reason = status[main].waiting
+        elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
             job.move(Status.RUNNING, f"attempt {attempt.number} runs on {_size(job, len(status))}")
         if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):

@@ -17,8 +17,10 @@ from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
+from orchestrator.engines.several import Several
 from orchestrator.home import HomeLock, ServerError
 from orchestrator.keys import KeyStore
+from orchestrator.pools import ensure_pools
 from shared_store.layout import Store
 
 
@@ -39,19 +41,19 @@ class Server:
         submit_rate_limit: int = 0,
         database: str | None = None,
         retention: float | None = None,
-        engine: str = "local",
+        engines: Sequence[str] = ("local",),
     ) -> None:
         """Take the lock, the port, the store and the database, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
-        jobs is kept; None: for ever. ``engine``: what starts the nodes, one of :data:`orchestrator.engines.ENGINES`.
+        jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
 
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
         try:
-            nodes = make_engine(engine, home, cpus, gpus)
+            nodes = Several([make_engine(name, home, cpus, gpus) for name in dict.fromkeys(engines)])
         except EngineError as error:
             raise ServerError(str(error)) from None
         self.access = Access(KeyStore(home), token, exposed=not is_loopback(host))
@@ -72,7 +74,9 @@ class Server:
         except BaseException:
             self._lock.release()
             raise
-        self.bus = Bus(home)
+        with found.session() as session:
+            ensure_pools(session, nodes.names)
+        self.bus = Bus(home, nodes.addresses)
         self.controller = Controller(found, nodes, self.store, self.bus, retention=retention)
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]

@@ -7,9 +7,11 @@ comes back reads a number that is not its own, and stops.
 from __future__ import annotations
 
 import re
+import socket
+import time
 
 from shared_store.files import write_atomic
-from shared_store.layout import Run
+from shared_store.layout import Run, StoreError
 
 
 class StaleEpoch(Exception):
@@ -36,8 +38,34 @@ def raise_epoch(run: Run, epoch: int) -> None:
     write_atomic(run.path / "EPOCH", f"{epoch}\n".encode())
 
 
+def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
+    """Make sure that this is the volume on which the controller gave the run to ``epoch``, before a node starts on it.
+
+    Args:
+        patience: Seconds that a network file system gets to show what another machine has written.
+
+    Raises:
+        StaleEpoch: A newer attempt owns the run.
+        StoreError: The epoch is not here: another directory of the same name, or nothing mounted.
+    """
+    deadline = time.monotonic() + patience
+    while (current := read_epoch(run)) < epoch:
+        if time.monotonic() >= deadline:
+            raise StoreError(
+                f"store {run.path.parent.parent} on {socket.gethostname()} is not the controller's: run {run.name} has epoch "
+                f"{current} there, not {epoch}; mount the same volume at this path on every node"
+            )
+        time.sleep(0.2)
+    if current > epoch:
+        raise _stale(run, epoch, current)
+
+
+def _stale(run: Run, epoch: int, current: int) -> StaleEpoch:
+    return StaleEpoch(f"run {run.name}: this attempt has epoch {epoch}, the run now belongs to epoch {current}")
+
+
 def check_epoch(run: Run, epoch: int) -> None:
     """Raises StaleEpoch where a newer attempt owns the run."""
     current = read_epoch(run)
     if current > epoch:
-        raise StaleEpoch(f"run {run.name}: this attempt has epoch {epoch}, the run now belongs to epoch {current}")
+        raise _stale(run, epoch, current)

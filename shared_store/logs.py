@@ -18,6 +18,9 @@ _LINE = re.compile(r"(\S+) (-|\d+) ([oe]) (.*)", re.DOTALL)
 _NODE = re.compile(r"node-(\d+)\.log")
 _CHUNK = 1 << 20
 
+OUTCOME_LINE = "muster-outcome "
+"""How the last line begins that a supervisor prints where its log leaves the node as text (AWS); the outcome follows as JSON."""
+
 
 @dataclass(frozen=True)
 class LogLine:

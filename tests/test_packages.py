@@ -19,7 +19,16 @@ FORBIDDEN = {
     "shared_store": HEAVY | {"worker", "orchestrator"},
     "worker": {"orchestrator"},
 }
-LIGHT_IN_WORKER = ("supervisor.py", "rank.py", "processes.py", "network.py", "slurm_node.py", "__init__.py")
+LIGHT_IN_WORKER = (
+    "supervisor.py",
+    "aws_node.py",
+    "lifeline.py",
+    "slurm_node.py",
+    "rank.py",
+    "processes.py",
+    "network.py",
+    "__init__.py",
+)
 
 
 def imported(path: Path) -> set[str]:

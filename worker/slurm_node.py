@@ -15,21 +15,16 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 from shared_store.contract import NodeContract
-from shared_store.epoch import read_epoch
-from shared_store.layout import Store, StoreError
 from worker.network import address_towards
 from worker.processes import follow_parent
 
 _PORTS, _SLOTS, _EACH = 20000, 600, 20
 """Below the ports that the kernel hands out: 600 jobs in a row each have 20 of their own, so that two on one host do not meet."""
-_PATIENCE = 15.0
-"""Seconds until a shared file system shows what the controller has just written to it."""
 
 
 def meet() -> str:
@@ -99,25 +94,10 @@ def environment_of(told: Mapping[str, Any], contract: NodeContract, given: Mappi
     }
 
 
-def check_store(contract: NodeContract) -> None:
-    """Raises StoreError where this node does not see what the controller has written before it submitted the job."""
-    store = Store(contract.store)
-    run = store.run(contract.run)
-    deadline = time.monotonic() + _PATIENCE
-    while read_epoch(run) < contract.epoch:
-        if time.monotonic() > deadline:
-            where = "is not there" if not store.path.is_dir() else f"has no epoch {contract.epoch} of run {run.name}"
-            raise StoreError(f"store {store.path} {where}: it must be the controller's, on a shared file system")
-        if run.path.is_dir():
-            os.listdir(run.path)  # has NFS look again
-        time.sleep(0.1)
-
-
 def start(meeting: Mapping[str, Any]) -> NoReturn:
-    """Become the node's supervisor. Raises OSError, StoreError, ValueError: one line each."""
+    """Become the node's supervisor. Raises OSError, ValueError: one line each."""
     told = json.load(sys.stdin)
     contract = contract_of(told, meeting, int(os.environ["SLURM_PROCID"]))
-    check_store(contract)
     environment = environment_of(told, contract, os.environ)
     command = told["kinds"][told["kind"][contract.node_index]]["command"]
     if told["directory"]:
@@ -142,7 +122,7 @@ def main(argv: list[str]) -> int:
         if len(argv) == 2 and argv[0] == "node":
             start(json.loads(argv[1]))
         print("usage: python -m worker.slurm_node meet | node MEETING", file=sys.stderr)
-    except (OSError, StoreError, ValueError) as error:
+    except (OSError, ValueError) as error:
         where = os.environ.get("SLURMD_NODENAME", socket.gethostname())
         print(f"muster: node {where}: {error}", file=sys.stderr, flush=True)
     return 2

@@ -15,10 +15,11 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from shared_store.contract import ContractError, NodeContract
-from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.logs import format_line
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
@@ -293,16 +294,19 @@ class Supervisor:
         return outcome.exit_code
 
 
-def main(argv: list[str]) -> int:
-    """Entry point; exit codes: the node's (0, 75, 128 + n, the program's), 2 for a wrong call, 3 where fenced off."""
+def main(argv: list[str], make: Callable[[NodeContract, Run, list[str]], Supervisor] = Supervisor) -> int:
+    """Entry point; exit codes: the node's (0, 75, 128 + n, the program's), 2 for a wrong call, 3 where fenced off.
+
+    ``make``: an engine's own kind of supervisor.
+    """
     if len(argv) < 2 or argv[0] != "--":
         print("usage: python -m worker.supervisor -- COMMAND [ARG …]", file=sys.stderr)
         return 2
     try:
         contract = NodeContract.from_env(os.environ)
         run = Store(contract.store).run(contract.run)
-        check_epoch(run, contract.epoch)
-        supervisor = Supervisor(contract, run, argv[1:])
+        find_epoch(run, contract.epoch)
+        supervisor = make(contract, run, argv[1:])
     except (ContractError, StoreError, ValueError) as error:
         print(f"muster supervisor: {error}", file=sys.stderr)
         return 2

@@ -25,11 +25,12 @@ from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import find_job
 from orchestrator.definition import gang_needs
-from orchestrator.engines.base import Gang
+from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.gangs import GRACE
 from orchestrator.jobs import Status
+from orchestrator.pools import options_of, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
-from orchestrator.tables import Job, JobQueue
+from orchestrator.tables import ComputeEnvironment, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
@@ -74,17 +75,19 @@ def _job(session: Session, reference: str) -> Job:
 
 
 @router.get("/capacity")
-def capacity(request: Request) -> dict[str, Any]:
-    """The engine, its hosts with all that they have, and the store."""
+def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
+    """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone."""
     controller = _controller(request)
-    hosts = [asdict(host) for host in controller.engine.capacity()]
+    names = controller.engine.names
     with controller.database.session() as session:
+        if queue is not None:
+            names = queue_engines(session, queue, names[0])
         queues = list(
             session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
         )
     return {
-        "engine": controller.engine.name,
-        "hosts": hosts,
+        "engines": {name: name if number else "default" for number, name in enumerate(controller.engine.names)},
+        "hosts": [asdict(host) for host in controller.engine.capacity(names)],
         "store": str(controller.store.path),
         "queues": queues,
     }
@@ -97,11 +100,19 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     definition = validate("RegisterJobDefinition", body.definition)
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    needs, hosts = rules.check_nodes(definition["nodeProperties"], complete=True), controller.engine.capacity()
+    needs = rules.check_nodes(definition["nodeProperties"], complete=True)
+    with controller.database.session() as session:
+        hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]))
+        queue = session.get(JobQueue, body.queue)
+        pool = session.get(ComputeEnvironment, queue.environments[0]) if queue and queue.environments else None
+        options = options_of(pool.tags if pool else {}, queue.tags if queue else {})
+    if queue is None:
+        raise ClientError(f"there is no queue {body.queue!r}")
     placements = place(needs.shape, hosts)
     if placements is None:
         raise ClientError(str(never_fits(needs.shape, hosts)))
-    planned = controller.engine.plan(
+    planned = _planned(
+        controller,
         Gang(
             job="job",
             attempt=1,
@@ -118,7 +129,10 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             grace=GRACE,
             directory=needs.setting("MUSTER_DIRECTORY") or None,
             containers=[node.container for node in needs.nodes],
-        )
+            title=definition["jobDefinitionName"],
+            timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
+            options=options,
+        ),
     )
     nodes = [
         {
@@ -132,7 +146,14 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         }
         for node in planned.nodes
     ]
-    return {"engine": controller.engine.name, "nodes": nodes}
+    return {"engine": engine_of(placements[0].host), "nodes": nodes, "document": planned.document}
+
+
+def _planned(controller: Controller, gang: Gang) -> Plan:
+    try:
+        return controller.engine.plan(gang)
+    except EngineError as error:
+        raise ClientError(str(error)) from None
 
 
 @router.get("/jobs/{reference}")

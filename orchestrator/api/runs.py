@@ -14,6 +14,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.jobs import Status
+from orchestrator.pools import queue_engines
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
 from orchestrator.tables import Job
@@ -122,7 +123,8 @@ def resume(
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
-        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, controller.engine.capacity()):
+        hosts = controller.engine.capacity(queue_engines(session, spec.queue, controller.engine.names[0]))
+        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
             raise ClientError(f"run {run.name}: {impossible}")
         registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
         if chosen and checkpoint is not None:

@@ -9,7 +9,7 @@ import sys
 
 import typer
 
-from orchestrator.cli import jobs, keys, logs, queues, runs, serving, tasks, verify
+from orchestrator.cli import aws, doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
 from orchestrator.client import ApiError, Unreachable
 from orchestrator.home import ServerError
 from orchestrator.spec import SpecError
@@ -33,6 +33,8 @@ verify.register(app)
 queues.register(app)
 keys.register(app)
 tasks.register(app)
+doctor.register(app)
+aws.register(app)
 
 
 def _version(wanted: bool) -> None:

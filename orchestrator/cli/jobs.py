@@ -19,6 +19,7 @@ from orchestrator import specfile
 from orchestrator.cli.progress import evaluated, follow
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.engines import ENGINES
 from orchestrator.engines.base import Host
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, schema
@@ -55,12 +56,15 @@ def submit_spec(
     ``environment`` is added on every node.
     """
     definition = compile_definition(spec, os.getcwd())
-    capacity = client.get("/api/capacity")
-    hosts = [Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"]) for host in capacity["hosts"]]
-    if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
-        raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
+    capacity = client.get("/api/capacity", queue=spec.queue)
     if spec.queue not in capacity["queues"]:
         raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")
+    hosts = [
+        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"])
+        for host in capacity["hosts"]
+    ]
+    if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
+        raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
 
@@ -72,11 +76,17 @@ def submit(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would start where; --json: with all variables. Nothing starts.")
     ] = False,
+    engine: Annotated[
+        str | None,
+        typer.Option(help=f"What runs it, of the engines that the controller has: {', '.join(ENGINES)}."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
     loaded = specfile.load(spec, set_)
     with Client.connect() as client:
+        if engine is not None:
+            loaded = on_engine(client, loaded, engine, spec)
         if dry_run:
             _show_plan(client, loaded, as_json)
             return
@@ -89,6 +99,25 @@ def submit(
                 typer.echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
+    """The same spec for the queue of that engine. Raises SpecError where the controller does not have it."""
+    queue = engine_queue(client, engine)
+    if spec.queue not in ("default", queue):
+        raise SpecError(f"{source}: queue: {spec.queue}, but --engine {engine} means {queue}; leave one of them out")
+    return spec.model_copy(update={"queue": queue})
+
+
+def engine_queue(client: Client, engine: str) -> str:
+    """The queue of an engine. Raises SpecError where the controller does not have it."""
+    queues: dict[str, str] = client.get("/api/capacity")["engines"]
+    if engine not in queues:
+        raise SpecError(
+            f"--engine {engine}: the controller has {', '.join(queues)}; start it with: muster serve "
+            + " ".join(f"--engine {name}" for name in (*queues, engine))
+        )
+    return queues[engine]
 
 
 def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
@@ -110,6 +139,8 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
         )
     typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
     Console(soft_wrap=True).print(table)
+    if plan["document"]:
+        typer.echo(f"\n{plan['document']}")
 
 
 def list_jobs(

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption, SetOption
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
 from orchestrator.cli.progress import follow
 from orchestrator.client import Client
 
@@ -30,12 +30,19 @@ def resume(
         int | None, typer.Option(min=1, help="Another number of nodes; the worlds are dealt out anew.")
     ] = None,
     set_: SetOption = None,
+    engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Go on with a run from its newest checkpoint, at the next iteration."""
     with Client.connect() as client:
-        body = {"checkpoint": checkpoint, "nodes": nodes, "set": set_ or [], "directory": os.getcwd()}
+        elsewhere = [f"queue={engine_queue(client, engine)}"] if engine is not None else []
+        body = {
+            "checkpoint": checkpoint,
+            "nodes": nodes,
+            "set": [*(set_ or []), *elsewhere],
+            "directory": os.getcwd(),
+        }
         resumed = client.post(f"/api/runs/{run}/resume", body)
         if as_json:
             typer.echo(json.dumps(resumed))

@@ -7,14 +7,14 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from orchestrator import specfile
-from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
+from orchestrator.cli.jobs import SetOption, SpecArgument, on_engine, submit_spec
 from orchestrator.cli.progress import follow
 from orchestrator.client import Client, Unreachable
 from orchestrator.home import ServerError, local_url, muster_home
@@ -22,9 +22,10 @@ from orchestrator.spec import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 EngineOption = Annotated[
-    str,
+    list[str] | None,
     typer.Option(
-        help="What runs the nodes: local (processes of this machine) or docker (containers of the job's image)."
+        help="What runs the nodes: local (the default: processes of this machine), docker (containers of the job's image), ray, "
+        "slurm or aws-batch. Repeatable: the first has the queue default, the others one of their own name."
     ),
 ]
 CpusOption = Annotated[
@@ -42,15 +43,17 @@ def run(
     set_: SetOption = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
-    engine: EngineOption = "local",
+    engine: EngineOption = None,
 ) -> None:
     """Run a job to its end, with a controller of its own where none is running; exit with its result.
 
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
     loaded = specfile.load(spec, set_)
-    with controller(store, cpus, engine) as connect:
+    with controller(store, cpus, engine or ()) as connect:
         client = connect()
+        if engine:
+            loaded = on_engine(client, loaded, engine[0], spec)
         job = submit_spec(client, loaded, spec)["jobId"]
         code = see_through(client, job)
     raise typer.Exit(code)
@@ -75,7 +78,7 @@ def serve(
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free port.")] = 8080,
     store: StoreOption = None,
     cpus: CpusOption = None,
-    engine: EngineOption = "local",
+    engine: EngineOption = None,
     database: Annotated[
         str | None,
         typer.Option(
@@ -104,7 +107,7 @@ def serve(
         store=store,
         token=os.environ.get("MUSTER_TOKEN"),
         cpus=cpus,
-        engine=engine,
+        engines=engine or ("local",),
         rate_limit=rate_limit,
         submit_rate_limit=submit_rate_limit,
         database=database,
@@ -128,12 +131,12 @@ def serve(
 
 
 @contextlib.contextmanager
-def controller(store: str | None, cpus: float | None, engine: str = "local") -> Iterator[Callable[[], Client]]:
+def controller(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[Callable[[], Client]]:
     """A function that connects to the controller of this home directory, or brings one where there is none (any more)."""
     with contextlib.ExitStack() as stack:
 
         def connect() -> Client:
-            client = stack.enter_context(_controller(store, cpus, engine))
+            client = stack.enter_context(_controller(store, cpus, engines))
             client.successor = connect
             return client
 
@@ -141,7 +144,7 @@ def controller(store: str | None, cpus: float | None, engine: str = "local") -> 
 
 
 @contextlib.contextmanager
-def _controller(store: str | None, cpus: float | None, engine: str) -> Iterator[Client]:
+def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -> Iterator[Client]:
     """A client of the controller that serves this home directory, or of a new one in this process."""
     url = os.environ.get("MUSTER_URL") or local_url()
     if url:
@@ -159,7 +162,7 @@ def _controller(store: str | None, cpus: float | None, engine: str) -> Iterator[
                 raise
     from orchestrator.server import Server
 
-    server = Server(muster_home(), store=store, cpus=cpus, engine=engine)
+    server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",))
     server.start()
     try:
         with Client(server.url, server.access.own_token) as client:  # it may have keys, and this command none of them

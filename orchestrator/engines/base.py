@@ -16,6 +16,11 @@ class EngineError(Exception):
 class NotYet(EngineError):
     """A launch has to wait; the message says for what. It will be asked for again."""
 
+    def __init__(self, message: str, *, unknown: bool = False) -> None:
+        """``unknown``: something of the gang may run already, which can't be seen just now."""
+        super().__init__(message)
+        self.unknown = unknown
+
 
 @dataclass(frozen=True)
 class Host:

@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -77,11 +78,12 @@ class DockerEngine:
             ) from error
         self._cores = float(info["NCPU"])
         self._host = Host(
-            info["Name"],
+            f"docker/{info['Name']}",
             cpus or self._cores,
             tuple(gpus if gpus is not None else visible_gpus()),
             int(info["MemTotal"] / 2**20),
         )
+        self.address = self._gateway()
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
         self._pulls: dict[str, Future[Image]] = {}
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
@@ -93,7 +95,7 @@ class DockerEngine:
 
     def plan(self, gang: Gang) -> Plan:
         """With the addresses of the first subnet that would be tried."""
-        return Plan(gang, _nodes(gang, _addresses(_subnet(gang.name, 0), len(gang.placements))))
+        return Plan(gang, self._nodes(gang, _addresses(_subnet(gang.name, 0), len(gang.placements))))
 
     def launch(self, plan: Plan) -> str:
         gang = plan.gang
@@ -101,7 +103,7 @@ class DockerEngine:
         there = self._containers(gang.name)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
-        nodes = _nodes(gang, addresses)
+        nodes = self._nodes(gang, addresses)
         run = Store(gang.store).run(gang.run)
         facts = {**_facts(gang), "addresses": addresses}
         try:
@@ -123,8 +125,6 @@ class DockerEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        if "addresses" not in facts:
-            return [NodeStatus(False, "", None, "another engine started it") for _ in facts["nodes"]]
         found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
         status = []
         for index, address in enumerate(facts["addresses"]):
@@ -146,6 +146,16 @@ class DockerEngine:
         while len(self._ended) > _REMEMBERED:
             del self._ended[next(iter(self._ended))]
         self._remove(facts["gang"])
+
+    def _gateway(self) -> str | None:
+        """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
+        try:
+            [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
+            with socket.socket() as probe:
+                probe.bind((config["Gateway"], 0))
+            return str(config["Gateway"])
+        except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
+            return None
 
     # -- starting -----------------------------------------------------------------------------------------------------
 
@@ -220,6 +230,10 @@ class DockerEngine:
             **options,
         )
 
+    def _nodes(self, gang: Gang, addresses: Sequence[str]) -> list[NodePlan]:
+        bus = gang.bus if self.address else None  # on loopback no container would find it
+        return node_plans(dataclasses.replace(gang, store=STORE, bus=bus), addresses, _PORT)
+
     # -- watching -----------------------------------------------------------------------------------------------------
 
     def _containers(self, gang: str) -> dict[int, Container]:
@@ -292,11 +306,6 @@ def _facts(gang: Gang) -> dict[str, Any]:
         "run": gang.run,
         "store": gang.store,
     }
-
-
-def _nodes(gang: Gang, addresses: Sequence[str]) -> list[NodePlan]:
-    """The controller's bus listens on its machine alone, where containers do not reach it."""
-    return node_plans(dataclasses.replace(gang, store=STORE, bus=None, bus_token=None), addresses, _PORT)
 
 
 def _subnet(gang: str, salt: int) -> str:

@@ -33,7 +33,7 @@ class LocalEngine:
 
     name = "local"
     queues = False
-    address = None
+    address: str | None = None
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
         """Args:
@@ -85,14 +85,12 @@ class LocalEngine:
 
     def observe(self, handle: str) -> GangStatus:
         state = json.loads(handle)
-        if "nodes" not in state:
-            return [NodeStatus(False, address, None, "another engine started it") for address in state["addresses"]]
         return [self._observe_node(state["gang"], index, node) for index, node in enumerate(state["nodes"])]
 
     def stop(self, handle: str, grace: float) -> None:
         state = json.loads(handle)
         deadline = time.monotonic() + grace
-        nodes = state.get("nodes", [])  # none where another engine started it
+        nodes = state["nodes"]
         for node in nodes:
             if _alive(node["pid"], node["start"]):
                 _signal(node["pid"], signal.SIGTERM)

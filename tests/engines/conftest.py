@@ -60,3 +60,21 @@ def host_files() -> dict[str, Any]:
 
 
 PATH = f"{Path(sys.executable).parent}:/usr/local/bin:/usr/bin:/bin"
+
+
+@pytest.fixture(scope="session")
+def ray_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A head (drivers run there), and nodes ``n1``, ``n2`` and ``n3``, whose Python looks into ``modules`` first; environment variables lead to it."""
+    pytest.importorskip("ray", reason="NO RAY: the ray engine is not tested (pip install 'muster[ray]')")
+    from tests.engines.ray_cluster import RayCluster
+
+    cluster = RayCluster(tmp_path_factory.mktemp("ray"))
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in cluster.variables.items():
+            patch.setenv(name, value)
+        try:
+            cluster.add("n1", "n2")
+            cluster.add("n3", PYTHONPATH=str(cluster.modules))
+            yield cluster
+        finally:
+            cluster.close()

@@ -48,5 +48,5 @@ def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Pat
 
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
     assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
-    with pytest.raises(EngineError, match="there is no engine 'slumr'"):
-        make_engine("slumr", tmp_path)
+    with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):
+        make_engine("kubernetes", tmp_path)

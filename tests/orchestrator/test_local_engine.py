@@ -16,7 +16,7 @@ import pytest
 
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, Placement
 from orchestrator.engines.local import LocalEngine
-from shared_store.epoch import raise_epoch
+from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
@@ -63,15 +63,18 @@ class Bench:
 
     def launch(self, gang: Gang, engine: LocalEngine | None = None) -> str:
         engine = engine or self.engine
+        run = self.store.run(gang.run)
+        if read_epoch(run) < gang.epoch:  # as the controller does
+            raise_epoch(run, gang.epoch)
         return engine.launch(engine.plan(gang))
 
-    def lines(self, job: str = JOB) -> list[tuple[int, str]]:
+    def lines(self, job: str = JOB, run: str = "run") -> list[tuple[int, str]]:
         """(node, text) of what the ranks printed."""
-        found = LogFollower(self.store.run("run"), job).drain()
+        found = LogFollower(self.store.run(run), job).drain()
         return [(line.node, line.text) for line in found if line.rank is not None]
 
-    def ready(self, nodes: int = 2, job: str = JOB) -> None:
-        wait_for(lambda: [text for _, text in self.lines(job)].count("ready") == nodes, 10, f"{nodes} nodes")
+    def ready(self, nodes: int = 2, job: str = JOB, run: str = "run") -> None:
+        wait_for(lambda: [text for _, text in self.lines(job, run)].count("ready") == nodes, 10, f"{nodes} nodes")
 
     def wait_for_end(self, handle: str, engine: LocalEngine | None = None) -> Sequence[NodeStatus]:
         def ended() -> Sequence[NodeStatus] | None:
@@ -365,8 +368,9 @@ def test_stopping_ends_what_a_dead_supervisor_left_behind(bench: Bench) -> None:
 def test_stopping_one_gang_leaves_the_others_alone(bench: Bench) -> None:
     handle = bench.launch(bench.gang())
     # a name that the first one's begins with: job/1/1 and job/1/12
-    other = bench.launch(bench.gang(epoch=12, attempt=1))
-    wait_for(lambda: [text for _, text in bench.lines()].count("ready") == 4, 10, "both gangs")
+    other = bench.launch(bench.gang(epoch=12, attempt=1, run="another"))
+    bench.ready()
+    bench.ready(run="another")
     bench.engine.stop(handle, 5.0)
     assert [node.running for node in bench.engine.observe(handle)] == [False, False]
     assert [node.running for node in bench.engine.observe(other)] == [True, True]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.contract import NodeContract
+from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
@@ -42,6 +43,8 @@ class Node:
         }
         self.contract = NodeContract(**{**facts, **contract})
         self.run: Run = Store(home).open().run("run")
+        if read_epoch(self.run) < self.contract.epoch:
+            raise_epoch(self.run, self.contract.epoch)
         self.environment = {**ENVIRONMENT, **self.contract.to_env()}
         self.stderr = home / "stderr"
 

@@ -9,6 +9,7 @@ import os
 import re
 import resource
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -113,7 +114,6 @@ def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: N
 
 def test_a_store_that_refuses_the_outcome_does_not_change_the_exit_code(node: Nodes) -> None:
     n = node()
-    n.run.path.mkdir(parents=True)
     (n.run.path / "outcomes").write_text("a file where a directory should be")
     assert n.shell("exit 6") == 6
     assert n.stderr.read_text() == "outcome of node 0 can't be written: Not a directory\n"
@@ -235,10 +235,20 @@ def test_a_broken_contract_is_told_in_one_line(
 
 def test_a_damaged_epoch_file_is_told_in_one_line(node: Nodes) -> None:
     n = node()
-    n.run.path.mkdir(parents=True)
     (n.run.path / "EPOCH").write_text("")
     assert n.call("true") == 2
     assert n.stderr.read_text() == f"muster supervisor: {n.run.path}/EPOCH: expected a whole number, found ''\n"
+
+
+def test_a_store_that_is_not_the_controllers_is_told_before_anything_starts(node: Nodes, tmp_path: Path) -> None:
+    n = node(epoch=3)
+    (tmp_path / "other" / "runs").mkdir(parents=True)
+    assert n.call("touch", str(tmp_path / "started"), MUSTER_STORE=str(tmp_path / "other")) == 2
+    assert n.stderr.read_text() == (
+        f"muster supervisor: store {tmp_path}/other on {socket.gethostname()} is not the controller's: run run has epoch 0 there, "
+        "not 3; mount the same volume at this path on every node\n"
+    )
+    assert not (tmp_path / "started").exists() and not list((tmp_path / "other" / "runs").iterdir())
 
 
 @pytest.mark.parametrize("arguments", [[], ["--"], ["sleep", "60"]])

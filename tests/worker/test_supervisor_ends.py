@@ -241,7 +241,6 @@ def test_ranks_die_when_their_supervisor_is_killed(node: Nodes) -> None:
 
 def test_a_newer_epoch_ends_everything_at_once_and_nothing_is_written(node: Nodes) -> None:
     n = node(grace=30.0)
-    raise_epoch(n.run, 1)
     n.start("sh", "-c", f'setsid sh -c "echo \\$\\$; exec sleep 600" & echo $$; {STAYS}')
     wait_for(lambda: "ready" in n.output() and len(n.output()) == 3, 10, "the rank and its child")
     pids = [int(text) for text in n.output() if text.isdigit()]
@@ -267,7 +266,6 @@ def test_a_node_of_an_old_attempt_does_not_even_start(node: Nodes, tmp_path: Pat
 
 def test_an_epoch_that_can_not_be_read_for_a_while_does_not_stop_the_ranks(node: Nodes) -> None:
     n = node()
-    raise_epoch(n.run, 1)
     n.start("sh", "-c", "echo ready; sleep 2.5; echo done")
     n.wait_for_output("ready")
     (n.run.path / "EPOCH").unlink()

@@ -1,0 +1,170 @@
+"""``muster aws``: the stack in which jobs run on AWS."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.home import ServerError, muster_home
+
+if TYPE_CHECKING:
+    from orchestrator.aws_stack import Event, Stack
+
+NameOption = Annotated[str, typer.Option("--stack-name", help="Name of the CloudFormation stack.")]
+RegionOption = Annotated[str | None, typer.Option(help="AWS region; that of your AWS configuration by default.")]
+ProfileOption = Annotated[str | None, typer.Option(help="Profile of your AWS configuration.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(
+        no_args_is_help=True,
+        help="The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch).",
+    )
+    group.command(epilog="Example:  muster aws up --region eu-west-1 --parameter InstanceTypes=g6.4xlarge")(up)
+    group.command(epilog="Example:  muster aws down")(down)
+    group.command(epilog="Example:  muster aws status --json | jq .jobs")(status)
+    app.add_typer(group, name="aws")
+
+
+def up(
+    stack_name: NameOption = "muster",
+    region: RegionOption = None,
+    profile: ProfileOption = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=VALUE of the template; repeatable. What is not given stays as it was."),
+    ] = None,
+    template: Annotated[Path | None, typer.Option(help="Another template than Muster's own.")] = None,
+    yes: YesOption = False,
+) -> None:
+    """Create the stack, or bring it up to date, and write $MUSTER_HOME/aws.json for the aws-batch engine."""
+    given = dict(_pair(each) for each in parameter or [])
+    from_template, stack = _stack_module(), _stack(stack_name, region, profile)
+    text = from_template.template_text(template)
+    stack.parameters(text, given, existing=False)  # refused before anything is asked
+    if not yes:
+        verb = "update" if stack.describe() else "create"
+        typer.confirm(
+            f"{verb} stack {stack_name} in {stack.region}? It costs money from now on (a NAT gateway by the hour, the volume "
+            "by what lies on it; instances only while jobs run)",
+            abort=True,
+        )
+    began = time.time() - 1
+    made = stack.create(text, given)
+    if made is None:
+        typer.echo(f"stack {stack_name} is up to date")
+    else:
+        events = _follow(stack, made, began)
+        found = stack.describe()
+        state = found["StackStatus"] if found else "DELETE_COMPLETE"
+        if state not in ("CREATE_COMPLETE", "UPDATE_COMPLETE"):
+            why = from_template.first_failure(events) or (found or {}).get("StackStatusReason", "")
+            raise ServerError(f"stack {stack_name} is in {state}: {why}; remove what is left with `muster aws down`")
+    path = from_template.write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
+    repository = stack.outputs()["RepositoryUri"]
+    typer.echo(f"""wrote {path}
+
+push the image, then run jobs:
+  aws ecr get-login-password --region {stack.region} | docker login --username AWS --password-stdin {repository.partition("/")[0]}
+  docker build -f containers/Dockerfile -t {repository}:latest --build-arg EXTRAS=worker . && docker push {repository}:latest
+  muster serve --engine aws-batch""")
+    if url := stack.outputs().get("WorkstationUrl"):
+        typer.echo(f"  the workstation's desktop, ready in some 15 minutes: {url}")
+
+
+def down(
+    stack_name: NameOption = "muster",
+    region: RegionOption = None,
+    profile: ProfileOption = None,
+    yes: YesOption = False,
+) -> None:
+    """Delete the stack: network, queue, images, logs, workstation. The volume with all runs stays."""
+    from_template, stack = _stack_module(), _stack(stack_name, region, profile)
+    outputs = stack.outputs()
+    volume = outputs.get("FileSystemId")
+    stays = f"file system {volume}, with all runs and checkpoints, stays" if volume else "there is no volume yet"
+    if not yes:
+        jobs = stack.jobs(outputs["JobQueueArn"]) if "JobQueueArn" in outputs else {}
+        ended = f"{sum(jobs.values())} jobs in it are ended; " if jobs else ""
+        typer.confirm(f"delete stack {stack_name} in {stack.region}? {ended}images and logs go; {stays}", abort=True)
+    began = time.time() - 1
+    events = _follow(stack, stack.delete(), began)
+    if stack.describe() is not None:
+        raise ServerError(f"stack {stack_name} could not be deleted: {from_template.first_failure(events)}")
+    config = muster_home() / "aws.json"
+    if config.exists() and f'"stack": "{stack_name}"' in config.read_text():
+        config.unlink()
+    typer.echo(f"stack {stack_name} is deleted; {stays}")
+    if volume:
+        typer.echo(
+            f"to delete that, too:  aws efs delete-file-system --region {stack.region} --file-system-id {volume}"
+        )
+
+
+def status(
+    stack_name: NameOption = "muster",
+    region: RegionOption = None,
+    profile: ProfileOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the stack: whether it is whole, what its queue and compute environment say, its jobs, its image."""
+    told = _stack(stack_name, region, profile).status()
+    if as_json:
+        typer.echo(json.dumps(told, indent=1))
+        return
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_row("stack", f"{stack_name} in {told['region']}: {told['status']} {told['reason']}".strip())
+    for key, label in (("computeEnvironment", "compute environment"), ("queue", "queue")):
+        words = told.get(key) or {}
+        text = f"{words.get('state', '')} {words.get('status', '')} {words.get('statusReason', '')}".strip()
+        table.add_row(label, escape(text) or "not there")
+    jobs = ", ".join(f"{count} {state}" for state, count in (told.get("jobs") or {}).items())
+    table.add_row("jobs", jobs or "none wait or run")
+    table.add_row(
+        "image", f"pushed {told['image']}" if told.get("image") else "not pushed yet: see containers/aws/README.md"
+    )
+    for name, value in told["outputs"].items():
+        table.add_row(name, escape(str(value)))
+    Console(soft_wrap=True).print(table)
+
+
+def _follow(stack: Stack, made: str, began: float) -> list[Event]:
+    """Print what happens until the stack rests."""
+    events = []
+    for event in stack.follow(made, began):
+        events.append(event)
+        reason = f"  {event.reason}" if event.reason and event.is_failure else ""
+        typer.echo(f"{event.time}  {event.status:<22} {event.resource}{reason}")
+    return events
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, sign, value = text.partition("=")
+    if not sign or not key:
+        raise typer.BadParameter(f"--parameter {text}: expected NAME=VALUE, such as MaxvCpus=96")
+    return key, value
+
+
+def _stack_module() -> ModuleType:
+    """What needs boto3. Raises ServerError where it is not installed."""
+    try:
+        from orchestrator import aws_stack
+    except ModuleNotFoundError as error:
+        raise ServerError("muster aws is not installed: pip install 'muster[aws]'") from error
+    return aws_stack
+
+
+def _stack(name: str, region: str | None, profile: str | None) -> Stack:
+    found: Stack = _stack_module().Stack(name, region, profile)
+    return found

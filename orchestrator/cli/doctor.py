@@ -1,0 +1,154 @@
+"""``muster doctor``: whether this machine has what Muster needs, and what to do where it has not."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.client import ApiError, Client, Unreachable
+from orchestrator.engines import make_engine
+from orchestrator.engines.base import EngineError
+from orchestrator.engines.gpus import visible_gpus
+from orchestrator.home import local_url, muster_home
+from shared_store import __version__
+from shared_store.files import write_json
+
+_WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
+_LEAST_SHARED_MEMORY = 256
+"""MiB of /dev/shm below which NCCL between ranks of one node has been seen to fail (Docker's default is 64)."""
+_MARKS = {"ok": "[green]ok [/]", "absent": "[yellow]-  [/]", "bad": "[red]BAD[/]"}
+_LEAST_SPACE = 5
+"""GiB."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    state: str
+    """``ok``; ``absent``: only those who want it need it; ``bad``: it is needed and not as it must be."""
+    said: str
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Example:  muster doctor --engine docker --store /mnt/efs/muster")(doctor)
+
+
+def doctor(
+    engine: Annotated[list[str] | None, typer.Option(help="Engines that must work here. Repeatable.")] = None,
+    store: Annotated[
+        str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")
+    ] = None,
+    worker: Annotated[bool, typer.Option("--worker", help="This machine must be able to run nodes.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing."""
+    findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
+    if as_json:
+        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+    else:
+        console = Console(soft_wrap=True, highlight=False)
+        for finding in findings:
+            console.print(f"{_MARKS[finding.state]} {finding.what:<16} {escape(finding.said)}")
+    if any(finding.state == "bad" for finding in findings):
+        raise typer.Exit(1)
+
+
+def _examine(engines: Sequence[str], store: Path, worker: bool) -> Iterator[Finding]:
+    yield Finding("muster", "ok", f"{__version__}, Python {platform.python_version()} at {sys.executable}")
+    yield _packages(worker)
+    gpus = visible_gpus()
+    yield Finding("GPUs", "ok" if gpus else "absent", ", ".join(gpus) or "none that NVIDIA's driver lists")
+    yield _checked("home", lambda: _directory(muster_home()))
+    yield _checked("store", lambda: _store(store))
+    yield _shared_memory()
+    yield _controller()
+    for name in engines:
+        yield _checked(f"engine {name}", lambda name=name: _engine(name))  # type: ignore[misc]
+
+
+def _checked(what: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(what, "ok", look())
+    except OSError as error:
+        return Finding(what, "bad", f"{error.filename}: {error.strerror}")
+    except EngineError as error:
+        return Finding(what, "bad", " ".join(str(error).split()))
+
+
+def _packages(worker: bool) -> Finding:
+    found, missing = [], []
+    for name in _WORKER:
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        said = f"{', '.join(missing)} not installed: controller and command only; pip install 'muster[worker]' to run nodes"
+        return Finding("packages", "bad" if worker else "absent", said)
+    return Finding("packages", "ok", ", ".join(found))
+
+
+def _directory(path: Path) -> str:
+    path.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(path).free / 2**30
+    if free < _LEAST_SPACE:
+        raise OSError(0, f"{free:.1f} GiB free; {_LEAST_SPACE} are needed", str(path))
+    return f"{path}, {free:.0f} GiB free"
+
+
+def _store(path: Path) -> str:
+    """A commit as Muster makes them: written, made durable, renamed, read again."""
+    said = _directory(path)
+    with tempfile.TemporaryDirectory(prefix=".doctor-", dir=path) as scratch:
+        started = time.perf_counter()
+        write_json(Path(scratch) / "commit", {"pid": os.getpid()})
+        took = time.perf_counter() - started
+        json.loads((Path(scratch) / "commit").read_text())
+    return f"{said}, a durable write takes {took * 1000:.1f} ms"
+
+
+def _shared_memory() -> Finding:
+    try:
+        size = shutil.disk_usage("/dev/shm").total / 2**20
+    except OSError:
+        return Finding("/dev/shm", "absent", "there is none; NCCL between GPUs of one machine needs it")
+    if size < _LEAST_SHARED_MEMORY:
+        return Finding("/dev/shm", "absent", f"{size:.0f} MiB; several GPUs on a node need more: --shm-size 2g")
+    return Finding("/dev/shm", "ok", f"{size:.0f} MiB")
+
+
+def _controller() -> Finding:
+    url = os.environ.get("MUSTER_URL") or local_url()
+    if url is None:
+        return Finding("controller", "absent", f"none of {socket.gethostname()} runs; muster serve starts one")
+    try:
+        with Client.connect(url) as client:
+            engines = client.get("/api/capacity")["engines"]
+    except (Unreachable, ApiError) as error:
+        return Finding("controller", "bad", " ".join(str(error).split()))
+    return Finding("controller", "ok", f"{url}, engines {', '.join(engines)}")
+
+
+def _engine(name: str) -> str:
+    with tempfile.TemporaryDirectory() as scratch:
+        hosts = make_engine(name, Path(scratch)).capacity()
+    cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
+    return f"{len(hosts)} host{'s' if len(hosts) != 1 else ''}, {cpus:g} CPUs, {gpus} GPUs"

@@ -1,0 +1,334 @@
+"""The AWS Batch engine: a gang is a multi-node parallel job of AWS's, in the account that ``muster aws up`` made ready.
+
+AWS queues, finds instances and starts containers; retries, epochs and the judgement of an end stay here: each attempt is a job of
+its own on AWS, never retried there. Whether the controller's store is the nodes' volume (a workstation that mounts it) or not
+(a laptop) is all the same to a job: on a laptop its log and its outcomes come over CloudWatch Logs (:mod:`.aws_logs`), while
+checkpoints stay on the volume.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
+from botocore.parsers import ResponseParserError
+
+from orchestrator.engines.aws_config import load_config, on_network
+from orchestrator.engines.aws_logs import GangLogs, NodeLog
+from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
+from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
+from shared_store.layout import Store
+from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
+
+_OVER = ("SUCCEEDED", "FAILED")
+_PORT = 29500
+_CAPACITY_AGE = 60.0
+"""Seconds for which AWS's answer about its size is kept."""
+_STRAGGLE = 180.0
+"""Seconds after a job's end within which AWS says of every node that it ended, too."""
+_BLAME = 60.0
+"""Seconds that a failed main node waits for its children's ends: AWS ends them now, and one may have been the cause."""
+_FIXED = 6.0
+"""Seconds that an outcome on a shared volume may take to be seen."""
+_REMEMBERED = 256
+"""Gangs whose end is kept: the controller asks once more after it, and after a restart it asks anew."""
+_MEMORY = 32 * 1024
+"""MiB a vCPU at most, of all of EC2's instance types."""
+_TRANSIENT = ("TooManyRequestsException", "ThrottlingException", "RequestLimitExceeded", "ServerException")
+
+
+@dataclass
+class _Watched:
+    """What is known of a gang between two looks."""
+
+    at: float = 0.0
+    status: GangStatus | None = None
+    over_since: float | None = None
+    ended: dict[int, float] = field(default_factory=dict)
+    logs: GangLogs | None = None
+
+
+class AwsBatchEngine:
+    """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
+
+    name = "aws-batch"
+    queues = True
+    address: str | None = None  # nodes on AWS do not reach this machine
+
+    def __init__(self, home: Path) -> None:
+        """Raises EngineError: there is no configuration, or there are no credentials. AWS itself is not asked yet."""
+        self.config = load_config(home)
+        try:
+            session = boto3.Session(region_name=self.config.region, profile_name=self.config.profile)
+            if session.get_credentials() is None:
+                raise NoCredentialsError
+            url = self.config.endpoint_url
+            # a SubmitJob whose answer was lost must not be sent again unseen: AWS has no key to make it harmless
+            once = Config(retries={"total_max_attempts": 1})
+            self._batch = session.client("batch", endpoint_url=url)
+            self._submitting = session.client("batch", endpoint_url=url, config=once)
+            self._logs = session.client("logs", endpoint_url=url)
+        except (BotoCoreError, NoRegionError) as error:
+            raise EngineError(f"AWS: {error}; see `aws configure`") from None
+        self._hosts: dict[str, tuple[float, Host]] = {}
+        self._gangs: dict[str, _Watched] = {}
+
+    def capacity(self) -> Sequence[Host]:
+        """One host: what the queue's compute environments may grow to.
+
+        AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
+        is taken as their number, and what does not exist waits there with AWS's own reason.
+        """
+        queue = self.config.job_queue
+        asked, host = self._hosts.get(queue, (0.0, self._host(self.config.max_vcpus)))
+        if not asked or time.monotonic() - asked > _CAPACITY_AGE:
+            try:
+                host = self._host(self._max_vcpus(queue))
+            except (ClientError, BotoCoreError, ResponseParserError):
+                pass  # as before
+            self._hosts[queue] = (time.monotonic(), host)
+        return [host]
+
+    def plan(self, gang: Gang) -> Plan:
+        """The requests; nodes' addresses are AWS's to give."""
+        plan, _ = self._planned(gang)
+        return plan
+
+    def launch(self, plan: Plan) -> str:
+        gang = plan.gang
+        config = self.config.with_options(gang.options)
+        _, requests = self._planned(gang)
+        try:
+            job = self._find(config.job_queue, job_name(gang)) or self._submit(requests)
+        except ClientError as error:
+            if _is_transient(error):
+                raise NotYet(f"AWS Batch: {_words(error)}; trying again") from None
+            raise EngineError(f"AWS Batch: {_words(error)}") from None
+        except NoCredentialsError as error:
+            raise EngineError(f"AWS: {error}; see `aws configure`") from None
+        except (BotoCoreError, ResponseParserError) as error:
+            raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
+        facts = {
+            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main")},
+            "gang": gang.name,
+            "aws": job,
+            "queue": config.job_queue,
+            "supervised": requests.supervised,
+            "addresses": [""] * len(plan.nodes),
+        }
+        return json.dumps(facts)
+
+    def observe(self, handle: str) -> GangStatus:
+        facts = json.loads(handle)
+        if "aws" not in facts:
+            count = len(facts.get("addresses") or facts.get("nodes") or [])
+            return [NodeStatus(False, "", None, "another engine started it")] * count
+        watched = self._gangs.setdefault(facts["gang"], _Watched())
+        over = watched.status is not None and not any(node.running for node in watched.status)
+        if watched.status is None or (not over and time.monotonic() - watched.at >= self.config.poll):
+            watched.status = self._look(facts, watched)
+            watched.at = time.monotonic()
+        return watched.status
+
+    def stop(self, handle: str, grace: float) -> None:
+        """AWS's own grace is 30 s, whatever ``grace`` says. Waits for as long as AWS says that something of it runs."""
+        facts = json.loads(handle)
+        if "aws" not in facts:
+            return
+        watched = self._gangs.setdefault(facts["gang"], _Watched())
+        asked = False
+        while True:
+            try:
+                if not asked:
+                    self._batch.terminate_job(jobId=facts["aws"], reason="ended by Muster")
+                    asked = True
+            except (ClientError, BotoCoreError, ResponseParserError) as error:
+                if isinstance(error, ClientError) and not _is_transient(error) and not self._describe(facts)[0]:
+                    break  # AWS has forgotten the job
+            watched.status, watched.at = self._look(facts, watched), time.monotonic()
+            if not any(node.running for node in watched.status):
+                break
+            time.sleep(self.config.poll)
+        if watched.logs is not None:
+            watched.logs.finish()
+        while len(self._gangs) > _REMEMBERED and next(iter(self._gangs)) != facts["gang"]:
+            del self._gangs[next(iter(self._gangs))]
+
+    # -- starting -----------------------------------------------------------------------------------------------------
+
+    def _planned(self, gang: Gang) -> tuple[Plan, Requests]:
+        nodes = node_plans(gang, ["given by AWS"] * len(gang.placements), _PORT)
+        requests = requests_for(gang, nodes, self.config.with_options(gang.options))
+        return Plan(gang, nodes, requests.document()), requests
+
+    def _find(self, queue: str, name: str) -> str | None:
+        """The job of that name: a controller may have been killed after it submitted it."""
+        filters = [{"name": "JOB_NAME", "values": [name]}]
+        for page in self._batch.get_paginator("list_jobs").paginate(jobQueue=queue, filters=filters):
+            for job in page["jobSummaryList"]:
+                return str(job["jobId"])
+        return None
+
+    def _submit(self, requests: Requests) -> str:
+        request = {**requests.submission, "jobDefinition": self._definition(requests)}
+        return str(self._submitting.submit_job(**request)["jobId"])
+
+    def _definition(self, requests: Requests) -> str:
+        """The ARN of an active definition that says just that; a new revision where there is none."""
+        name = requests.definition["jobDefinitionName"]
+        pages = self._batch.get_paginator("describe_job_definitions")
+        for page in pages.paginate(jobDefinitionName=name, status="ACTIVE"):
+            for each in page["jobDefinitions"]:
+                if (each.get("tags") or {}).get(DIGEST) == requests.digest:
+                    return str(each["jobDefinitionArn"])
+        return str(self._batch.register_job_definition(**requests.definition)["jobDefinitionArn"])
+
+    # -- watching -----------------------------------------------------------------------------------------------------
+
+    def _look(self, facts: Mapping[str, Any], watched: _Watched) -> GangStatus:
+        """Ask AWS; where it does not answer nothing has changed."""
+        count = len(facts["addresses"])
+        try:
+            parent, nodes = self._describe(facts)
+        except (ClientError, BotoCoreError, ResponseParserError) as error:
+            said = _words(error) if isinstance(error, ClientError) else str(error)
+            return watched.status or [NodeStatus(True, "", waiting=f"AWS Batch does not answer: {said}")] * count
+        if parent is None:
+            return [NodeStatus(False, "", None, f"AWS Batch has no job {facts['aws']} any more")] * count
+        if parent["status"] in _OVER and watched.over_since is None:
+            watched.over_since = time.monotonic()
+        straggled = watched.over_since is not None and time.monotonic() - watched.over_since > _STRAGGLE
+        status = [
+            self._node(facts, watched, index, nodes.get(index) or parent, parent, straggled) for index in range(count)
+        ]
+        main = facts["main"]
+        failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
+        if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
+            status[main] = NodeStatus(True, status[main].address)
+        return status
+
+    def _describe(self, facts: Mapping[str, Any]) -> tuple[dict[str, Any] | None, dict[int, dict[str, Any]]]:
+        """The job, and its nodes by index: those that AWS tells of."""
+        ids = [facts["aws"], *(f"{facts['aws']}#{index}" for index in range(len(facts["addresses"])))]
+        found: dict[str, dict[str, Any]] = {}
+        for start in range(0, len(ids), 100):
+            for job in self._batch.describe_jobs(jobs=ids[start : start + 100])["jobs"]:
+                found[job["jobId"]] = job
+        nodes = {index: found[name] for index, name in enumerate(ids[1:]) if name in found}
+        return found.get(ids[0]), nodes
+
+    def _node(
+        self,
+        facts: Mapping[str, Any],
+        watched: _Watched,
+        index: int,
+        detail: Mapping[str, Any],
+        parent: Mapping[str, Any],
+        straggled: bool,
+    ) -> NodeStatus:
+        status, container = detail["status"], detail.get("container") or {}
+        address = next((each.get("privateIpv4Address", "") for each in container.get("networkInterfaces") or []), "")
+        over = status in _OVER or straggled
+        log = self._follow(facts, watched, index, container.get("logStreamName"), over)
+        if not over:
+            waiting = "" if status == "RUNNING" else _waiting(facts, index, status, detail, parent)
+            return NodeStatus(True, address, waiting=waiting)
+        watched.ended.setdefault(index, time.monotonic())
+        code = container.get("exitCode")
+        code = 0 if code is None and status == "SUCCEEDED" else code
+        reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
+        ended = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
+        seen = Outcome(index, facts["epoch"], code or 0, None, str(reason) or _exited(code), None, ended, ended)
+        if code is not None and not self._settled(facts, watched, log, seen):
+            return NodeStatus(True, address)  # it has ended, but how is still on its way
+        return NodeStatus(False, address, code, str(reason))
+
+    def _settled(self, facts: Mapping[str, Any], watched: _Watched, log: NodeLog | None, seen: Outcome) -> bool:
+        """Whether the store has the node's outcome; it is written here where nobody else did."""
+        run = Store(facts["store"]).run(facts["run"])
+        if read_outcome(run, facts["job"], facts["attempt"], seen.node) is not None:
+            return True
+        since = time.monotonic() - watched.ended[seen.node]
+        if not (log.whole if log is not None else since > _FIXED):
+            return False
+        if run.path.exists():
+            write_outcome(run, facts["job"], facts["attempt"], (log.outcome if log else None) or seen)
+        return True
+
+    def _follow(
+        self, facts: Mapping[str, Any], watched: _Watched, index: int, stream: str | None, over: bool
+    ) -> NodeLog | None:
+        """The copy of a node's log; None where the supervisor writes it to the store that is here, too."""
+        if watched.logs is None:
+            run = Store(facts["store"]).run(facts["run"])
+            paths = [run.log(facts["job"], facts["attempt"], each) for each in range(len(facts["addresses"]))]
+            shared = self._is_shared(facts["store"])
+            nodes = [
+                NodeLog(path, told, copied=not (told and shared))
+                for path, told in zip(paths, facts["supervised"], strict=True)
+            ]
+            watched.logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
+            watched.logs.start(facts["gang"])
+        node = watched.logs.saw(index, stream, over)
+        return node if node.copied else None
+
+    def _is_shared(self, store: str) -> bool:
+        told = self.config.store_is_shared
+        return on_network(Path(store)) if told is None else told
+
+    # -- capacity -----------------------------------------------------------------------------------------------------
+
+    def _host(self, vcpus: int) -> Host:
+        name = self.config.job_queue.rpartition("/")[2]
+        gpus = tuple(str(number) for number in range(vcpus // 4))
+        return Host(f"{self.name}/{name}", float(vcpus), gpus, vcpus * _MEMORY)
+
+    def _max_vcpus(self, queue: str) -> int:
+        found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
+        order = [each["computeEnvironment"] for each in found[0]["computeEnvironmentOrder"]] if found else []
+        described = self._batch.describe_compute_environments(computeEnvironments=order) if order else {}
+        sizes = [
+            int((each.get("computeResources") or {}).get("maxvCpus", 0))
+            for each in described.get("computeEnvironments", [])
+        ]
+        return max([*sizes, 0]) or self.config.max_vcpus  # a gang is in one of them
+
+
+def _waiting(
+    facts: Mapping[str, Any], index: int, status: str, detail: Mapping[str, Any], parent: Mapping[str, Any]
+) -> str:
+    """Why a node has not been started, in words a person can act on."""
+    said = detail.get("statusReason") or parent.get("statusReason") or ""
+    if said and status != "STARTING":
+        return f"AWS Batch: {said}"
+    count, queue = len(facts["addresses"]), str(facts["queue"]).rpartition("/")[2]
+    if status == "STARTING":
+        return f"AWS Batch starts node {index}: its instance pulls the image"
+    if parent["status"] == "RUNNING":
+        return f"AWS Batch starts node {index} now that the main node runs"
+    return (
+        f"AWS Batch gets {count} instance{'s' if count > 1 else ''} for queue {queue} ({status}); "
+        "if that lasts, see `muster aws status` for limits and the account's quota of vCPUs"
+    )
+
+
+def _exited(code: int | None) -> str:
+    return f"container exited with code {code}" if code else "done"
+
+
+def _is_transient(error: ClientError) -> bool:
+    answer = error.response
+    status = int(answer.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
+    return answer.get("Error", {}).get("Code") in _TRANSIENT or status >= 500 or status == 429
+
+
+def _words(error: ClientError) -> str:
+    told = error.response.get("Error", {})
+    return f"{told.get('Message') or told.get('Code') or error}"

@@ -1,0 +1,158 @@
+"""What nodes on AWS print, copied from CloudWatch Logs into the run's logs; and their outcomes, which come the same way.
+
+For a controller whose store is not the volume of the nodes, and for images without Muster. One thread a gang.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from botocore.exceptions import BotoCoreError, ClientError
+from botocore.parsers import ResponseParserError
+
+from shared_store.logs import OUTCOME_LINE, format_line, parse_line
+from shared_store.outcomes import FirstError, Outcome
+
+_PACE = 0.05
+"""Seconds between two requests: CloudWatch answers 25 a second for the whole account."""
+_PAGE = 10_000
+_LAST_WAIT = 20.0
+"""Seconds that a gang which is over waits for the rest of its logs."""
+
+
+@dataclass
+class NodeLog:
+    """The copy of one node's log."""
+
+    path: Path
+    supervised: bool
+    copied: bool = True
+    """False where the supervisor writes it to the store that is here, too."""
+    stream: str | None = None
+    """Name of the stream; None until the node has one."""
+    token: str | None = None
+    skip: int = 0
+    """Lines that are in the copy already: a controller before this one wrote them."""
+    ended: float | None = None
+    """When the node was first seen to have ended (monotonic [s])."""
+    heard: float = 0.0
+    """When a line last came (monotonic [s])."""
+    outcome: Outcome | None = None
+    whole: bool = False
+    """Nothing more will come."""
+
+    def take(self, events: list[Mapping[str, Any]]) -> None:
+        """Append what came; the outcome is the last line of a supervised node."""
+        with open(self.path, "a", encoding="utf-8", errors="backslashreplace") as file:
+            for event in events:
+                if self.outcome is not None:
+                    return
+                self.heard = time.monotonic()
+                line = self._line(str(event["message"]), float(event["timestamp"]) / 1000)
+                if line is None:
+                    continue
+                if self.skip:
+                    self.skip -= 1
+                else:
+                    file.write(line)
+
+    def _line(self, message: str, seconds: float) -> str | None:
+        """As it belongs into the run's log; None for the outcome, which is kept."""
+        if not self.supervised:
+            return format_line(seconds, 0, "o", message)
+        said = parse_line(message, 0, 0)
+        if said is None:
+            return format_line(seconds, None, "o", message)
+        if said.rank is None and said.text.startswith(OUTCOME_LINE):
+            self.outcome = read_outcome_line(said.text)
+            return None
+        return message + "\n"
+
+    def settle(self, quiet: float) -> None:
+        """Whether all is there: the outcome has come, or nothing has for ``quiet`` seconds after the end."""
+        silent = self.ended is not None and time.monotonic() - max(self.ended, self.heard) > quiet
+        self.whole = self.outcome is not None or silent
+
+
+def read_outcome_line(text: str) -> Outcome | None:
+    """The outcome that a supervisor printed; None where it is damaged."""
+    try:
+        value = json.loads(text.removeprefix(OUTCOME_LINE))
+        error = FirstError(**value["error"]) if value.get("error") else None
+        return Outcome(**{**value, "error": error})
+    except (ValueError, TypeError, KeyError):
+        return None
+
+
+@dataclass
+class GangLogs:
+    """Copies the logs of all nodes of a gang until each is whole."""
+
+    client: Any
+    """Of CloudWatch Logs."""
+    group: str
+    nodes: list[NodeLog]
+    poll: float
+    """Seconds between two rounds."""
+    quiet: float
+    """Seconds without a line after which an ended node's log is whole."""
+    _wake: threading.Event = field(default_factory=threading.Event)
+    _closed: bool = False
+
+    def start(self, name: str) -> None:
+        for node in self.nodes:
+            if not node.copied:
+                node.whole = True
+                continue
+            node.path.parent.mkdir(parents=True, exist_ok=True)
+            node.skip = node.path.read_bytes().count(b"\n") if node.path.exists() else 0
+        threading.Thread(target=self._follow, name=f"log {name}", daemon=True).start()
+
+    def saw(self, index: int, stream: str | None, ended: bool) -> NodeLog:
+        """What AWS says of a node: the name of its stream, and whether it has ended."""
+        node = self.nodes[index]
+        node.stream = stream or node.stream
+        if ended and node.ended is None:
+            node.ended = time.monotonic()
+            self._wake.set()
+        return node
+
+    def finish(self) -> None:
+        """All nodes have ended: wait until their logs are whole, for a while, and copy no more."""
+        deadline = time.monotonic() + _LAST_WAIT
+        while not all(node.whole or node.stream is None for node in self.nodes) and time.monotonic() < deadline:
+            self._wake.set()
+            time.sleep(0.1)
+        self._closed = True
+        self._wake.set()
+
+    def _follow(self) -> None:
+        while not self._closed and not all(node.whole for node in self.nodes):
+            for node in self.nodes:
+                if not node.whole:
+                    self._copy(node)
+            self._wake.wait(self.poll)
+            self._wake.clear()
+
+    def _copy(self, node: NodeLog) -> None:
+        """All that has come since the last look."""
+        try:
+            while node.stream is not None and not self._closed:
+                request = {"logGroupName": self.group, "logStreamName": node.stream, "startFromHead": True}
+                if node.token:
+                    request["nextToken"] = node.token
+                page = self.client.get_log_events(**request, limit=_PAGE)
+                node.take(page["events"])
+                if node.token == page["nextForwardToken"]:  # AWS's sign for: that is all for now
+                    break
+                node.token = page["nextForwardToken"]
+                time.sleep(_PACE)
+        except (ClientError, BotoCoreError, ResponseParserError, OSError):
+            pass  # not there yet, throttled, away, or the disk is full: the next round
+        node.settle(self.quiet)

@@ -1,0 +1,203 @@
+"""What runs in the actor that a gang's driver has on each node of a Ray cluster: it starts the node's supervisor and ends it.
+
+It travels to the node by value, since that may have another version of Muster, or none: that has to be said in words. So it imports
+nothing but the standard library. Python and Muster are those of the node.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_TIE = """
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
+if os.getppid() != int(sys.argv[1]):
+    sys.exit(1)
+for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):
+    signal.signal(number, signal.SIG_DFL)
+signal.pthread_sigmask(signal.SIG_SETMASK, [])
+try:
+    os.execvp(sys.argv[2], sys.argv[2:])
+except OSError as error:
+    sys.exit(f"can't start {sys.argv[2]!r}: {error.strerror}")
+"""
+"""Ties the supervisor's life to the actor's (``PR_SET_PDEATHSIG``) and undoes what Ray has done to its workers' signals.
+
+A program of its own, not a ``preexec_fn``: the actor's process has threads that may hold locks when it forks."""
+_FIRST_PORT, _PORTS = 29500, 500
+_OF_RAY = ("RAY_", "OMP_NUM_THREADS", "PYTHONBREAKPOINT", "SPT_NOENV", "GRPC_DEFAULT_SSL_ROOTS_FILE_PATH")
+"""Variables of a Ray worker that its node's command does not get."""
+
+
+class Node:
+    """One node of a gang. Methods that wait and methods that do not run side by side."""
+
+    def __init__(self, marks: Mapping[str, str], lease: float) -> None:
+        """Args:
+        marks: Variables that every process of the node, and of no other, has in its environment.
+        lease: Seconds without :meth:`beat` after which the node is ended: its driver is gone, or cut off.
+        """
+        self.marks, self.lease = {f"{name}={value}".encode() for name, value in marks.items()}, lease
+        self.heard = time.monotonic()
+        self._order: tuple[list[str], dict[str, str], str | None] | None = None
+        self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._problem = ""
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
+        # The kernel ties a child to the thread that started it: to one that lives as long as the process.
+        threading.Thread(target=self._keep, name="keeper", daemon=True).start()
+
+    def facts(self, directory: str | None, store: str) -> dict[str, Any]:
+        """What the driver has to know before it starts anything: the version of Muster here, a free port, what is missing."""
+        try:
+            from shared_store import __version__ as muster
+        except ImportError as error:
+            return {"problem": f"Muster is not installed there for {sys.executable} ({error})"}
+        if directory and not os.path.isdir(directory):
+            return {
+                "problem": f"working directory {directory} is not there: it has to be on a volume that all nodes share"
+            }
+        if not os.path.isdir(store):
+            return {"problem": f"store {store} is not there: it has to be on a volume that all nodes share"}
+        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": ""}
+
+    def free_port(self, address: str) -> int:
+        """The first port from 29500 that nobody listens on at ``address``; 0 where there is none."""
+        for port in range(_FIRST_PORT, _FIRST_PORT + _PORTS):
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                with contextlib.suppress(OSError):
+                    probe.bind((address, port))
+                    return port
+        return 0
+
+    def start(
+        self,
+        prefix: Sequence[str],
+        command: Sequence[str],
+        user: Mapping[str, str],
+        contract: Mapping[str, str],
+        gpus: int,
+        directory: str | None,
+    ) -> str:
+        """Start the supervisor; returns why it could not be started, or nothing.
+
+        Args:
+            prefix: Put before it: what gives it its mounts.
+            command: What it supervises.
+            user: The job's environment, which goes over that of the node.
+            contract: The node contract, which goes over both.
+            gpus: How many GPUs the node has; which ones is for Ray to say.
+            directory: Working directory.
+        """
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith(_OF_RAY)}
+        environment = {
+            **inherited,
+            "PATH": f"{os.path.dirname(sys.executable)}:{inherited.get('PATH', '/usr/bin:/bin')}",
+            "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "") if gpus else "",
+            **user,
+            **contract,
+        }
+        # -P: a folder called "worker" in the job's directory must not hide ours
+        supervisor = [*prefix, sys.executable, "-P", "-m", "worker.supervisor", "--", *command]
+        self._order = (supervisor, environment, directory)
+        self._ordered.set()
+        self._started.wait()
+        return self._problem
+
+    def wait(self) -> tuple[int, str]:
+        """Block until the supervisor has ended; its exit code (128 + n for signal n) and its last words."""
+        self._ended.wait()
+        assert self._process is not None
+        code = self._process.returncode
+        self._said.seek(0)
+        words = self._said.read().decode(errors="replace").strip().rpartition("\n")[2]
+        return code if code >= 0 else 128 - code, words
+
+    def beat(self) -> None:
+        """The driver is there."""
+        self.heard = time.monotonic()
+
+    def leave(self) -> None:
+        """Ask the supervisor to leave (SIGTERM): it saves, within its grace time."""
+        if self._process is not None and not self._ended.is_set():
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGTERM)
+
+    def stop(self, grace: float) -> None:
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the node is left."""
+        if self._process is not None:
+            self.leave()
+            self._ended.wait(grace)
+        self._end()
+
+    def _keep(self) -> None:
+        while not self._ordered.wait(0.5):
+            if self._abandoned():
+                os._exit(1)
+        assert self._order is not None
+        command, environment, directory = self._order
+        tie = [sys.executable, "-I", "-S", "-c", _TIE, str(os.getpid()), *command]
+        try:
+            self._process = subprocess.Popen(
+                tie,
+                env=environment,
+                cwd=directory,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._said,
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            self._problem = f"can't start the node: {error}"
+            self._started.set()
+            return
+        self._started.set()
+        while True:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(0.5)
+                break
+            if self._abandoned():
+                self._end()
+                os._exit(1)
+        self._ended.set()
+        while not self._abandoned():
+            time.sleep(0.5)
+        os._exit(1)
+
+    def _abandoned(self) -> bool:
+        return time.monotonic() - self.heard > self.lease
+
+    def _end(self) -> None:
+        """SIGKILL to everything here that carries the marks, until nothing is left."""
+        while pids := self._left():
+            for pid in pids:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(0.02)
+
+    def _left(self) -> list[int]:
+        found = []
+        for entry in os.listdir("/proc"):
+            if not entry.isdigit() or int(entry) == os.getpid():
+                continue
+            try:
+                with open(f"/proc/{entry}/environ", "rb") as file:
+                    if not self.marks <= set(file.read().split(b"\0")):
+                        continue
+                with open(f"/proc/{entry}/stat") as status:
+                    if status.read().rpartition(")")[2].split()[0] not in "ZX":
+                        found.append(int(entry))
+            except OSError:
+                continue
+        return found

@@ -1,0 +1,76 @@
+"""Several engines as one: what a controller drives. A host's name tells whose it is, and so does a gang's handle."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, engine_of
+
+log = logging.getLogger("muster.engines")
+
+
+class Several:
+    """Engines by their names; the first is the one that jobs of the queue ``default`` go to."""
+
+    def __init__(self, engines: Sequence[Engine]) -> None:
+        self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
+        self._known: dict[str, Sequence[Host]] = {}
+        self._troubles: dict[str, str] = {}
+
+    @property
+    def names(self) -> Sequence[str]:
+        return list(self.engines)
+
+    @property
+    def queueing(self) -> frozenset[str]:
+        """Those that queue by themselves."""
+        return frozenset(name for name, engine in self.engines.items() if engine.queues)
+
+    @property
+    def addresses(self) -> Sequence[str]:
+        """Of this machine as the engines' nodes see it, beside loopback."""
+        return sorted({engine.address for engine in self.engines.values() if engine.address})
+
+    def capacity(self, names: Iterable[str] | None = None) -> Sequence[Host]:
+        """The hosts of all engines, or of these. Those of one that does not answer are as they were when it last did."""
+        hosts: list[Host] = []
+        for name in self.engines if names is None else names:
+            try:
+                self._known[name] = self.engines[name].capacity()
+                self._troubles.pop(name, None)
+            except EngineError as error:
+                if self._troubles.get(name) != str(error):  # said once, not at every pass
+                    log.warning("engine %s: %s", name, error)
+                self._troubles[name] = str(error)
+            hosts += self._known.get(name, [])
+        return hosts
+
+    def plan(self, gang: Gang) -> Plan:
+        engine = self._engine(engine_of(gang.placements[0].host))
+        if gang.bus and engine.address:
+            gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
+        return engine.plan(gang)
+
+    def launch(self, plan: Plan) -> str:
+        name = engine_of(plan.gang.placements[0].host)
+        return f"{name} {len(plan.nodes)} {self._engine(name).launch(plan)}"
+
+    def observe(self, handle: str) -> GangStatus:
+        name, count, rest = handle.split(" ", 2)
+        if name not in self.engines:
+            lost = f"it was started on the engine {name}, which this controller does not have: muster serve --engine {name}"
+            return [NodeStatus(False, "", None, lost)] * int(count)
+        return self.engines[name].observe(rest)
+
+    def stop(self, handle: str, grace: float) -> None:
+        name, _, rest = handle.split(" ", 2)
+        if name in self.engines:
+            self.engines[name].stop(rest, grace)
+
+    def _engine(self, name: str) -> Engine:
+        try:
+            return self.engines[name]
+        except KeyError:
+            raise EngineError(f"this controller has no engine {name!r}; it has {', '.join(self.engines)}") from None

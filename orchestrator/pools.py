@@ -1,0 +1,50 @@
+"""Queues and compute environments that are there without anybody making them: one of each for every engine.
+
+A job goes to an engine by its queue. The queue ``default`` is that of the first engine, as long as nobody gave it others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy.orm import Session
+
+from orchestrator.engines import ENGINES
+from orchestrator.tables import ComputeEnvironment, JobQueue
+
+ENGINE_TAG = "muster:engine"
+"""Tag of a compute environment: which engine's hosts it has; without it, those of the controller's first."""
+
+
+def ensure_pools(session: Session, engines: Sequence[str]) -> None:
+    """A compute environment for each of ``engines``, and a queue of its name for each but the first, which has ``default``."""
+    for name in engines:
+        if (environment := session.get(ComputeEnvironment, name)) is None:
+            environment = ComputeEnvironment(name=name, document={"type": "UNMANAGED"}, tags={})
+            session.add(environment)
+        if environment.tags.get(ENGINE_TAG) != name:
+            environment.tags = {**environment.tags, ENGINE_TAG: name}
+        if name != engines[0] and session.get(JobQueue, name) is None:
+            session.add(JobQueue(name=name, environments=[name]))
+    default = session.get(JobQueue, "default")
+    if default is not None and len(default.environments) == 1 and default.environments[0] in ENGINES:
+        default.environments = [engines[0]]
+
+
+def queue_engines(session: Session, queue: str, first: str) -> list[str]:
+    """The engines of a queue's compute environments, in their order; none for a queue that does not exist."""
+    found = session.get(JobQueue, queue)
+    environments = [session.get(ComputeEnvironment, name) for name in (found.environments if found else [])]
+    return list(dict.fromkeys(pool_engine(each.tags, first) for each in environments if each is not None))
+
+
+def pool_engine(tags: dict[str, str], first: str) -> str:
+    """The engine of a compute environment with these tags."""
+    return tags.get(ENGINE_TAG, first)
+
+
+def options_of(*tags: dict[str, str]) -> dict[str, str]:
+    """Options for an engine: ``muster:NAME=VALUE`` tags, later ones over earlier ones."""
+    return {
+        key.removeprefix("muster:"): value for each in tags for key, value in each.items() if key.startswith("muster:")
+    }

@@ -1,0 +1,60 @@
+"""moto as AWS, with its server in this process, and what it lacks of CloudFormation for our template."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from moto.batch import models as batch
+from moto.ec2.models import ec2_backends
+from moto.ec2.models.route_tables import RouteTable
+from moto.efs.models import AccessPoint
+from moto.server import ThreadedMotoServer
+
+
+def _definition(
+    cls: Any, resource_name: str, cloudformation_json: dict[str, Any], account_id: str, region_name: str, **_: Any
+) -> Any:
+    """moto takes every definition of a template for one of a single container; this passes on what it is."""
+    properties = cloudformation_json["Properties"]
+    return batch.batch_backends[account_id][region_name].register_job_definition(
+        def_name=resource_name,
+        parameters={},
+        _type=properties["Type"],
+        tags={},
+        retry_strategy=batch.lowercase_first_key(properties["RetryStrategy"]),
+        container_properties=None,
+        node_properties=batch.lowercase_first_key(properties["NodeProperties"]),
+        eks_properties=None,
+        timeout=batch.lowercase_first_key(properties["Timeout"]),
+        platform_capabilities=None,
+        propagate_tags=properties["PropagateTags"],
+    )
+
+
+@contextmanager
+def moto_server() -> Iterator[str]:
+    """The URL of a moto that has no account's state yet."""
+    original = batch.JobDefinition.create_from_cloudformation_json
+    AccessPoint.physical_resource_id = property(lambda point: point.access_point_id)  # what `Ref` of one gives
+    RouteTable.delete = lambda table, account, region: ec2_backends[account][region].route_tables.pop(table.id, None)
+    batch.JobDefinition.create_from_cloudformation_json = classmethod(_definition)
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        url = f"http://{host}:{port}"
+        post(url, "/moto-api/reset", {})
+        post(url, "/moto-api/config", {"batch": {"use_docker": False}})
+        yield url
+    finally:
+        server.stop()
+        batch.JobDefinition.create_from_cloudformation_json = original
+
+
+def post(url: str, path: str, body: object) -> None:
+    request = urllib.request.Request(url + path, json.dumps(body).encode(), {"Content-Type": "application/json"})
+    urllib.request.urlopen(request, timeout=30).read()

@@ -1,0 +1,154 @@
+"""Every engine in its place, for the tests that each of them passes: a controller that has it, and what it needs around it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Serving, wait_for
+from tests.engines.conftest import PATH, SUPERVISED, host_files
+
+ENGINES = ("local", "docker", "ray", "slurm", "aws-batch")
+
+
+@dataclass
+class Site:
+    """One engine."""
+
+    engine: str
+    serving: Serving
+    volume: Path
+    """The nodes' store, as this machine sees it."""
+    container: dict[str, Any] = field(default_factory=dict)
+    """What a job's ``containerProperties`` need there."""
+    environment: dict[str, str] = field(default_factory=dict)
+    """What its environment needs."""
+
+    def submit(self, script: str, nodes: int, attempts: int = 1, cpus: str = "0.25", **env: str) -> str:
+        """A native gang of ``sh -c script``; returns the job id."""
+        environment = {"MUSTER_ON_CHILD_FAILURE": "restart", **self.environment, **env}
+        container = {
+            "image": "muster",
+            "command": ["sh", "-c", script],
+            "environment": [{"name": name, "value": value} for name, value in environment.items()],
+            "resourceRequirements": [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "128"}],
+            **self.container,
+        }
+        properties = {
+            "numNodes": nodes,
+            "mainNode": 0,
+            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
+        }
+        registered = self.serving.client.batch(
+            "RegisterJobDefinition",
+            jobDefinitionName="suite",
+            type="multinode",
+            nodeProperties=properties,
+            retryStrategy={"attempts": attempts},
+        )
+        submitted = self.serving.client.batch(
+            "SubmitJob", jobName="suite", jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
+        )
+        return str(submitted["jobId"])
+
+    def printed(self, job: str, attempt: int | None = None) -> list[str]:
+        """What the job's ranks printed."""
+        query = {} if attempt is None else {"attempt": attempt}
+        return [line["text"] for line in self.serving.client.logs(job, **query) if line["rank"] is not None]
+
+    def ready(self, job: str, attempt: int, nodes: int) -> None:
+        wait_for(lambda: self.printed(job, attempt).count("ready") == nodes, 60, f"attempt {attempt} of {nodes} nodes")
+
+
+def processes(job: str, **variables: str) -> dict[int, list[bytes]]:
+    """Commands by pid of all that carries the job's id, and these variables, on this machine: in containers, too."""
+    wanted = {f"{name}={value}".encode() for name, value in {"MUSTER_JOB_ID": job, **variables}.items()}
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with contextlib.suppress(OSError):
+            there = set((entry / "environ").read_bytes().split(b"\0"))
+            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+            if wanted <= there and state not in "ZX":
+                found[int(entry.name)] = (entry / "cmdline").read_bytes().split(b"\0")
+    return found
+
+
+def kill_rank(job: str, rank: int) -> None:
+    """SIGKILL to one rank."""
+    for pid in processes(job, RANK=str(rank)):
+        os.kill(pid, signal.SIGKILL)
+
+
+def kill_supervisor(job: str, node: int) -> None:
+    """SIGKILL to the supervisor of one node: its ranks have no other parent."""
+    for pid in processes(job, NODE_RANK=str(node)):
+        with contextlib.suppress(OSError):
+            if b"TORCHELASTIC_ERROR_FILE=" not in Path(f"/proc/{pid}/environ").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def local(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    yield from _served("local", home, "--cpus", "8")
+
+
+@contextlib.contextmanager
+def docker(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    request.getfixturevalue("docker_client")
+    container = {"image": SUPERVISED, **host_files()}
+    yield from _served("docker", home, "--cpus", "8", container=container, environment={"PATH": PATH})
+
+
+@contextlib.contextmanager
+def ray(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    request.getfixturevalue("ray_cluster")
+    yield from _served("ray", home)
+
+
+@contextlib.contextmanager
+def slurm(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    request.getfixturevalue("slurm_cluster")
+    yield from _served("slurm", home)
+
+
+@contextlib.contextmanager
+def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    """A second Muster plays AWS; its nodes write to a volume that the controller does not see."""
+    from orchestrator.engines.aws_config import AwsConfig, save_config
+
+    os.environ.update(AWS_ACCESS_KEY_ID="any", AWS_SECRET_ACCESS_KEY="any")
+    aws = Serving(home / "aws", "--cpus", "8")
+    try:
+        settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
+        told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
+        (home / "home").mkdir()
+        save_config(home / "home", AwsConfig(**told))
+        yield from _served("aws-batch", home / "home", volume=home / "volume")
+    finally:
+        aws.close()
+
+
+def _served(engine: str, home: Path, *options: str, volume: Path | None = None, **needs: Any) -> Iterator[Site]:
+    serving = Serving(home, "--engine", engine, *options)
+    try:
+        yield Site(engine, serving, volume or home / "store", **needs)
+    finally:
+        serving.close()
+
+
+SITES: dict[str, Callable[..., Any]] = {
+    "local": local,
+    "docker": docker,
+    "ray": ray,
+    "slurm": slurm,
+    "aws-batch": aws_batch,
+}

@@ -1,0 +1,82 @@
+"""The Docker engine through a controller: a stop while an image is pulled, a bus that reaches into containers, a node that is cut off."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.client import ApiError
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.conftest import Serving, wait_for
+from tests.engines.conftest import PATH, SUPERVISED, host_files
+from tests.engines.test_every_training import submit
+
+
+def plain(served: Serving, image: str, script: str, queue: str = "default", **container: Any) -> str:
+    """A gang of one in ``image``; returns the job id."""
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
+    container = {"image": image, "command": ["sh", "-c", script], "resourceRequirements": needs, **container}
+    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
+    arn = served.client.batch(
+        "RegisterJobDefinition", jobDefinitionName="plain", type="multinode", nodeProperties=properties
+    )["jobDefinitionArn"]
+    job: str = served.client.batch("SubmitJob", jobName="plain", jobQueue=queue, jobDefinition=arn)["jobId"]
+    return job
+
+
+@pytest.mark.usefixtures("docker_client")
+def test_a_job_whose_image_is_being_pulled_can_be_stopped_and_a_node_answers_on_the_bus(tmp_path: Path) -> None:
+    served = Serving(tmp_path, "--engine", "docker")
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as registry:  # takes connections, and never answers
+            image = f"127.0.0.1:{registry.getsockname()[1]}/far:1"
+            job = plain(served, image, "true")
+            wait_for(lambda: served.detail(job)["statusReason"] == f"pulling image {image}", 30, "the pull")
+            served.client.batch("TerminateJob", jobId=job, reason="no time for that")
+            assert served.wait(job, timeout=10)["statusReason"] == "no time for that"
+        environment = [{"name": "PATH", "value": PATH}]
+        job = plain(served, SUPERVISED, "echo ready; exec sleep 600", environment=environment, **host_files())
+        wait_for(lambda: "ready" in served.log(job), 30, "its start")
+        [node] = wait_for(lambda: ask_stacks(served, job), 30, "an answer from inside the container")
+        assert "rank 0:" in node["stacks"]
+        served.client.batch("TerminateJob", jobId=job, reason="enough")
+        served.wait(job)
+    finally:
+        served.close()
+
+
+def ask_stacks(served: Serving, job: str) -> Any:
+    try:
+        return served.client.get(f"/api/jobs/{job}/stacks")
+    except ApiError:
+        return None
+
+
+@pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="three minutes: MUSTER_LONG=1, in make bits")
+def test_a_node_that_is_cut_off_is_noticed_by_its_silence_and_the_gang_goes_on(
+    docker_client: Any, tmp_path: Path
+) -> None:
+    docker = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
+    run = Store(tmp_path / "store").run("cut")
+    job = ""
+    try:
+        job = submit(docker, "cut", "docker", 24, "stall_timeout=15s")
+        wait_for(lambda: run.path.exists() and len(read_metrics(run)) >= 5, 120, "some iterations")
+        [network] = [n for n in docker_client.networks.list(filters={"label": "muster.gang"}) if job in n.name]
+        network.reload()
+        [child] = [c for c in network.containers if c.labels["muster.node"] == "1"]
+        network.disconnect(child)
+        done = docker.wait(job, timeout=240)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], docker.log(job)[-20:])
+        first = done["attempts"][0]["statusReason"]
+        assert len(done["attempts"]) == 2 and "made no progress for 1" in first, first
+    finally:
+        docker.close()
+        for container in docker_client.containers.list(all=True, filters={"label": "muster.gang"}):
+            if job and container.labels["muster.gang"].startswith(job):
+                container.remove(force=True)
