@@ -83,12 +83,12 @@ class SlurmEngine:
             "output": output_path(gang),
         }
         if trouble := self._jobs.away():
-            raise NotYet(f"Slurm: {trouble}")
+            raise NotYet(f"Slurm: {trouble}", unknown=True)
         with self._submitting:  # one look and one submission at a time
             try:
                 number = self._find(facts) or self._submit(gang, script)
             except Unreachable as error:
-                raise NotYet(f"Slurm: {error}") from error
+                raise NotYet(f"Slurm: {error}", unknown=True) from error
             self._submitted[number] = time.monotonic()
         return json.dumps({**facts, "slurm": number})
 

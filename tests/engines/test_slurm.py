@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -18,11 +17,9 @@ from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
 from orchestrator.engines.slurm_commands import SlurmJob
 from orchestrator.engines.slurm_words import ending, waiting
-from shared_store.layout import StoreError
 from tests.conftest import wait_for
 from tests.engines.slurm_bench import POLITE, Bench
 from tests.engines.slurm_cluster import GPUS, NODES, SlurmCluster, need_slurm
-from worker import slurm_node
 
 
 @pytest.fixture(scope="module")
@@ -264,24 +261,16 @@ def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: Bench) -> 
         assert not bench.processes(b"worker.supervisor") and not any(n.running for n in bench.engine.observe(handle))
 
 
-@pytest.mark.parametrize(
-    ("changes", "problem"),
-    [
-        ({"directory": "/no/such/place"}, "[Errno 2] No such file or directory: '/no/such/place'"),
-        # what a node with another disk at that path finds: no such epoch
-        pytest.param(
-            {"epoch": 2},
-            "store {store} has no epoch 2 of run run: it must be the controller's, on a shared file system",
-            marks=pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="it waits for NFS: MUSTER_LONG=1"),
-        ),
-    ],
-)
-def test_what_a_node_does_not_have_is_one_line_with_its_name(
-    bench: Bench, changes: dict[str, Any], problem: str
-) -> None:
-    for node, name in zip(bench.ended(bench.launch(bench.gang(nodes=2, **changes))), NODES, strict=False):
+def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: Bench) -> None:
+    nowhere = bench.launch(bench.gang(nodes=2, directory="/no/such/place"))
+    # what a node with another disk at the store's path finds: no such epoch
+    other = bench.launch(bench.gang(nodes=1, epoch=2, suffix="2"))
+    for node, name in zip(bench.ended(nowhere), NODES, strict=False):
         assert node.exit_code == 2
-        assert node.detail == f"muster: node {name}: {problem.format(store=bench.store.path)}"
+        assert node.detail == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
+    [node] = bench.ended(other)
+    assert node.exit_code == 2 and node.detail.startswith(f"muster supervisor: store {bench.store.path} on "), node
+    assert " is not the controller's: run run has epoch 1 there, not 2" in node.detail
 
 
 def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
@@ -298,18 +287,6 @@ def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
         node.detail.startswith("Slurm could not start it on n1: is ")
         and "file system that all nodes share" in node.detail
     )
-
-
-def test_a_node_that_does_not_see_the_controller_s_store_says_so(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(slurm_node, "_PATIENCE", 0.2)
-    [plan] = bench.engine.plan(bench.gang()).nodes
-    slurm_node.check_store(plan.contract)
-    with pytest.raises(StoreError, match=r"has no epoch 2 of run run: it must be the controller's, on a shared file"):
-        slurm_node.check_store(dataclasses.replace(plan.contract, epoch=2))
-    with pytest.raises(StoreError, match=r"^store /nowhere is not there: it must be the controller's"):
-        slurm_node.check_store(dataclasses.replace(plan.contract, store="/nowhere"))
 
 
 @pytest.mark.parametrize(
