@@ -18,6 +18,7 @@ from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, Serving, wait_for
 from tests.engines.slurm_cluster import SlurmCluster, need_slurm
 
+long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
 CHANGES = ("nodes=2", "train.iterations=24", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 
 
@@ -53,6 +54,7 @@ def submit(serving: Serving, run: str, *changes: str) -> str:
     return job
 
 
+@long
 def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_the_local_engine(
     cluster: SlurmCluster, tmp_path: Path
 ) -> None:
@@ -102,9 +104,6 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         text=True,
     )
     assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
-
-
-long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
 
 
 @long
