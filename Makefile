@@ -9,7 +9,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -38,6 +38,9 @@ bench-scheduling: $(READY)
 
 bench-logs: $(READY)
 	$(BIN)/python -m benchmarks.log_follow | tee benchmarks/log_follow.md
+
+bench-engines: $(READY)
+	$(BIN)/pytest -q -s -p tests.engines.conftest benchmarks/engines.py
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume

@@ -127,9 +127,6 @@ class AwsBatchEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        if "aws" not in facts:
-            count = len(facts.get("addresses") or facts.get("nodes") or [])
-            return [NodeStatus(False, "", None, "another engine started it")] * count
         watched = self._gangs.setdefault(facts["gang"], _Watched())
         over = watched.status is not None and not any(node.running for node in watched.status)
         if watched.status is None or (not over and time.monotonic() - watched.at >= self.config.poll):
@@ -140,8 +137,6 @@ class AwsBatchEngine:
     def stop(self, handle: str, grace: float) -> None:
         """AWS's own grace is 30 s, whatever ``grace`` says. Waits for as long as AWS says that something of it runs."""
         facts = json.loads(handle)
-        if "aws" not in facts:
-            return
         watched = self._gangs.setdefault(facts["gang"], _Watched())
         asked = False
         while True:

@@ -146,8 +146,6 @@ class RayEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        if "ray" not in facts:
-            return [NodeStatus(False, "", None, "another engine started it") for _ in facts.get("nodes", [0])]
         self._note(facts)
         gang, count = str(facts["ray"]), len(facts["hosts"])
         folder = Folder.of(self.home, _job(gang))
@@ -180,8 +178,6 @@ class RayEngine:
 
     def stop(self, handle: str, grace: float) -> None:
         facts = json.loads(handle)
-        if "ray" not in facts:
-            return
         gang = str(facts["ray"])
         folder = Folder.of(self.home, _job(gang))
         asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE

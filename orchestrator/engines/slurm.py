@@ -94,11 +94,6 @@ class SlurmEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        if "slurm" not in facts:
-            return [
-                NodeStatus(False, "", None, "another engine started it")
-                for _ in facts.get("nodes", facts.get("addresses"))
-            ]
         count = len(facts["addresses"])
         try:
             job = self._job(facts)
@@ -113,8 +108,6 @@ class SlurmEngine:
 
     def stop(self, handle: str, grace: float) -> None:
         facts = json.loads(handle)
-        if "slurm" not in facts:
-            return
         number, deadline, asked, killed = facts["slurm"], time.monotonic() + grace, False, 0.0
         while True:
             try:

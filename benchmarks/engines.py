@@ -1,0 +1,123 @@
+"""What engines cost: how soon a gang starts, how soon a death is noticed and mended, how soon a stop is done, speed and memory.
+
+``make bench-engines`` writes ``benchmarks/engines.md``. The clusters are those of the tests (``tests/engines/``), all on this machine, so
+this is a module for pytest. Gangs have two nodes. A rank's death is noticed when the controller has recorded it, a node's likewise; a
+gang runs again when all its ranks have printed; nothing is left when no process of it is and the job is FAILED.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.conftest import wait_for
+from tests.engines.sites import ENGINES, SITES, Site, kill_rank, kill_supervisor, processes
+from tests.engines.test_every_training import submit
+
+TRIES = 5
+TABLE = Path(__file__).with_suffix(".md")
+STAYS = 'trap "exit 75" TERM; echo ready; while :; do sleep 0.02; done'
+DAEMONS = {
+    "docker": ("dockerd", "containerd", "containerd-shim"),
+    "ray": ("raylet", "gcs_server", "ray::", "ray/dashboard", "ray/_private", "engines.ray_"),
+    "slurm": ("slurmctld", "slurmd", "slurmstepd"),
+}
+"""What the engine itself runs, by words in the commands of its processes."""
+ROWS: dict[str, dict[str, str]] = {}
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    with SITES[request.param](tmp_path_factory.mktemp(request.param), request) as found:
+        yield found
+
+
+def seconds(since: float, what: Callable[[], Any]) -> float:
+    """Seconds from ``since`` (monotonic) until ``what`` is true."""
+    wait_for(what, 90, "what is measured")
+    return time.monotonic() - since
+
+
+def test_measure(site: Site) -> None:
+    times: dict[str, list[float]] = {name: [] for name in ("first", "rank", "node", "again", "stop")}
+    for _ in range(TRIES):
+        begun = time.monotonic()
+        job = site.submit(STAYS, nodes=2, attempts=4)
+        times["first"].append(seconds(begun, lambda job=job: site.printed(job)))
+        site.ready(job, 1, 2)
+        for attempt, (name, kill) in enumerate((("rank", kill_rank), ("node", kill_supervisor)), 1):
+            begun = time.monotonic()
+            kill(job, 1)
+
+            def noticed(job: str = job, attempt: int = attempt) -> bool:
+                attempts = site.serving.detail(job)["attempts"]
+                return len(attempts) > attempt or bool(attempts[attempt - 1]["statusReason"])
+
+            times[name].append(seconds(begun, noticed))
+            again = seconds(begun, lambda job=job, a=attempt: site.printed(job, a + 1).count("ready") == 2)
+            if name == "node":
+                times["again"].append(again)
+        memory = _memory(site)
+        begun = time.monotonic()
+        site.serving.client.batch("TerminateJob", jobId=job, reason="measured")
+        times["stop"].append(
+            seconds(begun, lambda job=job: not processes(job) and site.serving.detail(job)["status"] == "FAILED")
+        )
+    row = {name: f"{statistics.median(found):.2f}" for name, found in times.items()}
+    ROWS[site.engine] = {**row, **memory, "speed": _speed(site)}
+    _write()
+
+
+def _speed(site: Site) -> str:
+    """Median steps/s of a cart-pole training on two nodes, from its metrics."""
+    if site.engine == "aws-batch":
+        return "-"  # its nodes are the local engine's
+    job = submit(site.serving, "speed", site.engine, 40, "train.worlds=256", "checkpoint.every=1000")
+    assert site.serving.wait(job, timeout=180)["status"] == "SUCCEEDED", site.serving.detail(job)["statusReason"]
+    found = [record["steps_per_second"] for record in read_metrics(Store(site.volume).run("speed"))[5:]]
+    return f"{statistics.median(found):,.0f}"
+
+
+def _memory(site: Site) -> dict[str, str]:
+    """MiB (proportional set size) of the controller, and of all that the engine itself runs, its processes on all nodes together."""
+    words = DAEMONS.get(site.engine, ())
+    engine = 0.0
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != site.serving.process.pid:
+            try:
+                command = (entry / "cmdline").read_bytes().decode(errors="replace")
+            except OSError:
+                continue
+            if any(word in command for word in words) and "pytest" not in command:
+                engine += _pss(int(entry.name))
+    return {"controller": f"{_pss(site.serving.process.pid):.0f}", "engine": f"{engine:.0f}" if words else "-"}
+
+
+def _pss(pid: int) -> float:
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
+
+
+def _write() -> None:
+    head = (
+        "# Engines\n\nWritten by `make bench-engines`: gangs of two nodes, all on one machine (two CPU cores); seconds, medians of "
+        f"{TRIES}. Memory is proportional set size in MiB:\nof the controller, and of what the engine itself runs on all its nodes "
+        "together (Ray: a head and three nodes; Slurm: slurmctld and three slurmd).\n`aws-batch` is a second Muster in AWS's place: "
+        "what AWS itself takes (instances, images) is not in it.\nSteps/s: cart-pole, two nodes of 256 worlds.\n\n"
+        "| engine | submit → first rank | rank's death → noticed | node's death → noticed | → runs again | stop → nothing left | "
+        "steps/s | controller | engine |\n|---|---|---|---|---|---|---|---|---|\n"
+    )
+    keys = ("first", "rank", "node", "again", "stop", "speed", "controller", "engine")
+    TABLE.write_text(
+        head + "".join(f"| {name} | {' | '.join(row[key] for key in keys)} |\n" for name, row in ROWS.items())
+    )
