@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import threading
 import time
@@ -27,8 +28,8 @@ from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeS
 from orchestrator.engines.slurm_commands import Hosts, Jobs, SlurmJob, Unreachable, address_of_this_machine, call
 from orchestrator.engines.slurm_script import output_path, render
 from orchestrator.engines.slurm_words import OVER, QUEUED, ending, waiting
-from shared_store.layout import Store
-from shared_store.outcomes import read_outcome
+from shared_store.layout import Run, Store
+from shared_store.outcomes import Outcome, read_outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """What sbatch says where it would take the job later."""
@@ -40,6 +41,8 @@ _FORGOTTEN = "0"
 """Number of a job that Slurm does not know any more."""
 _SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit code (\d+)|(.+))$", re.MULTILINE)
 _SIGNALS = {"Killed": 137, "Terminated": 143, "Segmentation fault": 139, "Aborted": 134, "Out Of Memory": 137}
+_SCRIPT = re.compile(r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", re.MULTILINE)
+"""What the script itself says where it can't start the nodes."""
 _MEETING = re.compile(r"^muster: meeting (\{.*\})$", re.MULTILINE)
 
 
@@ -74,32 +77,34 @@ class SlurmEngine:
             "attempt": gang.attempt,
             "run": gang.run,
             "store": gang.store,
-            "nodes": len(gang.placements),
+            "addresses": [""] * len(gang.placements),
             "main": gang.main,
             "native": any(environment.get("MUSTER_ON_CHILD_FAILURE") for environment in gang.environments),
             "output": output_path(gang),
         }
         if trouble := self._jobs.away():
-            raise NotYet(f"Slurm: {trouble}")
+            raise NotYet(f"Slurm: {trouble}", unknown=True)
         with self._submitting:  # one look and one submission at a time
             try:
                 number = self._find(facts) or self._submit(gang, script)
             except Unreachable as error:
-                raise NotYet(f"Slurm: {error}") from error
+                raise NotYet(f"Slurm: {error}", unknown=True) from error
             self._submitted[number] = time.monotonic()
         return json.dumps({**facts, "slurm": number})
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        count = facts["nodes"]
+        count = len(facts["addresses"])
         try:
             job = self._job(facts)
         except Unreachable as error:
             return [NodeStatus(True, "", waiting=f"Slurm: {error}")] * count
         if job is not None and job.state in QUEUED:
             return [NodeStatus(True, "", waiting=waiting(job))] * count
+        run = Store(facts["store"]).run(facts["run"])
+        ends = _outcomes(run, facts)
         said = _said(facts)
-        return [_node(facts, job, said, index) for index in range(count)]
+        return [_node(facts, job, said, index, ends.get(index)) for index in range(count)]
 
     def stop(self, handle: str, grace: float) -> None:
         facts = json.loads(handle)
@@ -180,12 +185,26 @@ def _said(facts: Mapping[str, Any]) -> str:
         return ""
 
 
-def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int) -> NodeStatus:
+def _outcomes(run: Run, facts: Mapping[str, Any]) -> dict[int, Outcome]:
+    """By node index; one look at the folder, however many nodes there are."""
+    try:
+        names = set(os.listdir(run.outcome(facts["job"], facts["attempt"], 0).parent))
+    except FileNotFoundError:
+        return {}
+    found = {}
+    for index in range(len(facts["addresses"])):
+        if run.outcome(facts["job"], facts["attempt"], index).name in names:
+            outcome = read_outcome(run, facts["job"], facts["attempt"], index)
+            if outcome is not None:
+                found[index] = outcome
+    return found
+
+
+def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int, outcome: Outcome | None) -> NodeStatus:
     """How one node is, by its outcome, else by what srun says of its task, else by its job."""
     task = 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
     meeting = _MEETING.search(said)
     address = json.loads(meeting[1])["addresses"][task] if meeting else ""
-    outcome = read_outcome(Store(facts["store"]).run(facts["run"]), facts["job"], facts["attempt"], index)
     if outcome is not None:
         return NodeStatus(False, address, outcome.exit_code)
     # what the node's own processes said before they could say it in the store
@@ -195,13 +214,9 @@ def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int)
             status = int(code) if code else _SIGNALS.get(how.removesuffix(" (core dumped)"), 137)
             return NodeStatus(False, address, status, own[-1] if own else "")
     if job is not None and job.state not in OVER:
-        return NodeStatus(True, address)
-    if not meeting and (
-        early := re.findall(
-            r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", said, re.MULTILINE
-        )
-    ):
-        return NodeStatus(False, address, 2, own[-1] if own else early[-1])
+        return NodeStatus(True, address, waiting="" if meeting else f"Slurm: starts on {job.hosts} (job {job.number})")
+    if not own and (not meeting or (job is not None and job.state == "FAILED")):
+        own = _SCRIPT.findall(said)
     if own:
         return NodeStatus(False, address, 2, own[-1])
     if job is None:

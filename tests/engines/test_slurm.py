@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,13 +12,14 @@ from typing import Any
 
 import pytest
 
+from orchestrator.engines import slurm_script
 from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
-from shared_store.layout import StoreError
+from orchestrator.engines.slurm_commands import SlurmJob
+from orchestrator.engines.slurm_words import ending, waiting
 from tests.conftest import wait_for
 from tests.engines.slurm_bench import POLITE, Bench
 from tests.engines.slurm_cluster import GPUS, NODES, SlurmCluster, need_slurm
-from worker import slurm_node
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,9 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     environments = [
         {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart", "NODE": str(i)} for i in range(3)
     ]
-    gang = bench.gang(show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS)
+    gang = bench.gang(
+        show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS, title='a "job" \\ é $HOME #1'
+    )
     handle = bench.launch(gang)
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(json.loads(handle)["output"]).read_text()
     told = sorted((json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"]))
@@ -82,6 +85,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
     for env in told:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
+        assert env["SLURM_JOB_NAME"] == gang.title
         assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], told[0]["MASTER_PORT"])
         assert env["CUDA_VISIBLE_DEVICES"] == "0,1", "as Slurm set it"
         assert env["FROM_THE_CONTROLLER"] == "kept" and env["MUSTER_GANG"] == f"{bench.job}/1/1"
@@ -162,6 +166,9 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: Bench) -> None:
     wait_for(lambda: waits("the partition is down", closed), 20, "its reason")
     long = bench.launch(bench.gang(suffix="6", options={"partition": "short"}, timeout=3600))
     wait_for(lambda: waits("more time than the partition allows", long), 20, "its reason")
+    bench.cluster.run("scancel", json.loads(closed)["slurm"])
+    [node] = bench.ended(closed)
+    assert node.detail.startswith("it was cancelled in Slurm, not by Muster (job "), node
     bench.engine.stop(small, 5.0)
     assert bench.state(small) == "CANCELLED" and not bench.engine.observe(small)[0].running
     bench.engine.stop(big, 0.0)
@@ -254,33 +261,60 @@ def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: Bench) -> 
         assert not bench.processes(b"worker.supervisor") and not any(n.running for n in bench.engine.observe(handle))
 
 
+def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: Bench) -> None:
+    nowhere = bench.launch(bench.gang(nodes=2, directory="/no/such/place"))
+    # what a node with another disk at the store's path finds: no such epoch
+    other = bench.launch(bench.gang(nodes=1, epoch=2, suffix="2"))
+    for node, name in zip(bench.ended(nowhere), NODES, strict=False):
+        assert node.exit_code == 2
+        assert node.detail == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
+    [node] = bench.ended(other)
+    assert node.exit_code == 2 and node.detail.startswith(f"muster supervisor: store {bench.store.path} on "), node
+    assert " is not the controller's: run run has epoch 1 there, not 2" in node.detail
+
+
+def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "executable", "/no/python")
+        handle = bench.launch(bench.gang(nodes=2))
+    for node in bench.ended(handle):
+        assert not node.running and node.detail.endswith("/no/python: No such file or directory"), node
+    monkeypatch.setattr(slurm_script, "output_path", lambda gang: "/nowhere/slurm.out")
+    [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
+    assert (
+        node.detail.startswith("Slurm could not start it on n1: is ")
+        and "file system that all nodes share" in node.detail
+    )
+
+
 @pytest.mark.parametrize(
-    ("changes", "problem"),
+    ("state", "reason", "words"),
     [
-        ({"directory": "/no/such/place"}, "[Errno 2] No such file or directory: '/no/such/place'"),
-        # what a node with another disk at that path finds: no such epoch
-        pytest.param(
-            {"epoch": 2},
-            "store {store} has no epoch 2 of run run: it must be the controller's, on a shared file system",
-            marks=pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="it waits for NFS: MUSTER_LONG=1"),
+        (
+            "PENDING",
+            "QOSMaxCpuPerUserLimit",
+            "Slurm: a limit of the account or QOS is reached (QOSMaxCpuPerUserLimit; job 5)",
         ),
+        ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", "Slurm: nodes that it needs are down, drained or reserved"),
+        ("PENDING", "SomethingNew", "Slurm: waits (SomethingNew; job 5)"),
+        ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
     ],
 )
-def test_what_a_node_does_not_have_is_one_line_with_its_name(
-    bench: Bench, changes: dict[str, Any], problem: str
-) -> None:
-    for node, name in zip(bench.ended(bench.launch(bench.gang(nodes=2, **changes))), NODES, strict=False):
-        assert node.exit_code == 2
-        assert node.detail == f"muster: node {name}: {problem.format(store=bench.store.path)}"
+def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason: str, words: str) -> None:
+    assert waiting(SlurmJob("5", state, reason, "n1", "")).startswith(words)
 
 
-def test_a_node_that_does_not_see_the_controller_s_store_says_so(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(slurm_node, "_PATIENCE", 0.2)
-    [plan] = bench.engine.plan(bench.gang()).nodes
-    slurm_node.check_store(plan.contract)
-    with pytest.raises(StoreError, match=r"has no epoch 2 of run run: it must be the controller's, on a shared file"):
-        slurm_node.check_store(dataclasses.replace(plan.contract, epoch=2))
-    with pytest.raises(StoreError, match=r"^store /nowhere is not there: it must be the controller's"):
-        slurm_node.check_store(dataclasses.replace(plan.contract, store="/nowhere"))
+@pytest.mark.parametrize(
+    ("state", "code", "words"),
+    [
+        ("PREEMPTED", 75, "preempted by Slurm, and did not leave in time (job 5)"),
+        ("TIMEOUT", 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)"),
+        ("OUT_OF_MEMORY", 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
+        ("NODE_FAIL", 137, "Slurm lost a node of n1 (job 5)"),
+        ("SOMETHING_NEW", 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
+    ],
+)
+def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(state: str, code: int, words: str) -> None:
+    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (code, words)

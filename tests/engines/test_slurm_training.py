@@ -18,6 +18,7 @@ from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, Serving, wait_for
 from tests.engines.slurm_cluster import SlurmCluster, need_slurm
 
+long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
 CHANGES = ("nodes=2", "train.iterations=24", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 
 
@@ -53,6 +54,7 @@ def submit(serving: Serving, run: str, *changes: str) -> str:
     return job
 
 
+@long
 def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_the_local_engine(
     cluster: SlurmCluster, tmp_path: Path
 ) -> None:
@@ -60,6 +62,8 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
     home.mkdir()
     slurm = Serving(home, "--engine", "slurm")
     run = Store(home / "store").run("queued")
+
+    local: Serving | None = None
 
     def iterations() -> int:
         return len(read_metrics(run)) if run.path.exists() else 0
@@ -73,6 +77,9 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         for pid in frozen:
             os.kill(pid, signal.SIGSTOP)
         cluster.kill("n2")
+        # meanwhile the same on the local engine, undisturbed
+        local = Serving(tmp_path / "local", "--store", str(home / "store"), "--cpus", "4")
+        other = submit(local, "unqueued")
         wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
         assert all(b"SLURMD_NODENAME=n2" in environment(pid) for pid in frozen), "what ran there is still there"
         slurm.kill()
@@ -85,14 +92,11 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         assert [attempt["number"] for attempt in done["attempts"]] == [1, 2], done["attempts"]
         assert any("resumed from checkpoint" in line for line in slurm.log(job))
         wait_for(lambda: not cluster.processes(b"worker."), 30, "no process is left")
+        assert local.wait(other, timeout=180)["status"] == "SUCCEEDED"
     finally:
         slurm.close()
-    local = Serving(home, "--cpus", "4")
-    try:
-        job = submit(local, "unqueued")
-        assert local.wait(job, timeout=180)["status"] == "SUCCEEDED"
-    finally:
-        local.close()
+        if local is not None:
+            local.close()
     compared = subprocess.run(
         [sys.executable, "-P", "-m", "worker.compare", "queued", "unqueued"],
         env={**os.environ, "MUSTER_STORE": str(home / "store")},
@@ -100,9 +104,6 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         text=True,
     )
     assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
-
-
-long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
 
 
 @long

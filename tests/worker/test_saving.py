@@ -89,6 +89,19 @@ def test_a_writer_that_dies_is_told_and_replaced(run: Run) -> None:
     alone.close()
 
 
+def test_a_sigterm_to_every_process_of_a_node_leaves_the_writer_at_work(run: Run) -> None:
+    """Slurm's way to end a job, or to tell it that it will: the last save is still to be written."""
+    saver = Saver(run, 1, 0, 1, keep=None)
+    saver.save(1, content(1), {})
+    assert saver._process is not None
+    os.kill(saver._process.pid, signal.SIGTERM)
+    assert saver.wait() == ["checkpoint 00000001-e1"]
+    os.kill(saver._process.pid, signal.SIGTERM)
+    saver.save(2, content(2), {})
+    assert saver.wait() == ["checkpoint 00000002-e1"]
+    saver.close()
+
+
 def test_a_stale_attempt_is_stopped_by_its_own_save(run: Run) -> None:
     saver = Saver(run, 1, 0, 1, keep=None)
     raise_epoch(run, 2)
