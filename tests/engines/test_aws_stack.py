@@ -232,11 +232,14 @@ def test_the_engine_works_on_what_up_has_written(
     assert definition["type"] == "multinode" and definition["tags"]["muster:digest"]
 
 
-def test_status_says_what_is_there_and_up_again_changes_nothing(account: Account) -> None:
+def test_status_says_what_is_there_and_writes_what_the_engine_needs(account: Account) -> None:
     shown = account.muster("status")
     assert shown.returncode == 0, shown.stderr
     assert "muster in us-east-1: CREATE_COMPLETE" in shown.stdout and "not pushed yet" in shown.stdout
-    told = json.loads(account.muster("status", "--json").stdout)
+    before = (account.home / "aws.json").read_text()
+    (account.home / "aws.json").unlink()
+    told = json.loads(account.muster("status", "--json", "--write").stdout)
+    assert (account.home / "aws.json").read_text() == before
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == (
         "muster: there is no stack other in us-east-1; create it with `muster aws up`\n"
