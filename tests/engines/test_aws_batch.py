@@ -36,9 +36,11 @@ TRAP = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; don
 @pytest.fixture(scope="module")
 def aws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """The second Muster."""
-    os.environ.update(AWS_ACCESS_KEY_ID="any", AWS_SECRET_ACCESS_KEY="any")
     serving = Serving(tmp_path_factory.mktemp("aws"), "--cpus", "16")
-    yield serving
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "any")
+        yield serving
     serving.close()
 
 
