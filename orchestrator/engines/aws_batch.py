@@ -21,7 +21,7 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
 
-from orchestrator.engines.aws_config import load_config, on_network
+from orchestrator.engines.aws_config import is_mounted_from, load_config
 from orchestrator.engines.aws_logs import GangLogs, NodeLog
 from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
@@ -301,8 +301,9 @@ class AwsBatchEngine:
         return logs
 
     def _is_shared(self, store: str) -> bool:
-        told = self.config.store_is_shared
-        return on_network(Path(store)) if told is None else told
+        if self.config.store_is_shared is not None:
+            return self.config.store_is_shared
+        return is_mounted_from(Path(store).resolve(), self.config.file_system, Path("/proc/self/mountinfo").read_text())
 
     # -- capacity -----------------------------------------------------------------------------------------------------
 
