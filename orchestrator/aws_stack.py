@@ -248,6 +248,8 @@ def template_text(path: Path | None = None) -> str:
 def write_config(home: Path, stack: Stack, endpoint_url: str | None) -> Path:
     """``aws.json`` of the stack's outputs; what a person has added to it stays."""
     outputs = stack.outputs()
+    if "JobQueue" not in outputs:
+        raise ServerError(f"stack {stack.name} is not whole: it has no outputs; see `muster aws status`")
     kept: dict[str, Any] = {}
     try:
         before = json.loads(config_path(home).read_text())

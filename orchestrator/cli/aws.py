@@ -116,10 +116,17 @@ def status(
     stack_name: NameOption = "muster",
     region: RegionOption = None,
     profile: ProfileOption = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Write $MUSTER_HOME/aws.json, on a machine that did not create the stack.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the stack: whether it is whole, what its queue and compute environment say, its jobs, its image."""
-    told = _stack(stack_name, region, profile).status()
+    stack = _stack(stack_name, region, profile)
+    told = stack.status()
+    if write:
+        path = _stack_module().write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
+        typer.echo(f"wrote {path}", err=as_json)
     if as_json:
         typer.echo(json.dumps(told, indent=1))
         return

@@ -9,6 +9,7 @@ checkpoints stay on the volume.
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
 
-from orchestrator.engines.aws_config import load_config, on_network
+from orchestrator.engines.aws_config import is_mounted_from, load_config
 from orchestrator.engines.aws_logs import GangLogs, NodeLog
 from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
@@ -41,18 +42,31 @@ _REMEMBERED = 256
 """Gangs whose end is kept: the controller asks once more after it, and after a restart it asks anew."""
 _MEMORY = 32 * 1024
 """MiB a vCPU at most, of all of EC2's instance types."""
-_TRANSIENT = ("TooManyRequestsException", "ThrottlingException", "RequestLimitExceeded", "ServerException")
+_TRANSIENT = (
+    *("TooManyRequestsException", "ThrottlingException", "RequestLimitExceeded", "ServerException"),
+    *("ExpiredToken", "ExpiredTokenException"),  # a person logs in again
+)
+_AWAY = 15.0
+"""Seconds for which an AWS that did not answer is left alone."""
 
 
 @dataclass
 class _Watched:
     """What is known of a gang between two looks."""
 
-    at: float = 0.0
+    next: float = 0.0
+    """When AWS is asked again (monotonic [s])."""
     status: GangStatus | None = None
     over_since: float | None = None
+    """When AWS first said that the job is over (monotonic [s])."""
     ended: dict[int, float] = field(default_factory=dict)
+    """By node: when it was first seen to have ended (monotonic [s])."""
     logs: GangLogs | None = None
+
+    @property
+    def straggled(self) -> bool:
+        """Whether the job is over for so long that none of its nodes can run."""
+        return self.over_since is not None and time.monotonic() - self.over_since > _STRAGGLE
 
 
 class AwsBatchEngine:
@@ -71,14 +85,17 @@ class AwsBatchEngine:
                 raise NoCredentialsError
             url = self.config.endpoint_url
             # a SubmitJob whose answer was lost must not be sent again unseen: AWS has no key to make it harmless
-            once = Config(retries={"total_max_attempts": 1})
-            self._batch = session.client("batch", endpoint_url=url)
+            once = Config(connect_timeout=5, read_timeout=30, retries={"total_max_attempts": 1})
+            # the controller's own loop asks: an AWS that is away must not hold up everything else for long
+            twice = Config(connect_timeout=5, read_timeout=30, retries={"mode": "standard", "total_max_attempts": 2})
+            self._batch = session.client("batch", endpoint_url=url, config=twice)
             self._submitting = session.client("batch", endpoint_url=url, config=once)
-            self._logs = session.client("logs", endpoint_url=url)
+            self._logs = session.client("logs", endpoint_url=url, config=twice)
         except (BotoCoreError, NoRegionError) as error:
             raise EngineError(f"AWS: {error}; see `aws configure`") from None
         self._hosts: dict[str, tuple[float, Host]] = {}
         self._gangs: dict[str, _Watched] = {}
+        self._lock = threading.Lock()
 
     def capacity(self) -> Sequence[Host]:
         """One host: what the queue's compute environments may grow to.
@@ -111,8 +128,6 @@ class AwsBatchEngine:
             if _is_transient(error):
                 raise NotYet(f"AWS Batch: {_words(error)}; trying again") from None
             raise EngineError(f"AWS Batch: {_words(error)}") from None
-        except NoCredentialsError as error:
-            raise EngineError(f"AWS: {error}; see `aws configure`") from None
         except (BotoCoreError, ResponseParserError) as error:
             raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
         facts = {
@@ -129,9 +144,8 @@ class AwsBatchEngine:
         facts = json.loads(handle)
         watched = self._gangs.setdefault(facts["gang"], _Watched())
         over = watched.status is not None and not any(node.running for node in watched.status)
-        if watched.status is None or (not over and time.monotonic() - watched.at >= self.config.poll):
-            watched.status = self._look(facts, watched)
-            watched.at = time.monotonic()
+        if watched.status is None or (not over and time.monotonic() >= watched.next):
+            return self._look_again(facts, watched)
         return watched.status
 
     def stop(self, handle: str, grace: float) -> None:
@@ -145,10 +159,12 @@ class AwsBatchEngine:
                     self._batch.terminate_job(jobId=facts["aws"], reason="ended by Muster")
                     asked = True
             except (ClientError, BotoCoreError, ResponseParserError) as error:
-                if isinstance(error, ClientError) and not _is_transient(error) and not self._describe(facts)[0]:
+                if isinstance(error, ClientError) and not _is_transient(error):
+                    if any(node.running for node in self._look_again(facts, watched)):
+                        time.sleep(self.config.poll)
+                        raise EngineError(f"AWS Batch does not end job {facts['aws']}: {_words(error)}") from None
                     break  # AWS has forgotten the job
-            watched.status, watched.at = self._look(facts, watched), time.monotonic()
-            if not any(node.running for node in watched.status):
+            if not any(node.running for node in self._look_again(facts, watched)):
                 break
             time.sleep(self.config.poll)
         if watched.logs is not None:
@@ -187,23 +203,26 @@ class AwsBatchEngine:
 
     # -- watching -----------------------------------------------------------------------------------------------------
 
-    def _look(self, facts: Mapping[str, Any], watched: _Watched) -> GangStatus:
+    def _look_again(self, facts: Mapping[str, Any], watched: _Watched) -> GangStatus:
         """Ask AWS; where it does not answer nothing has changed."""
-        count = len(facts["addresses"])
         try:
-            parent, nodes = self._describe(facts)
+            watched.status, pause = self._look(facts, watched), self.config.poll
         except (ClientError, BotoCoreError, ResponseParserError) as error:
             said = _words(error) if isinstance(error, ClientError) else str(error)
-            return watched.status or [NodeStatus(True, "", waiting=f"AWS Batch does not answer: {said}")] * count
+            waits = NodeStatus(True, "", waiting=f"AWS Batch does not answer: {said}")
+            watched.status, pause = watched.status or [waits] * len(facts["addresses"]), _AWAY
+        watched.next = time.monotonic() + pause
+        return watched.status
+
+    def _look(self, facts: Mapping[str, Any], watched: _Watched) -> GangStatus:
+        """What AWS says of every node."""
+        count, main = len(facts["addresses"]), facts["main"]
+        parent, nodes = self._describe(facts)
         if parent is None:
             return [NodeStatus(False, "", None, f"AWS Batch has no job {facts['aws']} any more")] * count
         if parent["status"] in _OVER and watched.over_since is None:
             watched.over_since = time.monotonic()
-        straggled = watched.over_since is not None and time.monotonic() - watched.over_since > _STRAGGLE
-        status = [
-            self._node(facts, watched, index, nodes.get(index) or parent, parent, straggled) for index in range(count)
-        ]
-        main = facts["main"]
+        status = [self._node(facts, watched, index, nodes.get(index) or parent, parent) for index in range(count)]
         failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
         if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
             status[main] = NodeStatus(True, status[main].address)
@@ -226,11 +245,10 @@ class AwsBatchEngine:
         index: int,
         detail: Mapping[str, Any],
         parent: Mapping[str, Any],
-        straggled: bool,
     ) -> NodeStatus:
         status, container = detail["status"], detail.get("container") or {}
         address = next((each.get("privateIpv4Address", "") for each in container.get("networkInterfaces") or []), "")
-        over = status in _OVER or straggled
+        over = status in _OVER or watched.straggled
         log = self._follow(facts, watched, index, container.get("logStreamName"), over)
         if not over:
             waiting = "" if status == "RUNNING" else _waiting(facts, index, status, detail, parent)
@@ -261,22 +279,26 @@ class AwsBatchEngine:
         self, facts: Mapping[str, Any], watched: _Watched, index: int, stream: str | None, over: bool
     ) -> NodeLog | None:
         """The copy of a node's log; None where the supervisor writes it to the store that is here, too."""
-        if watched.logs is None:
-            run = Store(facts["store"]).run(facts["run"])
-            paths = [run.log(facts["job"], facts["attempt"], each) for each in range(len(facts["addresses"]))]
-            shared = self._is_shared(facts["store"])
-            nodes = [
-                NodeLog(path, told, copied=not (told and shared))
-                for path, told in zip(paths, facts["supervised"], strict=True)
-            ]
-            watched.logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
-            watched.logs.start(facts["gang"])
-        node = watched.logs.saw(index, stream, over)
+        with self._lock:  # a gang that is being stopped is looked at by two threads
+            logs = watched.logs = watched.logs or self._copies(facts)
+        node = logs.saw(index, stream, over)
         return node if node.copied else None
 
+    def _copies(self, facts: Mapping[str, Any]) -> GangLogs:
+        """The copies of a gang's logs, begun."""
+        run, shared = Store(facts["store"]).run(facts["run"]), self._is_shared(facts["store"])
+        nodes = [
+            NodeLog(run.log(facts["job"], facts["attempt"], index), supervised, copied=not (supervised and shared))
+            for index, supervised in enumerate(facts["supervised"])
+        ]
+        logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
+        logs.start(facts["gang"])
+        return logs
+
     def _is_shared(self, store: str) -> bool:
-        told = self.config.store_is_shared
-        return on_network(Path(store)) if told is None else told
+        if self.config.store_is_shared is not None:
+            return self.config.store_is_shared
+        return is_mounted_from(Path(store).resolve(), self.config.file_system, Path("/proc/self/mountinfo").read_text())
 
     # -- capacity -----------------------------------------------------------------------------------------------------
 

@@ -36,7 +36,7 @@ class AwsConfig:
     store: str = "/muster/store"
     """Where a node sees the shared volume."""
     store_is_shared: bool | None = None
-    """Whether the controller's own store is that volume; None: where it is on NFS."""
+    """Whether the controller's own store is that volume; None: where it is mounted from it."""
     job_role: str | None = None
     instance_type: str | None = None
     share: str | None = None
@@ -88,13 +88,18 @@ def save_config(home: Path, config: AwsConfig) -> Path:
     return path
 
 
-def on_network(path: Path) -> bool:
-    """Whether ``path`` lies on an NFS mount, as EFS is."""
-    path = path.resolve()
-    best, kind = "", ""
-    for line in Path("/proc/self/mountinfo").read_text().splitlines():
+def is_mounted_from(path: Path, file_system: str | None, mounts: str) -> bool:
+    """Whether ``path`` lies on a mount of the EFS file system; without one, on any NFS.
+
+    Args:
+        path: A directory, with its links followed.
+        file_system: Id, ``fs-…``. Amazon's own mount helper hides it behind a tunnel on 127.0.0.1.
+        mounts: What ``/proc/self/mountinfo`` says.
+    """
+    best, kind, source = "", "", ""
+    for line in mounts.splitlines():
         left, _, right = line.partition(" - ")
         point = left.split()[4]
-        if (f"{path}/".startswith(point.rstrip("/") + "/")) and len(point) >= len(best):
-            best, kind = point, right.split()[0]
-    return kind.startswith("nfs")
+        if f"{path}/".startswith(point.rstrip("/") + "/") and len(point) >= len(best):
+            best, (kind, source) = point, right.split()[:2]
+    return kind.startswith("nfs") and (file_system is None or source.startswith((file_system, "127.0.0.1:")))

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from orchestrator.engines.aws_batch import AwsBatchEngine
-from orchestrator.engines.aws_config import AwsConfig, save_config
+from orchestrator.engines.aws_config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
@@ -36,9 +36,11 @@ TRAP = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; don
 @pytest.fixture(scope="module")
 def aws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     """The second Muster."""
-    os.environ.update(AWS_ACCESS_KEY_ID="any", AWS_SECRET_ACCESS_KEY="any")
     serving = Serving(tmp_path_factory.mktemp("aws"), "--cpus", "16")
-    yield serving
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "any")
+        yield serving
     serving.close()
 
 
@@ -49,7 +51,7 @@ class Bench:
         self.aws, self.home = aws, home
         self.volume = Store(home / "efs").open()
         self.store = self.volume if config.get("store_is_shared") else Store(home / "store").open()
-        settings = {"store": str(self.volume.path), "poll": 0.1, "quiet": 1.0, "store_is_shared": False, **config}
+        settings = {"store": str(self.volume.path), "poll": 0.1, "quiet": 1.0, **config}
         told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
         save_config(home, AwsConfig(**told))
         self.engine = AwsBatchEngine(home)
@@ -335,6 +337,29 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -
     assert node.running and "does not answer" in node.waiting
     with pytest.raises(NotYet, match="does not answer"):
         away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
+
+
+MOUNTS = """\
+22 1 259:1 / / rw - ext4 /dev/root rw
+40 22 0:50 / /muster/volume rw - nfs4 fs-1.efs.us-east-1.amazonaws.com:/ rw
+41 22 0:51 / /home rw - nfs4 server:/home rw
+42 22 0:52 / /tunnel rw - nfs4 127.0.0.1:/ rw
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "volume", "found"),
+    [
+        ("/muster/volume/muster", "fs-1", True),
+        ("/muster/volume/muster", "fs-2", False),
+        ("/tunnel/store", "fs-1", True),
+        ("/home/me/.muster/store", "fs-1", False),
+        ("/home/me/.muster/store", None, True),
+        ("/var/store", None, False),
+    ],
+)
+def test_a_store_that_is_mounted_from_the_volume_is_the_volume(path: str, volume: str | None, found: bool) -> None:
+    assert is_mounted_from(Path(path), volume, MOUNTS) is found
 
 
 def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:

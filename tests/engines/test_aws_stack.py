@@ -15,6 +15,7 @@ from typing import Any
 import boto3
 import pytest
 import yaml
+from moto.cloudformation.models import cloudformation_backends
 from moto.ec2.models import ec2_backends
 
 from orchestrator.aws_stack import Event, first_failure
@@ -232,11 +233,20 @@ def test_the_engine_works_on_what_up_has_written(
     assert definition["type"] == "multinode" and definition["tags"]["muster:digest"]
 
 
-def test_status_says_what_is_there_and_up_again_changes_nothing(account: Account) -> None:
+def test_status_says_what_is_there_and_writes_what_the_engine_needs(account: Account) -> None:
     shown = account.muster("status")
     assert shown.returncode == 0, shown.stderr
     assert "muster in us-east-1: CREATE_COMPLETE" in shown.stdout and "not pushed yet" in shown.stdout
-    told = json.loads(account.muster("status", "--json").stdout)
+    manifest = json.dumps({"schemaVersion": 2, "config": {"digest": "sha256:0"}, "layers": []})
+    kind = "application/vnd.docker.distribution.manifest.v2+json"
+    account.client("ecr").put_image(
+        repositoryName="muster", imageManifest=manifest, imageTag="latest", imageManifestMediaType=kind
+    )
+    assert "image " in account.muster("status").stdout and "not pushed" not in account.muster("status").stdout
+    before = (account.home / "aws.json").read_text()
+    (account.home / "aws.json").unlink()
+    told = json.loads(account.muster("status", "--json", "--write").stdout)
+    assert (account.home / "aws.json").read_text() == before
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == (
         "muster: there is no stack other in us-east-1; create it with `muster aws up`\n"
@@ -278,6 +288,12 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         asked = account.muster("down")  # nobody answers
         assert asked.returncode == 1 and f"file system {volume}" in asked.stdout
         assert account.client("cloudformation").describe_stacks(StackName="muster")["Stacks"]
+        [stack] = cloudformation_backends["123456789012"][REGION].stacks.values()
+        stack.status = "ROLLBACK_COMPLETE"
+        again = account.muster("up", "--yes", *PARAMETERS)
+        assert again.returncode == 1 and again.stderr == (
+            "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; remove it with `muster aws down`, then try again\n"
+        )
         gone = account.muster("down", "--yes")
         assert gone.returncode == 0, gone.stderr
         assert f"file system {volume}, with all runs and checkpoints, stays" in gone.stdout
