@@ -73,6 +73,8 @@ class Watch:
             reader = threading.Thread(target=errors.extend, args=(stderr,), daemon=True)
             reader.start()
             for line in self._process.stdout:
+                if not line.startswith("{"):
+                    continue  # a word of Ray's own
                 said = json.loads(line)
                 if "error" in said:
                     self._error = said

@@ -20,6 +20,8 @@ from shared_store.files import write_json
 
 _BEAT = 2.0
 """Seconds between two signs of life to an actor."""
+_BROKEN = 3.0
+"""Seconds after which an actor whose connection broke, and that does not answer on another, is given up."""
 _STARTING = 60.0
 """Seconds that an actor may take to start: a machine that Ray believes alive may be frozen."""
 
@@ -46,6 +48,8 @@ class Gang:
         self.asked: dict[Any, tuple[str, int]] = {}
         """What was asked of actors and is not answered: a kind and a node's index."""
         self.heard = [time.monotonic()] * len(self.nodes)
+        self.broken: dict[int, float] = {}
+        """Since when the connection to an actor is broken."""
         self.next_beat = 0.0
         self.deadline = 0.0
         """When a stop has to be done with [monotonic s]."""
@@ -130,8 +134,11 @@ class Gang:
     def stop(self, grace: float) -> None:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
         self.phase, self.deadline = "stopping", time.monotonic() + grace + 10.0
+        lost = {index for index, node in enumerate(self.nodes) if not node["running"] and node["code"] is None}
+        self.asked = {ref: told for ref, told in self.asked.items() if told[1] not in lost}
         for index, actor in enumerate(self.actors):
-            self.asked[actor.stop.remote(grace)] = ("stop", index)
+            if index not in lost:  # nobody is there to answer
+                self.asked[actor.stop.remote(grace)] = ("stop", index)
 
     def leave(self) -> None:
         """SIGTERM to all: one of the machines will go away."""
@@ -148,7 +155,10 @@ class Gang:
                 try:
                     self._take(kind, index, ray.get(ref))
                     self.heard[index] = time.monotonic()
-                except ray.exceptions.ActorUnavailableError:  # a connection broke, no more is known
+                    self.broken.pop(index, None)
+                except ray.exceptions.ActorUnavailableError:  # a connection broke: the machine's end, or the network's
+                    self.broken.setdefault(index, time.monotonic())
+                    self.asked[self.actors[index].beat.remote()] = ("beat", index)
                     if kind == "wait":
                         self.asked[self.actors[index].wait.remote()] = ("wait", index)
                 except ray.exceptions.RayActorError:
@@ -182,6 +192,9 @@ class Gang:
     def _beat(self) -> None:
         """Show actors that the driver is there, and see that they are: sooner than Ray, which needs 13 to 64 s."""
         now = time.monotonic()
+        for index, since in self.broken.items():
+            if now - since > _BROKEN:
+                self.end(index, None, "")
         if now < self.next_beat or not self.actors:
             return
         self.next_beat = now + _BEAT

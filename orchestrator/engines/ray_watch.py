@@ -60,6 +60,7 @@ def look(state: GlobalState) -> dict[str, Any]:
             "id": node["NodeID"],
             "name": node["NodeName"] or node["NodeManagerAddress"],
             "address": node["NodeManagerAddress"],
+            "port": node["NodeManagerPort"],
             "cpus": node["Resources"].get("CPU", 0.0),
             "gpus": int(node["Resources"].get("GPU", 0.0)),
             "memory": int(node["Resources"].get("memory", 0.0) / 2**20),
@@ -69,7 +70,7 @@ def look(state: GlobalState) -> dict[str, Any]:
         for node in state.node_table()
         if node["Alive"] and node["NodeID"] not in draining
     ]
-    here = [node for node in nodes if _is_here(node["address"])]
+    here = [node for node in nodes if _is_here(node["address"], node["port"])]
     # best a node that was made for it (`--num-cpus 0`), and not the head, whose end would be that of the drivers
     here.sort(key=lambda node: (node["cpus"] > 0, node["head"], node["address"]))
     config = state.get_cluster_config()
@@ -85,11 +86,13 @@ def look(state: GlobalState) -> dict[str, Any]:
     return {"nodes": nodes, "grows": grows, "join": here[0]["address"] if here else None}
 
 
-def _is_here(address: str) -> bool:
-    """Whether the address is one of this machine's."""
+def _is_here(address: str, port: int) -> bool:
+    """Whether the address is one of this machine's, and a raylet listens there: the head believes in a dead one for a while."""
     with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
         try:
             probe.bind((address, 0))
+            probe.settimeout(1.0)
+            probe.connect((address, port))
             return True
         except OSError:
             return False

@@ -18,10 +18,11 @@ _SMALL = ["--object-store-memory=80000000", "--min-worker-port=0", "--max-worker
 class RayCluster:
     """Processes are ended by their session, never with ``ray stop``, which ends everybody's."""
 
-    def __init__(self, home: Path, head_options: tuple[str, ...] = (), **env: str) -> None:
+    def __init__(self, home: Path, head_options: tuple[str, ...] = (), port: int = 0, **env: str) -> None:
         """``head_options``, ``env``: more of them for the head."""
         self.home, self.head_options, self.head_env = home, head_options, env
-        self.address, self.modules = f"{self.network()}.1:6379", home / "modules"
+        # the head listens at all of the machine's addresses: two of them need two ports
+        self.address, self.modules = f"{self.network()}.1:{port or free_port()}", home / "modules"
         token = home / "token"
         token.write_text("a-token-that-is-long-enough-for-a-test")
         token.chmod(0o600)
@@ -32,6 +33,7 @@ class RayCluster:
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_enable_worker_prestart": "0",  # two cores have other things to do
             "RAY_prestart_worker_first_driver": "0",
+            "RAY_raylet_start_wait_time_s": "120",
         }
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         self._number = 1
@@ -50,8 +52,14 @@ class RayCluster:
         self._start(
             "head",
             [
-                *("--head", "--port=6379", "--num-cpus=0", "--include-dashboard=false", *self.head_options),
-                *(f"--ray-client-server-port={_free_port()}", f"--node-ip-address={self.network()}.1"),
+                *(
+                    "--head",
+                    f"--port={self.address.rpartition(':')[2]}",
+                    "--num-cpus=0",
+                    "--include-dashboard=false",
+                    *self.head_options,
+                ),
+                *(f"--ray-client-server-port={free_port()}", f"--node-ip-address={self.network()}.1"),
             ],
             {"RAY_gcs_storage": "rocksdb", "RAY_gcs_storage_path": str(self.home / "gcs"), **self.head_env},
         )
@@ -69,7 +77,7 @@ class RayCluster:
             assert self.nodes[name].poll() is None, self._log(name).read_text()[-3000:]
             return "block forever" in self._log(name).read_text()
 
-        wait_for(up, 40, f"Ray node {name}")
+        wait_for(up, 60, f"Ray node {name}")
 
     def kill(self, name: str) -> None:
         """SIGKILL to all that the node is, at once, as when its machine loses its power."""
@@ -121,7 +129,7 @@ def _command(pid: int) -> bytes:
         return b""
 
 
-def _free_port() -> int:
+def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("", 0))
         return int(probe.getsockname()[1])

@@ -201,6 +201,7 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ben
     assert node.detail == (
         "node 0 on ray/n1: working directory /nowhere/at/all is not there: it has to be on a volume that all nodes share"
     )
+    bench.engine.stop(handle, 1.0)
     fake = bench.cluster.modules / "shared_store"
     fake.mkdir(parents=True)
     (fake / "__init__.py").write_text('__version__ = "0.0.1"\n')

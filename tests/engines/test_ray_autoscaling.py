@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import wait_for
-from tests.engines.ray_cluster import RayCluster
+from tests.conftest import REPOSITORY, wait_for
+from tests.engines.ray_cluster import RayCluster, free_port
 from tests.engines.test_ray import Bench, long
 
 pytest.importorskip("ray", reason="NO RAY: the ray engine is not tested (pip install 'muster[ray]')")
@@ -23,15 +23,20 @@ _HEAD = "f" * 51 + "00000"
 @pytest.fixture
 def growing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RayCluster]:
     """A head that may add two machines with one CPU and 1 GiB each, and takes them away after six idle seconds."""
+    port = free_port()
     config = {
         "cluster_name": "growing",
         "max_workers": 2,
         "idle_timeout_minutes": 0.1,
         "upscaling_speed": 1.0,
         "provider": {
-            "type": "fake_multinode",
+            "type": "external",
+            "module": "tests.engines.ray_provider.Provider",
+            "use_node_id_as_ip": True,
+            "disable_launch_config_check": True,
+            "disable_node_updaters": True,
             "head_node_id": _HEAD,
-            "gcs_address": f"{RayCluster.network()}.1:6379",
+            "gcs_address": f"{RayCluster.network()}.1:{port}",
         },
         "auth": {},
         "head_node_type": "ray.head.default",
@@ -61,7 +66,9 @@ def growing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RayClus
     cluster = RayCluster(
         tmp_path,
         (f"--autoscaling-config={tmp_path / 'autoscaling.json'}",),
+        port,
         RAY_FAKE_CLUSTER="1",
+        PYTHONPATH=str(REPOSITORY),
         AUTOSCALER_UPDATE_INTERVAL_S="1",
         RAY_OVERRIDE_NODE_ID_FOR_TESTING=_HEAD,
     )
