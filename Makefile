@@ -1,5 +1,6 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the whole test suite
+# make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments; every run must end with the same bits
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
@@ -9,14 +10,19 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test engines lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
 
 test: lint
 	$(BIN)/python -m tests.kernels
-	$(BIN)/pytest -q -n 2 --dist loadfile --durations=10
+	$(BIN)/pytest -q -n 2 --dist loadfile --durations=10 -m "not cluster"
+
+# one after the other: a cluster has this machine for itself
+engines: $(READY)
+	$(BIN)/python -m tests.kernels
+	$(BIN)/pytest -q --durations=10 -m cluster
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -58,7 +64,7 @@ torture: $(READY)
 	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300)
 
 bits: $(READY)
-	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/engines
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/e2e tests/engines
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py

@@ -23,6 +23,9 @@ def changes(*assignments: str) -> list[str]:
     return [part for assignment in (*SMALL, *assignments) for part in ("--set", assignment)]
 
 
+long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="a minute: MUSTER_LONG=1, in make bits")
+
+
 def submit(server: Serving, *assignments: str) -> dict[str, Any]:
     done = server.muster("submit", "job_specs/cartpole.yaml", "--json", *changes(*assignments))
     assert done.returncode == 0, done.stderr
@@ -112,6 +115,7 @@ def _check_damage(server: Serving, run: str, target: int) -> None:
     assert Path(f"{newest['path']}.damaged").is_dir()
 
 
+@long
 def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Serving) -> None:
     job = submit(server, "train.iterations=4000", "retry.attempts=2")
     wait_for_iteration(server, job["run"], 6)
@@ -135,6 +139,7 @@ def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Servin
     assert not processes_of(server.home)
 
 
+@long
 def test_ant_trains_on_two_nodes(server: Serving) -> None:
     done = server.muster(
         "submit", "job_specs/ant.yaml", "-f", "--set", "train.iterations=2", "--set", "train.worlds=8", timeout=500

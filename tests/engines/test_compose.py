@@ -21,6 +21,7 @@ from tests.conftest import MUSTER, REPOSITORY, wait_for
 from tests.engines.conftest import PATH, SUPERVISED, host_files
 from tests.worker.ranks import free_port
 
+pytestmark = pytest.mark.cluster
 NODES = 3
 
 

@@ -27,7 +27,14 @@ POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; d
 THIRD_TIME = "echo ready; [ $AWS_BATCH_JOB_ATTEMPT = 3 ] || exec sleep 600; while [ ! -e $MUSTER_STORE/go-$MUSTER_JOB_ID ]; do sleep 0.05; done; echo done"
 
 
-@pytest.fixture(scope="module", params=ENGINES)
+CLUSTER = {"ray"}
+"""Those that take a minute to start."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.cluster] if name in CLUSTER else []) for name in ENGINES],
+)
 def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     with SITES[request.param](tmp_path_factory.mktemp(request.param), request) as found:
         yield found

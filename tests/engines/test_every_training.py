@@ -17,7 +17,8 @@ from tests.conftest import REPOSITORY, Serving, wait_for
 from tests.engines.conftest import PATH, SUPERVISED, host_files
 from tests.engines.sites import kill_supervisor, processes
 
-SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5", "resources.memory=512MiB")
+pytestmark = pytest.mark.cluster
+SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 STAGE = 16
 """Iterations on each engine."""
 

@@ -106,9 +106,7 @@ class Bench:
         return pid
 
 
-long = pytest.mark.skipif(
-    not os.environ.get("MUSTER_LONG"), reason="half a minute and more: MUSTER_LONG=1, in make bits"
-)
+pytestmark = pytest.mark.cluster
 
 
 @pytest.fixture
@@ -246,7 +244,6 @@ def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
     assert bench.stopped(handle) == [143, 143, 143]
 
 
-@long
 def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:
     handle = bench.ready(bench.gang())
     os.kill(bench.driver(), signal.SIGKILL)
@@ -257,7 +254,6 @@ def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:
     assert bench.stopped(again) == [143, 143, 143]
 
 
-@long
 def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: Bench) -> None:
     handle = bench.ready(bench.gang())
     bench.cluster.kill("n3")
@@ -283,7 +279,6 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: Bench) 
     wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "its successor is one")
 
 
-@long
 def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: Bench) -> None:
     bench.cluster.add("controller", cpus=0, gpus=0)  # a driver on the head's own node would go with it
     wait_for(lambda: bench.engine._watch.seen["join"] == addresses(bench).get("controller"), 20, "it is seen")
@@ -353,7 +348,6 @@ def test_other_versions_and_no_ray_at_all_are_one_line_each(
         RayEngine(tmp_path)
 
 
-@long
 def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: Bench) -> None:
     handle = bench.ready(bench.gang())
     raylet = bench.cluster.raylet("n3")

@@ -14,9 +14,12 @@ import pytest
 
 from tests.conftest import REPOSITORY, wait_for
 from tests.engines.ray_cluster import RayCluster, free_port
-from tests.engines.test_ray import Bench, long
+from tests.engines.test_ray import Bench
 
 pytest.importorskip("ray", reason="NO RAY: the ray engine is not tested (pip install 'muster[ray]')")
+pytestmark = pytest.mark.cluster
+
+
 _HEAD = "f" * 51 + "00000"
 
 
@@ -79,7 +82,6 @@ def growing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RayClus
     cluster.close()
 
 
-@long
 def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path) -> None:
     bench = Bench(growing, tmp_path)
 

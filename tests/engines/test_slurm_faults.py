@@ -19,6 +19,8 @@ from tests.conftest import wait_for
 from tests.engines.slurm_bench import POLITE, Bench
 from tests.engines.slurm_cluster import SlurmCluster, need_slurm
 
+pytestmark = pytest.mark.cluster
+
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:

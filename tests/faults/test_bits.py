@@ -20,6 +20,9 @@ CARTPOLE = ("job_specs/cartpole.yaml", "train.worlds=8", "checkpoint.every=4", "
 ANT = ("job_specs/ant.yaml", "train.worlds=4", "checkpoint.every=2", "nodes=1", "train.ppo.steps=8")
 
 
+long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
+
+
 def options(spec: str, *changes: str) -> list[str]:
     return [spec, *(part for change in changes for part in ("--set", change))]
 
@@ -56,11 +59,10 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def verifying(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """Two verifications of one rank at the same time, since the machine has two cores."""
-    started = {
-        "Cartpole": verify(home, 9, 191, *CARTPOLE),
-        "Ant": verify(tmp_path_factory.mktemp("ant"), 3, 2, *ANT),
-    }
+    """Verifications of one rank, at the same time, since the machine has two cores."""
+    started = {"Cartpole": verify(home, 9, 191, *CARTPOLE)}
+    if os.environ.get("MUSTER_LONG"):
+        started["Ant"] = verify(tmp_path_factory.mktemp("ant"), 3, 2, *ANT)
     yield started
     for process in started.values():
         process.kill()
@@ -82,12 +84,14 @@ def test_one_rank_killed_ends_with_the_same_bits(straight: str) -> None:
     assert straight.startswith("cartpole-straight-")
 
 
+@long
 def test_ants_killed_end_with_the_same_bits(verifying: dict[str, subprocess.Popen[str]]) -> None:
     proven(verifying["Ant"], 5)
 
 
-# gangs of cart-poles are killed in test_torture.py too
-@pytest.mark.parametrize("spec", [ANT, *([CARTPOLE] if "MUSTER_LONG" in os.environ else [])])
+# gangs of cart-poles are killed in test_torture.py and on every engine, too
+@long
+@pytest.mark.parametrize("spec", [ANT, CARTPOLE])
 def test_a_gang_of_three_killed_ends_with_the_same_bits(tmp_path: Path, spec: tuple[str, ...]) -> None:
     _, killed, _ = proven(verify(tmp_path, 5, 2, *spec, "nodes=3", "train.worlds=5"), 7)
     (newest,) = (Store(tmp_path / "store").run(killed).checkpoints).glob("00000007-e2")

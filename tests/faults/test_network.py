@@ -21,6 +21,7 @@ from shared_store.outcomes import read_outcome
 from tests.conftest import REPOSITORY, processes_of, wait_for
 from tests.faults.link import ADDRESSES, Link
 
+pytestmark = pytest.mark.cluster
 SMALL = (
     *("nodes=2", "train.worlds=16", "train.iterations=100000", "checkpoint.every=100000", "stall_timeout=8s"),
     *("train.ppo.epochs=1", "train.ppo.minibatches=1"),
