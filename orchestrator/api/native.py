@@ -121,7 +121,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             run=needs.setting("MUSTER_RUN") or "run",
             store=str(controller.store.path),
             queue=body.queue,
-            pool="default",
+            pool=pool.name if pool else "local",
             main=needs.main,
             commands=[node.command for node in needs.nodes],
             environments=[node.environment for node in needs.nodes],
@@ -146,7 +146,9 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         }
         for node in planned.nodes
     ]
-    return {"engine": engine_of(placements[0].host), "nodes": nodes, "document": planned.document}
+    name = engine_of(placements[0].host)
+    images = controller.engine.engines[name].images
+    return {"engine": name, "images": images, "nodes": nodes, "document": planned.document}
 
 
 def _planned(controller: Controller, gang: Gang) -> Plan:

@@ -132,7 +132,7 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
         table.add_column(column, no_wrap=True)
     table.add_column("COMMAND", overflow="fold")
     for node in plan["nodes"]:
-        image = node["image"] if plan["engine"] != "local" else "-"
+        image = node["image"] if plan["images"] else "-"
         table.add_row(
             *(str(node["index"]), str(node["rank"]), node["host"], f"{node['cpus']:g}", ",".join(node["gpus"]) or "-"),
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),

@@ -74,6 +74,7 @@ class AwsBatchEngine:
 
     name = "aws-batch"
     queues = True
+    images = True
     address: str | None = None  # nodes on AWS do not reach this machine
 
     def __init__(self, home: Path) -> None:

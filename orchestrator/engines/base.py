@@ -179,6 +179,8 @@ class Engine(Protocol):
     name: str
     queues: bool
     """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
+    images: bool
+    """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
     address: str | None
     """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
 

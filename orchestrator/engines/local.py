@@ -33,6 +33,7 @@ class LocalEngine:
 
     name = "local"
     queues = False
+    images = False
     address: str | None = None
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:

@@ -48,7 +48,14 @@ class Several:
         return hosts
 
     def plan(self, gang: Gang) -> Plan:
+        """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
         engine = self._engine(engine_of(gang.placements[0].host))
+        named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
+        if named and not engine.images and gang.options.get("images") == "refuse":
+            raise EngineError(
+                f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
+                f"{gang.pool} refuses other images (tag muster:images)"
+            )
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return engine.plan(gang)

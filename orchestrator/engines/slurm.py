@@ -51,6 +51,7 @@ class SlurmEngine:
 
     name = "slurm"
     queues = True
+    images = False
 
     def __init__(self) -> None:
         """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""

@@ -43,3 +43,25 @@ def test_what_is_no_gang_is_refused(server: Serving, definition: dict) -> None:
     with pytest.raises(ApiError) as refusal:
         server.client.post("/api/plan", {"definition": definition})
     assert refusal.value.status == 400 and "\n" not in str(refusal.value)
+
+
+def test_an_image_that_would_not_be_run_is_passed_over_or_refused_as_the_compute_environment_says(
+    server: Serving,
+) -> None:
+    batch = server.client.batch
+    tags = {"muster:images": "refuse"}
+    batch("CreateComputeEnvironment", computeEnvironmentName="strict", type="UNMANAGED", tags=tags)
+    order = [{"order": 1, "computeEnvironment": "strict"}]
+    batch("CreateJobQueue", jobQueueName="strict", priority=1, computeEnvironmentOrder=order)
+    container = {"image": "busybox", "command": ["true"]}
+    container["resourceRequirements"] = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
+    definition = {"jobDefinitionName": "foreign", "type": "multinode", "nodeProperties": properties}
+    assert not server.client.post("/api/plan", {"definition": definition})["images"]
+    with pytest.raises(ApiError, match="image busybox: the local engine runs commands in its nodes' own environment"):
+        server.client.post("/api/plan", {"definition": definition, "queue": "strict"})
+    batch("RegisterJobDefinition", **definition)
+    passed = batch("SubmitJob", jobName="a", jobQueue="default", jobDefinition="foreign")["jobId"]
+    refused = batch("SubmitJob", jobName="b", jobQueue="strict", jobDefinition="foreign")["jobId"]
+    assert server.wait(passed)["status"] == "SUCCEEDED"
+    assert "image busybox: the local engine" in server.wait(refused)["statusReason"]
