@@ -15,6 +15,7 @@ import select
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -95,8 +96,10 @@ class Driver:
             self.group = None
         if self.group is None:
             selectors = [{"ray.io/node-id": pin} if pin else {} for pin in pins]
+            # names have to be unique, and a dead driver's group stays until Ray has noticed its death
+            name = f"muster {gang.name} {uuid.uuid4().hex[:8]}"
             self.group = ray.util.placement_group(
-                bundles, strategy="STRICT_SPREAD", name=f"muster {gang.name}", bundle_label_selector=selectors
+                bundles, strategy="STRICT_SPREAD", name=name, bundle_label_selector=selectors
             )
             self.key = key
         gang.phase, gang.why, self._told_to_leave = "placing", "waits for its placement group", False

@@ -82,17 +82,15 @@ def ray_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def slurm_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """slurmctld and three slurmd; ``SLURM_CONF`` leads to them."""
+    """slurmctld and three slurmd. ``SLURM_CONF`` is for the test to set: what inherits it counts as the cluster's."""
     from tests.engines.slurm_cluster import SlurmCluster, need_slurm
 
     need_slurm()
     cluster = SlurmCluster(tmp_path_factory.mktemp("slurm"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SLURM_CONF", str(cluster.conf))
-        try:
-            cluster.start()
-            cluster.ready()
-            yield cluster
-        finally:
-            cluster.close()
+    try:
+        cluster.start()
+        cluster.ready()
+        yield cluster
+    finally:
+        cluster.close()
     assert not cluster.processes()

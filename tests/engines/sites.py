@@ -116,8 +116,10 @@ def ray(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
 
 @contextlib.contextmanager
 def slurm(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
-    request.getfixturevalue("slurm_cluster")
-    yield from _served("slurm", home)
+    cluster = request.getfixturevalue("slurm_cluster")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SLURM_CONF", str(cluster.conf))
+        yield from _served("slurm", home)
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,11 +42,10 @@ def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str)
 
 
 def test_a_run_that_goes_from_engine_to_engine_ends_with_the_bits_of_one_that_stays(
-    request: pytest.FixtureRequest, tmp_path: Path
+    docker_client: Any, ray_cluster: Any, slurm_cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engines = ("docker", "slurm", "ray", "local")
-    for fixture in ("docker_client", "slurm_cluster", "ray_cluster"):
-        request.getfixturevalue(fixture)
+    monkeypatch.setenv("SLURM_CONF", str(slurm_cluster.conf))
     serving = Serving(tmp_path, "--cpus", "4", *(part for engine in engines for part in ("--engine", engine)))
     run = Store(tmp_path / "store").run("far")
 
