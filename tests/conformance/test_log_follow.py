@@ -211,7 +211,7 @@ def test_a_burst_comes_in_updates_of_500_and_above_5000_is_sampled(
 
 def test_live_tails_end_with_the_server_and_do_not_hold_it_up(server: Serving) -> None:
     tails = [Watching(server.url) for _ in range(45)]  # more than there are threads for requests
-    assert server.client.get("/api/capacity")["engine"] == "local"
+    assert server.client.get("/api/capacity")["engines"] == {"local": "default"}
     began = time.monotonic()
     server.process.terminate()
     server.process.wait(20 * PATIENCE)

@@ -89,11 +89,13 @@ def kill_rank(job: str, rank: int) -> None:
 
 
 def kill_supervisor(job: str, node: int) -> None:
-    """SIGKILL to the supervisor of one node: its ranks have no other parent."""
-    for pid in processes(job, NODE_RANK=str(node)):
+    """SIGKILL to the supervisor of one node: what started its rank, which has what is not of the job for a parent."""
+    ranks = processes(job, RANK=str(node))
+    for pid in ranks:
         with contextlib.suppress(OSError):
-            if b"TORCHELASTIC_ERROR_FILE=" not in Path(f"/proc/{pid}/environ").read_bytes():
-                os.kill(pid, signal.SIGKILL)
+            parent = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+            if parent not in ranks:
+                os.kill(parent, signal.SIGKILL)
 
 
 @contextlib.contextmanager
