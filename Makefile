@@ -46,7 +46,7 @@ bench-logs: $(READY)
 	$(BIN)/python -m benchmarks.log_follow | tee benchmarks/log_follow.md
 
 bench-engines: $(READY)
-	$(BIN)/pytest -q -s -p tests.engines.conftest benchmarks/engines.py
+	$(BIN)/python -m pytest -q -s -p tests.engines.conftest benchmarks/engines.py
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume
