@@ -134,17 +134,18 @@ class Stack:
 
     def outputs(self) -> dict[str, str]:
         """The stack's outputs by name. Raises ServerError where it is not there or not whole."""
-        found = self.describe()
-        if found is None:
+        return _outputs(self._found())
+
+    def _found(self) -> dict[str, Any]:
+        """The stack as CloudFormation has it. Raises ServerError where there is none."""
+        if (found := self.describe()) is None:
             raise ServerError(f"there is no stack {self.name} in {self.region}; create it with `muster aws up`")
-        return {each["OutputKey"]: each["OutputValue"] for each in found.get("Outputs") or []}
+        return found
 
     def status(self) -> dict[str, Any]:
         """The stack, its queue and compute environment with their own words, its jobs by state, and its image."""
-        found = self.describe()
-        if found is None:
-            raise ServerError(f"there is no stack {self.name} in {self.region}; create it with `muster aws up`")
-        outputs = self.outputs()
+        found = self._found()
+        outputs = _outputs(found)
         told: dict[str, Any] = {"stack": self.name, "region": self.region, "status": found["StackStatus"]}
         told |= {"reason": found.get("StackStatusReason", ""), "outputs": outputs}
         if "JobQueueArn" not in outputs:
@@ -200,6 +201,10 @@ class Stack:
                 if "does not exist" in str(error):
                     return []
                 raise
+
+
+def _outputs(found: Mapping[str, Any]) -> dict[str, str]:
+    return {each["OutputKey"]: each["OutputValue"] for each in found.get("Outputs") or []}
 
 
 class _Loader(yaml.SafeLoader):

@@ -22,10 +22,10 @@ from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
 from orchestrator.engines.several import Several
 from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
-from orchestrator.pools import options_of
+from orchestrator.pools import engine_options
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
-from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
+from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
@@ -110,7 +110,7 @@ class Gangs:
 
     def _gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
         nodes = needs.nodes[: len(attempt.nodes)]
-        pool, queue = session.get(ComputeEnvironment, attempt.pool or "local"), session.get(JobQueue, job.queue)
+        pool = attempt.pool or "local"
         return Gang(
             job=job.id,
             attempt=attempt.number,
@@ -119,7 +119,7 @@ class Gangs:
             run=job.run,
             store=str(self.store.path),
             queue=job.queue,
-            pool=attempt.pool or "local",
+            pool=pool,
             main=needs.main,
             commands=[node.command for node in nodes],
             environments=[node.environment for node in nodes],
@@ -135,7 +135,7 @@ class Gangs:
             title=job.name,
             timeout=job.timeout,
             priority=job.priority,
-            options=options_of(pool.tags if pool else {}, queue.tags if queue else {}),
+            options=engine_options(session, pool, job.queue),
         )
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> None:

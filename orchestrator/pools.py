@@ -18,17 +18,22 @@ ENGINE_TAG = "muster:engine"
 
 def ensure_pools(session: Session, engines: Sequence[str]) -> None:
     """A compute environment for each of ``engines``, and a queue of its name for each but the first, which has ``default``."""
-    for name in engines:
+    for name, queue in own_queues(engines).items():
         if (environment := session.get(ComputeEnvironment, name)) is None:
             environment = ComputeEnvironment(name=name, document={"type": "UNMANAGED"}, tags={})
             session.add(environment)
         if environment.tags.get(ENGINE_TAG) != name:
             environment.tags = {**environment.tags, ENGINE_TAG: name}
-        if name != engines[0] and session.get(JobQueue, name) is None:
-            session.add(JobQueue(name=name, environments=[name]))
+        if queue != "default" and session.get(JobQueue, queue) is None:
+            session.add(JobQueue(name=queue, environments=[name]))
     default = session.get(JobQueue, "default")
     if default is not None and len(default.environments) == 1 and default.environments[0] in ENGINES:
         default.environments = [engines[0]]
+
+
+def own_queues(engines: Sequence[str]) -> dict[str, str]:
+    """The queue that is there for each engine: ``default`` for the first."""
+    return {name: name if number else "default" for number, name in enumerate(engines)}
 
 
 def queue_engines(session: Session, queue: str, first: str) -> list[str]:
@@ -43,8 +48,8 @@ def pool_engine(tags: dict[str, str], first: str) -> str:
     return tags.get(ENGINE_TAG, first)
 
 
-def options_of(*tags: dict[str, str]) -> dict[str, str]:
-    """Options for an engine: ``muster:NAME=VALUE`` tags, later ones over earlier ones."""
-    return {
-        key.removeprefix("muster:"): value for each in tags for key, value in each.items() if key.startswith("muster:")
-    }
+def engine_options(session: Session, pool: str, queue: str) -> dict[str, str]:
+    """Options for an engine: ``muster:NAME=VALUE`` tags of a compute environment, and over them those of a queue."""
+    told = (session.get(ComputeEnvironment, pool), session.get(JobQueue, queue))
+    tags = {name: value for each in told if each is not None for name, value in each.tags.items()}
+    return {name.removeprefix("muster:"): value for name, value in tags.items() if name.startswith("muster:")}

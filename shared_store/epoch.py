@@ -57,10 +57,8 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
                 f"store {run.path.parent.parent} on {socket.gethostname()} is not the controller's: run {run.name} has epoch "
                 f"{current} there, not {epoch}; mount the same volume at this path on every node"
             )
-        for directory in (
-            run.path.parent,
-            run.path,
-        ):  # to open a directory has NFS look again at what it took for absent
+        # to open a directory has NFS look again at what it took for absent
+        for directory in (run.path.parent, run.path):
             with contextlib.suppress(OSError):
                 os.listdir(directory)
         time.sleep(0.2)

@@ -51,9 +51,12 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
     """The committed outcome of a node; None while there is none, or where it is damaged. Raises OSError."""
     try:
         value: dict[str, Any] | None = read_json(run.outcome(job, attempt, node))
-        if value is None:
-            return None
-        error = FirstError(**value["error"]) if value.get("error") else None
-        return Outcome(**{**value, "error": error})
+        return None if value is None else parse_outcome(value)
     except (ValueError, TypeError):
         return None
+
+
+def parse_outcome(value: dict[str, Any]) -> Outcome:
+    """The outcome of which ``asdict`` made this. Raises TypeError where it is damaged."""
+    error = FirstError(**value["error"]) if value.get("error") else None
+    return Outcome(**{**value, "error": error})

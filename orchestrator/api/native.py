@@ -28,9 +28,9 @@ from orchestrator.definition import gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.gangs import GRACE
 from orchestrator.jobs import Status
-from orchestrator.pools import options_of, queue_engines
+from orchestrator.pools import engine_options, own_queues, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
-from orchestrator.tables import ComputeEnvironment, Job, JobQueue
+from orchestrator.tables import Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
@@ -86,7 +86,7 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
             session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
         )
     return {
-        "engines": {name: name if number else "default" for number, name in enumerate(controller.engine.names)},
+        "engines": own_queues(controller.engine.names),
         "hosts": [asdict(host) for host in controller.engine.capacity(names)],
         "store": str(controller.store.path),
         "queues": queues,
@@ -104,10 +104,10 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     with controller.database.session() as session:
         hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]))
         queue = session.get(JobQueue, body.queue)
-        pool = session.get(ComputeEnvironment, queue.environments[0]) if queue and queue.environments else None
-        options = options_of(pool.tags if pool else {}, queue.tags if queue else {})
-    if queue is None:
-        raise ClientError(f"there is no queue {body.queue!r}")
+        if queue is None:
+            raise ClientError(f"there is no queue {body.queue!r}")
+        pool = queue.environments[0]
+        options = engine_options(session, pool, queue.name)
     placements = place(needs.shape, hosts)
     if placements is None:
         raise ClientError(str(never_fits(needs.shape, hosts)))
@@ -121,7 +121,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             run=needs.setting("MUSTER_RUN") or "run",
             store=str(controller.store.path),
             queue=body.queue,
-            pool=pool.name if pool else "local",
+            pool=pool,
             main=needs.main,
             commands=[node.command for node in needs.nodes],
             environments=[node.environment for node in needs.nodes],

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.engines.aws_config import config_path
 from orchestrator.home import ServerError, muster_home
 
 if TYPE_CHECKING:
@@ -72,14 +73,15 @@ def up(
             why = from_template.first_failure(events) or (found or {}).get("StackStatusReason", "")
             raise ServerError(f"stack {stack_name} is in {state}: {why}; remove what is left with `muster aws down`")
     path = from_template.write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
-    repository = stack.outputs()["RepositoryUri"]
+    outputs = stack.outputs()
+    repository = outputs["RepositoryUri"]
     typer.echo(f"""wrote {path}
 
 push the image, then run jobs:
   aws ecr get-login-password --region {stack.region} | docker login --username AWS --password-stdin {repository.partition("/")[0]}
   docker build -f containers/Dockerfile -t {repository}:latest --build-arg EXTRAS=worker . && docker push {repository}:latest
   muster serve --engine aws-batch""")
-    if url := stack.outputs().get("WorkstationUrl"):
+    if url := outputs.get("WorkstationUrl"):
         typer.echo(f"  the workstation's desktop, ready in some 15 minutes: {url}")
 
 
@@ -102,7 +104,7 @@ def down(
     events = _follow(stack, stack.delete(), began)
     if stack.describe() is not None:
         raise ServerError(f"stack {stack_name} could not be deleted: {from_template.first_failure(events)}")
-    config = muster_home() / "aws.json"
+    config = config_path(muster_home())
     if config.exists() and f'"stack": "{stack_name}"' in config.read_text():
         config.unlink()
     typer.echo(f"stack {stack_name} is deleted; {stays}")

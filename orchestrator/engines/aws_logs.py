@@ -17,7 +17,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from botocore.parsers import ResponseParserError
 
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
-from shared_store.outcomes import FirstError, Outcome
+from shared_store.outcomes import Outcome, parse_outcome
 
 _PACE = 0.05
 """Seconds between two requests: CloudWatch answers 25 a second for the whole account."""
@@ -83,10 +83,8 @@ class NodeLog:
 def read_outcome_line(text: str) -> Outcome | None:
     """The outcome that a supervisor printed; None where it is damaged."""
     try:
-        value = json.loads(text.removeprefix(OUTCOME_LINE))
-        error = FirstError(**value["error"]) if value.get("error") else None
-        return Outcome(**{**value, "error": error})
-    except (ValueError, TypeError, KeyError):
+        return parse_outcome(json.loads(text.removeprefix(OUTCOME_LINE)))
+    except (ValueError, TypeError, AttributeError):
         return None
 
 

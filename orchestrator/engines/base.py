@@ -8,6 +8,9 @@ from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
 
+PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE")
+"""Variables of the controller that a job does not get."""
+
 
 class EngineError(Exception):
     """The engine can't do what was asked; the message is the reason that the job is given."""

@@ -17,15 +17,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
+from orchestrator.engines.base import PRIVATE, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
 from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
 
 _FIRST_PORT = 29500
-_PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE")
-"""Variables of the controller that a job does not get."""
 
 
 class LocalEngine:
@@ -102,7 +100,7 @@ class LocalEngine:
 
     def _start(self, plan: Plan, index: int, port: int) -> int:
         node = plan.nodes[index]
-        inherited = {name: value for name, value in os.environ.items() if name not in _PRIVATE}
+        inherited = {name: value for name, value in os.environ.items() if name not in PRIVATE}
         contract = {**node.contract.to_env(), "MASTER_PORT": str(port)}
         env = {
             **inherited,

@@ -13,10 +13,8 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.engines.base import EngineError, Host
+from orchestrator.engines.base import PRIVATE, EngineError, Host
 
-_PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE")
-"""Variables of the controller that a job does not get."""
 _LIMIT = 30.0
 """Seconds after which a command has failed: Slurm's own patience with a controller that is away is a minute and more."""
 _AWAY = re.compile(
@@ -80,7 +78,7 @@ def environment() -> dict[str, str]:
     return {
         name: value
         for name, value in os.environ.items()
-        if name not in _PRIVATE
+        if name not in PRIVATE
         and name != "CUDA_VISIBLE_DEVICES"
         and (name in ("SLURM_CONF", "SLURM_JWT") or not name.startswith(("SBATCH_", "SLURM_", "SQUEUE_", "SCANCEL_")))
     }
