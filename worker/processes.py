@@ -1,4 +1,4 @@
-"""What a node does to processes: tie a child's life to its parent's, adopt orphans, end everything it ever started.
+"""What a node does to processes: tie its own life to its parent's, adopt orphans, end everything it ever started.
 
 Linux only: it uses ``prctl(2)`` and ``/proc``. Imports no torch.
 """
@@ -8,30 +8,11 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
-_PR_SET_PTRACER = 0x59616D61
 _libc = ctypes.CDLL(None, use_errno=True)
-
-
-def die_with_parent() -> Callable[[], None]:
-    """A ``preexec_fn`` that has the child killed by the kernel when this process dies, however it dies.
-
-    The signal is tied to the *thread* that forks (``prctl(2)``), so it must be started from one that lives as long as the
-    process: the main thread.
-    """
-    parent = os.getpid()
-
-    def tie() -> None:
-        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        _libc.prctl(_PR_SET_PTRACER, parent, 0, 0, 0)  # its stacks may be read by us, also under Yama's ptrace_scope 1
-        if os.getppid() != parent:  # the parent died between fork and prctl
-            os._exit(1)
-
-    return tie
 
 
 def follow_parent() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -13,7 +15,7 @@ from typing import IO, Any
 
 from shared_store.contract import NodeContract
 from shared_store.outcomes import FirstError
-from worker.processes import die_with_parent
+from shared_store.tied import tied
 
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""
@@ -70,16 +72,18 @@ class Rank:
 
     def start(self, command: list[str], env: dict[str, str]) -> None:
         """Start ``command`` in a session of its own, tied to this process's life. Raises OSError where it can't be started."""
+        if shutil.which(command[0], path=env.get("PATH", os.defpath)) is None:
+            problem = errno.EACCES if os.path.exists(command[0]) else errno.ENOENT
+            raise OSError(problem, os.strerror(problem))
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._process = subprocess.Popen(
-            command,
+            tied(command),
             env={**env, "MUSTER_PROGRESS_FD": str(write_end)},
             pass_fds=(write_end,),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
-            preexec_fn=die_with_parent(),
         )
         os.close(write_end)
         self.running = True

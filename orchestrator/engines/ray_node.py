@@ -18,22 +18,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-_TIE = """
-import ctypes, os, signal, sys
-ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
-if os.getppid() != int(sys.argv[1]):
-    sys.exit(1)
-for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):
-    signal.signal(number, signal.SIG_DFL)
-signal.pthread_sigmask(signal.SIG_SETMASK, [])
-try:
-    os.execvp(sys.argv[2], sys.argv[2:])
-except OSError as error:
-    sys.exit(f"can't start {sys.argv[2]!r}: {error.strerror}")
-"""
-"""Ties the supervisor's life to the actor's (``PR_SET_PDEATHSIG``) and undoes what Ray has done to its workers' signals.
-
-A program of its own, not a ``preexec_fn``: the actor's process has threads that may hold locks when it forks."""
 _FIRST_PORT, _PORTS = 29500, 500
 _OF_RAY = ("RAY_", "OMP_NUM_THREADS", "PYTHONBREAKPOINT", "SPT_NOENV", "GRPC_DEFAULT_SSL_ROOTS_FILE_PATH")
 """Variables of a Ray worker that its node's command does not get."""
@@ -147,10 +131,11 @@ class Node:
                 os._exit(1)
         assert self._order is not None
         command, environment, directory = self._order
-        tie = [sys.executable, "-I", "-S", "-c", _TIE, str(os.getpid()), *command]
+        from shared_store.tied import tied  # it is there by now, and of the same version: see facts()
+
         try:
             self._process = subprocess.Popen(
-                tie,
+                tied(command),
                 env=environment,
                 cwd=directory,
                 stdin=subprocess.DEVNULL,

@@ -11,10 +11,12 @@ from rsl_rl.models.mlp_model import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage.rollout_storage import RolloutStorage
 from tensordict import TensorDict
+from torch.distributions import Normal
 
 from tests.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
 from worker.learning import linear
+from worker.learning.objective import Objective
 from worker.learning.ppo import LOSSES, PPO, Share
 from worker.learning.randomness import mix_seed
 
@@ -205,7 +207,7 @@ def test_every_epoch_has_its_own_order() -> None:
     first, second, third = ppo._orders.view(3, -1).clone()
     assert not torch.equal(first, second) and not torch.equal(second, third)
     for epoch in (first, second, third):  # each sample once
-        assert torch.equal(epoch.sort().values, torch.arange(len(ppo._samples)))
+        assert torch.equal(epoch.sort().values, torch.arange(32))
     ppo.begin_iteration(1)
     assert not torch.equal(first, ppo._orders.view(3, -1)[0])
 
@@ -218,3 +220,36 @@ def test_gradients_of_a_layer_are_those_of_torch() -> None:
         (layer(*leaves).tanh() ** 2).sum().backward()
         found.append([each.grad for each in leaves])
     torch.testing.assert_close(*found)
+
+
+def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
+    """Far from the old policy too, where ratios and values are clipped on either side."""
+    torch.manual_seed(3)
+    samples, actions, clip, value_coef, entropy_coef, weight = 500, 3, 0.2, 0.7, 0.02, 0.4
+    drawn, old_mean, mean = (0.7 * torch.randn(samples, actions) for _ in range(3))
+    old_std, std = torch.tensor([0.9, 1.0, 1.2]), torch.tensor([1.0, 0.8, 1.3])
+    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
+    advantages, returns, old_values, values = (torch.randn(samples) for _ in range(4))
+    leaves = [each.requires_grad_() for each in (mean, std, values.unsqueeze(1))]
+
+    policy, value = Normal(mean, std), leaves[2][:, 0]
+    ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
+    surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
+    near = old_values + (value - old_values).clamp(-clip, clip)
+    value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
+    entropy = policy.entropy().sum(1).mean()
+    kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
+    loss = weight * (surrogate + value_coef * value_loss - entropy_coef * entropy)
+    expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
+    assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
+
+    order = torch.randperm(samples)
+    rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
+    numbers = {"weight": weight, "clip": clip, "value_coef": value_coef, "entropy_coef": entropy_coef}
+    objective = Objective(samples, actions, "cpu", **numbers)
+    losses = objective.backward(order, rollout, old_std, *leaves[:2], leaves[2])
+    torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
+
+    mean.data[7, 0] = float("nan")
+    assert objective.backward(order, rollout, old_std, *leaves[:2], leaves[2])[[0, 3]].isnan().all()
+    assert mean.grad[7].isnan().all()

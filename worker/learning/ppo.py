@@ -27,14 +27,12 @@ from rsl_rl.storage.rollout_storage import RolloutStorage
 from worker.distributed import Gang
 from worker.learning import linear, moments
 from worker.learning.models import GROUP, build_models, example_observations
+from worker.learning.objective import LOSSES, Objective
 from worker.learning.randomness import mix_seed
 from worker.learning.recording import Recorded
 
 if TYPE_CHECKING:
     from worker.tasks.config import PPOConfig
-
-LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
-"""What :meth:`PPO.update` returns, in order; all are means over the samples of all ranks."""
 
 COLLECTIVES_IN_GRAPH = True
 """Whether a gang's collectives are part of the graph of learning, or stand between smaller graphs."""
@@ -119,7 +117,15 @@ class PPO(RslPPO):
         self._allocate_gradients()
         counts = [Share.of(r, gang.size, share.total).count * steps // config.minibatches for r in range(gang.size)]
         self._batch = share.count * steps // config.minibatches
-        self._weight = self._batch / sum(counts)
+        self._objective = Objective(
+            self._batch,
+            action_size,
+            device,
+            weight=self._batch / sum(counts),
+            clip=config.clip,
+            value_coef=config.value_loss_coef,
+            entropy_coef=config.entropy_coef,
+        )
         self._allocate_minibatches()
 
     def _allocate_rollout(
@@ -134,8 +140,7 @@ class PPO(RslPPO):
             self._images = self._observations.flatten(0, 1)
         features = self.actor._get_latent_dim()
         self._latents = empty(steps, worlds, features)
-        packed = features if self._images is None else 0  # of images the features change with every minibatch
-        self._terminal = empty(steps, worlds, packed)
+        self._terminal = empty(steps, worlds, features if self._images is None else 0)
         self._time_outs = empty(steps, worlds, 1)
         self._std = empty(actions)
         mean = empty(steps, worlds, actions)
@@ -143,8 +148,6 @@ class PPO(RslPPO):
         self._noise = empty(steps, self.share.total, actions)
         self._noise_source = torch.Generator(self.device)
         self._order_source = torch.Generator(self.device)
-        self._columns = [packed, actions, actions, 1, 1, 1, 1]
-        self._samples = empty(steps * worlds, sum(self._columns))
         self._last_observations = torch.zeros_like(self._observations[0])
         end = 3 + (2 * features if self.actor.obs_normalization else 0)
         self._sums = empty(end + extras, dtype=torch.float64)
@@ -220,7 +223,11 @@ class PPO(RslPPO):
         self._order_source.manual_seed(mix_seed(self.seed, iteration, 1, self.gang.rank))
         torch.randn(self._noise.shape, generator=self._noise_source, out=self._noise)
         for epoch in self._orders.view(self.num_learning_epochs, -1):
-            order = torch.randperm(len(self._samples), generator=self._order_source, device=self.device)
+            order = torch.randperm(
+                self.share.count * self.storage.num_transitions_per_env,
+                generator=self._order_source,
+                device=self.device,
+            )
             epoch.copy_(order[: len(epoch)])
         self.storage.clear()
         distribution = self.actor.distribution
@@ -319,7 +326,6 @@ class PPO(RslPPO):
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
         st.advantages.sub_(mean).div_(deviation + 1e-8)
         self._loss_sums.zero_()
-        self._pack_samples()
 
     def _bootstrap(self) -> None:
         """Where an episode was cut by the clock, its future is the value of the observation at which it was cut."""
@@ -358,20 +364,6 @@ class PPO(RslPPO):
         close()
         return self._losses_mean
 
-    def _pack_samples(self) -> None:
-        """Rows of everything that a minibatch reads, so that it takes one gather."""
-        st = self.storage
-        columns = (
-            *([self._latents] if self._images is None else []),
-            st.actions,
-            st.distribution_params[0],
-            st.actions_log_prob,
-            st.advantages,
-            st.returns,
-            st.values,
-        )
-        torch.cat([column.flatten(0, 1) for column in columns], dim=1, out=self._samples)
-
     def _apply_gradients(self) -> None:
         """One step of Adam with the gradients and losses of all ranks."""
         self._loss_sums.add_(self._losses)
@@ -389,28 +381,26 @@ class PPO(RslPPO):
         torch.div(self._loss_sums, len(self._orders), out=self._losses_mean)
 
     def _compute_gradients(self) -> None:
-        """The clipped objective (arXiv:1707.06347, eq. 7 and 9), as rsl-rl has it, weighted by this rank's part of the samples."""
+        """Of one minibatch, weighted by this rank's part of the samples."""
         self._shared.zero_()
-        samples = self._samples[self._rows]
-        latents, actions, old_mean, old_log_prob, advantages, returns, old_values = samples.split(self._columns, dim=1)
-        distribution = self.actor.distribution
-        if self._images is not None:
+        st, distribution = self.storage, self.actor.distribution
+        if self._images is None:
+            latents = self._latents.flatten(0, 1)[self._rows]
+        else:
             latents = self.actor.get_latent({GROUP: self._images[self._rows]})
-        distribution.update(linear.forward(self.actor.mlp, latents))
-        values = linear.forward(self.critic.mlp, latents)
-        ratio = torch.exp(distribution.log_prob(actions) - old_log_prob[:, 0])
-        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-advantages[:, 0] * ratio, -advantages[:, 0] * clipped).mean()
-        near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
-        value = torch.max((values - returns).square(), (near - returns).square()).mean()
-        loss = surrogate + self.value_loss_coef * value
-        with torch.set_grad_enabled(self.entropy_coef != 0.0):
-            entropy = distribution.entropy.mean()
-            loss = loss - self.entropy_coef * entropy if self.entropy_coef else loss
-        (loss * self._weight).backward()
-        with torch.no_grad():
-            kl = distribution.kl_divergence((old_mean, self._std.expand_as(old_mean)), distribution.params).mean()
-            torch.stack((surrogate, value, entropy, kl), out=self._losses).mul_(self._weight)
+        losses = self._objective.backward(
+            self._rows,
+            (
+                st.actions.flatten(0, 1),
+                st.distribution_params[0].flatten(0, 1),
+                *(each.flatten() for each in (st.actions_log_prob, st.advantages, st.returns, st.values)),
+            ),
+            self._std,
+            linear.forward(self.actor.mlp, latents),
+            distribution.std_param.clamp(*distribution.std_range),
+            linear.forward(self.critic.mlp, latents),
+        )
+        self._losses.copy_(losses)
 
     @torch.no_grad()
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:

@@ -17,7 +17,7 @@ import torch
 
 from shared_store.epoch import StaleEpoch
 from shared_store.layout import Run
-from worker.processes import die_with_parent
+from shared_store.tied import tied
 
 _BUFFERS = 2
 """One save is written while the next one is copied; a third waits."""
@@ -161,20 +161,17 @@ class Saver:
         Slurm sends SIGTERM to every process of a step, whatever its session: the writer ignores it from its first instant.
         """
         self._answers = b""
-        tie = die_with_parent()
-
-        def prepare() -> None:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            tie()
-
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "worker.saver"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=self._memory,
-            start_new_session=True,
-            preexec_fn=prepare,
-        )
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+        try:
+            self._process = subprocess.Popen(
+                tied([sys.executable, "-P", "-m", "worker.saver"], ignoring=[signal.SIGTERM]),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=self._memory,
+                start_new_session=True,
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _take_answer(self, seconds: float | None) -> bool:
         """Note the next answer, waiting for it up to ``seconds`` (None: for ever); False where none came. Raises StaleEpoch."""

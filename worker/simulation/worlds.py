@@ -76,6 +76,9 @@ def is_sound(worlds: WorldArrays, world: int) -> bool:
     return True
 
 
+FEW_ITERATIONS = 8
+"""Up to so many iterations of the solver are recorded one after the other, not as a loop that ends when all worlds are done."""
+
 # Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
 # constraints were dropped.
 _CAPACITY_BITS = wp.constant(
@@ -131,7 +134,12 @@ class Worlds:
             **solver_options,
         )
         # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
-        self.solver.mjw_model.opt.warn_overflow = 0
+        options = self.solver.mjw_model.opt
+        options.warn_overflow = 0
+        # A graph's loop asks the device after every iteration whether to go on, which costs more than the few iterations of a
+        # solver that was given a small limit: most of thousands of worlds need them all.
+        if device.startswith("cuda") and options.iterations <= FEW_ITERATIONS:
+            options.graph_conditional = False
         self.state = self.model.state()
         self._other_state = self.model.state()
         self.control = self.model.control()

@@ -1,0 +1,50 @@
+"""Runs a command whose life is tied to that of the process that started it: ``python -I -S tied.py PARENT IGNORED COMMAND ...``.
+
+A program of its own, not a ``preexec_fn``: Python may not run between fork and exec where a process has threads (its own locks may be
+held by one that the child does not have; seen with CPython 3.11: the child waits for ever, and so does who started it). Linux only.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_PTRACER = 0x59616D61
+
+
+def tied(command: Sequence[str], ignoring: Sequence[int] = ()) -> list[str]:
+    """The command line that runs ``command`` so that the kernel kills it when this process dies, however it dies.
+
+    The signal is tied to the *thread* that forks (``prctl(2)``), so it must be started from one that lives as long as the
+    process. All signals do by default what they do, but for those in ``ignoring``.
+    """
+    ignored = ",".join(str(int(number)) for number in ignoring)
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, *command]
+
+
+def main(parent: str, ignored: str, *command: str) -> None:
+    """Become ``command``; 127 and one line on standard error where that is not possible."""
+    import ctypes  # what starts commands with this module need not pay for it
+
+    libc = ctypes.CDLL(None)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    libc.prctl(_PR_SET_PTRACER, int(parent), 0, 0, 0)  # its stacks may be read by us, also under Yama's ptrace_scope 1
+    if os.getppid() != int(parent):  # it died before the kernel was told
+        os._exit(1)
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):  # Python and others change these
+        signal.signal(number, signal.SIG_DFL)
+    for each in filter(None, ignored.split(",")):
+        signal.signal(int(each), signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    try:
+        os.execvp(command[0], command)
+    except OSError as error:
+        print(f"can't start {command[0]!r}: {error.strerror}", file=sys.stderr, flush=True)
+        os._exit(127)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
