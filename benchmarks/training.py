@@ -32,7 +32,7 @@ from worker.learning.runner import Runner, build_task
 from worker.tasks import find_task
 
 CUDA = torch.cuda.is_available()
-STRETCHES, SECONDS = 3, 1.0
+STRETCHES, SECONDS = 3, 0.6
 DEFAULT = {"Cartpole": [4096, 16384], "Ant": [4096, 16384], "Humanoid": [4096, 16384], "Quadruped": [4096]} | {
     "CartpolePixels": [1024, 4096]
 }

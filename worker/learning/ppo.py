@@ -15,8 +15,9 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
 
 from __future__ import annotations
 
+import contextlib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -117,6 +118,7 @@ class PPO(RslPPO):
         self._allocate_gradients()
         counts = [Share.of(r, gang.size, share.total).count * steps // config.minibatches for r in range(gang.size)]
         self._batch = share.count * steps // config.minibatches
+        self._side = torch.cuda.Stream(device) if device.startswith("cuda") else None
         self._objective = Objective(
             self._batch,
             action_size,
@@ -388,6 +390,10 @@ class PPO(RslPPO):
             latents = self._latents.flatten(0, 1)[self._rows]
         else:
             latents = self.actor.get_latent({GROUP: self._images[self._rows]})
+        with self._beside() as join:
+            values = linear.forward(self.critic.mlp, latents)
+        mean = linear.forward(self.actor.mlp, latents)
+        join()
         losses = self._objective.backward(
             self._rows,
             (
@@ -396,11 +402,22 @@ class PPO(RslPPO):
                 *(each.flatten() for each in (st.actions_log_prob, st.advantages, st.returns, st.values)),
             ),
             self._std,
-            linear.forward(self.actor.mlp, latents),
+            mean,
             distribution.std_param.clamp(*distribution.std_range),
-            linear.forward(self.critic.mlp, latents),
+            values,
         )
         self._losses.copy_(losses)
+
+    @contextlib.contextmanager
+    def _beside(self) -> Iterator[Callable[[], None]]:
+        """On a GPU, what is in this context runs beside what follows (and so does its backward pass), until what it yields is called."""
+        if self._side is None:
+            yield lambda: None
+            return
+        main = torch.cuda.current_stream()
+        self._side.wait_stream(main)
+        with torch.cuda.stream(self._side):
+            yield lambda: main.wait_stream(self._side)
 
     @torch.no_grad()
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
