@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -152,12 +151,6 @@ def test_a_task_that_refuses_its_configuration_says_so_in_one_line(server: Servi
     job = submit(server, "train.iterations=2", "train.config={no_such_key: 1}", "retry.attempts=1")
     detail = server.wait(job["id"], timeout=120)
     assert detail["status"] == "FAILED" and "config.no_such_key" in detail["statusReason"]
-
-
-@pytest.mark.skipif(shutil.which("nvidia-smi") is None, reason="no NVIDIA GPU on this machine")
-def test_a_gpu_gang_trains_over_nccl(server: Serving) -> None:
-    job = submit(server, "train.iterations=3", "nodes=1", "resources.gpus=1", "train.worlds=256")
-    assert server.wait(job["id"], timeout=400)["status"] == "SUCCEEDED"
 
 
 def _is_rank(pid: int, number: str) -> bool:
