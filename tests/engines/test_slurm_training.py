@@ -12,6 +12,7 @@ import pytest
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import Serving, wait_for
+from tests.engines.sites import processes
 from tests.engines.slurm_cluster import SlurmCluster, started
 from tests.engines.training import same_bits, submit
 
@@ -23,13 +24,6 @@ def cluster(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     with started(tmp_path / "slurm", **getattr(request, "param", {})) as found:
         monkeypatch.setenv("SLURM_CONF", str(found.conf))
         yield found
-
-
-def environment(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/environ").read_bytes()
-    except OSError:
-        return b""
 
 
 @long
@@ -45,7 +39,7 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         job = submit(slurm, "queued", "slurm", 24)
         wait_for(lambda: len(read_metrics(run)) >= 6, 120, "some iterations")
         # the main node is on n1; n2 hangs with all that is on it, as a machine that swaps does
-        frozen = [pid for pid in cluster.processes(b"worker.") if b"SLURMD_NODENAME=n2" in environment(pid)]
+        frozen = set(processes(job, SLURMD_NODENAME="n2"))
         assert len(frozen) >= 2, "supervisor and rank"
         for pid in frozen:
             os.kill(pid, signal.SIGSTOP)
@@ -54,7 +48,7 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         local = Serving(tmp_path / "local", "--store", str(home / "store"), "--cpus", "4")
         other = submit(local, "unqueued", "local", 24)
         wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
-        assert all(b"SLURMD_NODENAME=n2" in environment(pid) for pid in frozen), "what ran there is still there"
+        assert frozen <= set(processes(job, SLURMD_NODENAME="n2")), "what ran there is still there"
         slurm.kill()
         slurm.start()
         wait_for(lambda: slurm.detail(job)["status"] == "RUNNING", 60, "it runs again")
