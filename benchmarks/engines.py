@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import wait_for
-from tests.engines.sites import ENGINES, SITES, Site, kill_rank, kill_supervisor, processes
-from tests.engines.test_every_training import submit
+from tests.engines.sites import Site, kill_rank, kill_supervisor, processes
+from tests.engines.training import submit
 
 TRIES = 3
 TABLE = Path(__file__).with_suffix(".md")
@@ -31,12 +29,6 @@ DAEMONS = {
 }
 """What the engine itself runs, by words in the commands of its processes."""
 ROWS: dict[str, dict[str, str]] = {}
-
-
-@pytest.fixture(scope="module", params=ENGINES)
-def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with SITES[request.param](tmp_path_factory.mktemp(request.param), request) as found:
-        yield found
 
 
 def seconds(since: float, what: Callable[[], Any]) -> float:

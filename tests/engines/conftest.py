@@ -1,20 +1,20 @@
-"""A real Docker Engine, and images made of nothing but this machine's own files, mounted read-only: no registry is needed."""
+"""What engines need around them: a real Docker Engine, a Ray cluster, a Slurm cluster, a controller."""
 
 from __future__ import annotations
 
 import io
-import sys
 import tarfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import REPOSITORY
+from tests.engines.images import PLAIN, SUPERVISED
+from tests.engines.sites import SITES, Site
+from tests.engines.slurm_cluster import SlurmCluster, started
 
-PLAIN, SUPERVISED = "muster-test-plain:1", "muster-test:1"
-"""An empty image, and one that says that Muster is in it."""
+CLUSTER = {"ray"}
+"""Those that take a minute to start."""
 
 
 @pytest.fixture(scope="session")
@@ -37,31 +37,6 @@ def docker_client() -> Iterator[Any]:
     client.close()
 
 
-def host_files() -> dict[str, Any]:
-    """``containerProperties`` with which an empty image has this machine's programs, Python and this repository."""
-    needed = {
-        "/usr",
-        "/bin",
-        "/lib",
-        "/lib64",
-        "/etc",
-        str(REPOSITORY),
-        sys.base_prefix,
-        str(Path(sys.executable).parent.parent),
-    }
-    paths = sorted(path for path in needed if Path(path).is_dir())
-    paths = [path for path in paths if not any(path != other and path.startswith(f"{other}/") for other in paths)]
-    return {
-        "volumes": [{"name": f"v{number}", "host": {"sourcePath": path}} for number, path in enumerate(paths)],
-        "mountPoints": [
-            {"sourceVolume": f"v{number}", "containerPath": path, "readOnly": True} for number, path in enumerate(paths)
-        ],
-    }
-
-
-PATH = f"{Path(sys.executable).parent}:/usr/local/bin:/usr/bin:/bin"
-
-
 @pytest.fixture(scope="session")
 def ray_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A head (drivers run there), and nodes ``n1``, ``n2`` and ``n3``, whose Python looks into ``modules`` first; environment variables lead to it."""
@@ -81,16 +56,16 @@ def ray_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def slurm_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def slurm_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:
     """slurmctld and three slurmd. ``SLURM_CONF`` is for the test to set: what inherits it counts as the cluster's."""
-    from tests.engines.slurm_cluster import SlurmCluster, need_slurm
-
-    need_slurm()
-    cluster = SlurmCluster(tmp_path_factory.mktemp("slurm"))
-    try:
-        cluster.start()
-        cluster.ready()
+    with started(tmp_path_factory.mktemp("slurm")) as cluster:
         yield cluster
-    finally:
-        cluster.close()
-    assert not cluster.processes()
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.cluster] if name in CLUSTER else []) for name in SITES],
+)
+def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    with SITES[request.param](tmp_path_factory.mktemp(request.param), request) as found:
+        yield found

@@ -12,10 +12,12 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, wait_for
-from tests.engines.conftest import PATH, SUPERVISED, host_files
+from tests.conftest import Serving, alive, parent, wait_for
+from tests.engines.images import PATH, SUPERVISED, host_files
 
-ENGINES = ("local", "docker", "ray", "slurm", "aws-batch")
+WAIT = "echo ready; exec sleep 600"
+POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+STUBBORN = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
 
 
 @dataclass
@@ -76,8 +78,7 @@ def processes(job: str, **variables: str) -> dict[int, list[bytes]]:
             continue
         with contextlib.suppress(OSError):
             there = set((entry / "environ").read_bytes().split(b"\0"))
-            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            if wanted <= there and state not in "ZX":
+            if wanted <= there and alive(int(entry.name)):
                 found[int(entry.name)] = (entry / "cmdline").read_bytes().split(b"\0")
     return found
 
@@ -93,9 +94,8 @@ def kill_supervisor(job: str, node: int) -> None:
     ranks = processes(job, RANK=str(node))
     for pid in ranks:
         with contextlib.suppress(OSError):
-            parent = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-            if parent not in ranks:
-                os.kill(parent, signal.SIGKILL)
+            if (supervisor := parent(pid)) not in ranks:
+                os.kill(supervisor, signal.SIGKILL)
 
 
 @contextlib.contextmanager

@@ -6,8 +6,11 @@ import dataclasses
 import json
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from orchestrator.engines.base import Gang, NodeStatus, Placement
 from orchestrator.engines.slurm import SlurmEngine
@@ -15,10 +18,8 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from tests.conftest import wait_for
+from tests.engines.sites import WAIT
 from tests.engines.slurm_cluster import SlurmCluster
-
-WAIT = "echo ready; exec sleep 600"
-POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
 
 
 class Bench:
@@ -87,3 +88,15 @@ class Bench:
 
     def processes(self, command: bytes) -> list[int]:
         return self.cluster.processes(command)
+
+
+@pytest.fixture
+def slurm_bench(slurm_cluster: SlurmCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """For a module to take as its own: ``bench = slurm_bench``."""
+    monkeypatch.setenv("SLURM_CONF", str(slurm_cluster.conf))
+    found = Bench(slurm_cluster, tmp_path)
+    yield found
+    for handle in found.handles:
+        found.engine.stop(handle, 0.0)
+    wait_for(lambda: not found.processes(b"worker.supervisor"), 20, "no supervisor is left")
+    slurm_cluster.ready()

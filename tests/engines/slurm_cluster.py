@@ -5,6 +5,7 @@ Needs Debian's ``slurm-wlm`` (or any Slurm that was built with multiple slurmd s
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pwd
 import shutil
@@ -13,12 +14,12 @@ import socket
 import stat
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import wait_for
+from tests.conftest import alive, wait_for
 
 NODES = ("n1", "n2", "n3")
 CPUS, MEMORY, GPUS = 4, 8192, 2
@@ -54,14 +55,14 @@ SlurmdLogFile={home}/%n.log
 SlurmctldTimeout=30
 SlurmdTimeout=5
 MessageTimeout=5
-KillWait={kill_wait}
-MinJobAge={min_job_age}
+KillWait=5
+MinJobAge=300
 InactiveLimit=0
 ReturnToService=2
 OverTimeLimit=0
 GresTypes=gpu
 {nodes}
-PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE DefaultTime={default_time} State=UP PriorityTier=1 PreemptMode=CANCEL GraceTime={preempt_grace}
+PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE DefaultTime={default_time} State=UP PriorityTier=1 PreemptMode=CANCEL GraceTime=20
 PartitionName=urgent Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=10 PreemptMode=OFF
 PartitionName=short Nodes=ALL MaxTime=1 State=UP PriorityTier=1
 PartitionName=closed Nodes=ALL MaxTime=INFINITE State=DOWN
@@ -86,14 +87,7 @@ def _free_ports(count: int) -> list[int]:
 class SlurmCluster:
     """The daemons, and where their configuration is."""
 
-    def __init__(
-        self,
-        home: Path,
-        kill_wait: int = 5,
-        min_job_age: int = 300,
-        preempt_grace: int = 20,
-        default_time: str = "INFINITE",
-    ) -> None:
+    def __init__(self, home: Path, default_time: str = "INFINITE") -> None:
         self.home = home
         self.conf = home / "slurm.conf"
         self.daemons: dict[str, subprocess.Popen[bytes]] = {}
@@ -114,9 +108,6 @@ class SlurmCluster:
                 user=pwd.getpwuid(os.geteuid()).pw_name,
                 home=home,
                 nodes="\n".join(nodes),
-                kill_wait=kill_wait,
-                min_job_age=min_job_age,
-                preempt_grace=preempt_grace,
                 default_time=default_time,
             )
         )
@@ -198,23 +189,32 @@ class SlurmCluster:
                 continue
             try:
                 command = (entry / "cmdline").read_bytes()
-                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
                 # slurmstepd has its node's name or its job's in its command, and no environment
-                if (mark in (entry / "environ").read_bytes() or str(self.home).encode() in command) and state != "Z":
-                    found.append((int(entry.name), command))
+                mine = mark in (entry / "environ").read_bytes() or str(self.home).encode() in command
             except OSError:
                 continue
-        return [pid for pid, command in found if what in command]
+            if mine and what in command and alive(int(entry.name)):
+                found.append(int(entry.name))
+        return found
 
 
-def slurm_missing() -> Sequence[str]:
-    """The Slurm programs that are not installed here."""
-    where = f"{os.environ.get('PATH', '')}:{_DAEMONS}"
-    programs = ("slurmctld", "slurmd", "sbatch", "squeue", "scontrol", "scancel", "sinfo", "srun")
-    return [program for program in programs if not shutil.which(program, path=where)]
+@contextlib.contextmanager
+def started(home: Path, **options: str) -> Iterator[SlurmCluster]:
+    """A cluster whose nodes are all idle; nothing of it is left in the end."""
+    need_slurm()
+    cluster = SlurmCluster(home, **options)
+    try:
+        cluster.start()
+        cluster.ready()
+        yield cluster
+    finally:
+        cluster.close()
+    assert not cluster.processes()
 
 
 def need_slurm() -> None:
     """Skip loudly where there is none."""
-    if missing := slurm_missing():
+    where = f"{os.environ.get('PATH', '')}:{_DAEMONS}"
+    programs = ("slurmctld", "slurmd", "sbatch", "squeue", "scontrol", "scancel", "sinfo", "srun")
+    if missing := [program for program in programs if not shutil.which(program, path=where)]:
         pytest.skip(f"NO SLURM: the slurm engine is not tested ({', '.join(missing)} not installed; Debian: slurm-wlm)")

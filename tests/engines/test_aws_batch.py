@@ -22,15 +22,14 @@ from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
 from tests.conftest import Serving, processes_of, wait_for
+from tests.engines.sites import POLITE, WAIT
 
 JOB = "6f1d0c5e-0000-4000-8000-00000000aaaa"
-WAIT = "echo ready; exec sleep 600"
 LAST = (
     f'[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/{JOB}/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
     "do sleep 0.05; done"
 )
 """Shell: the main node, whose end ends the others wherever they are, waits until they have ended by themselves."""
-TRAP = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +244,7 @@ def test_what_was_submitted_by_a_controller_that_died_is_found(bench: Bench) -> 
 
 
 def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(TRAP, 2))
+    handle = bench.launch(bench.gang(POLITE, 2))
     bench.ready(2)
     bench.engine.stop(handle, 10.0)
     assert bench.processes() == []

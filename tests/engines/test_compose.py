@@ -18,7 +18,7 @@ import yaml
 
 from orchestrator.client import ApiError, Client, Unreachable
 from tests.conftest import MUSTER, REPOSITORY, wait_for
-from tests.engines.conftest import PATH, SUPERVISED, host_files
+from tests.engines.images import PATH, SUPERVISED, host_files
 from tests.worker.ranks import free_port
 
 pytestmark = pytest.mark.cluster

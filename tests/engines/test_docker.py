@@ -16,10 +16,10 @@ from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
 from tests.conftest import wait_for
-from tests.engines.conftest import PATH, PLAIN, SUPERVISED, host_files
+from tests.engines.images import PATH, PLAIN, SUPERVISED, host_files
+from tests.engines.sites import POLITE, STUBBORN, WAIT
 
 JOB = "docker-engine-job"
-WAIT = "echo ready; exec sleep 600"
 
 
 class Bench:
@@ -183,12 +183,12 @@ def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: B
 
 
 def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
-    polite = bench.launch(bench.gang('trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done', 2))
+    polite = bench.launch(bench.gang(POLITE, 2))
     wait_for(lambda: bench.log().count("ready") == 2, 20, "both are ready")
     bench.engine.stop(polite, 10.0)
     assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75]
     assert bench.log().count("saved") == 2
-    stubborn = bench.launch(bench.gang('trap "" TERM; echo ready; while :; do sleep 0.05; done', 1, attempt=2))
+    stubborn = bench.launch(bench.gang(STUBBORN, 1, attempt=2))
     wait_for(lambda: "ready" in bench.log(2), 20, "it is ready")
     started = time.monotonic()
     bench.engine.stop(stubborn, 1.0)

@@ -13,8 +13,9 @@ from orchestrator.client import ApiError
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import Serving, wait_for
-from tests.engines.conftest import PATH, SUPERVISED, host_files
-from tests.engines.test_every_training import submit
+from tests.engines.images import PATH, SUPERVISED, host_files
+from tests.engines.sites import WAIT
+from tests.engines.training import submit
 
 
 def plain(served: Serving, image: str, script: str, queue: str = "default", **container: Any) -> str:
@@ -40,7 +41,7 @@ def test_a_job_whose_image_is_being_pulled_can_be_stopped_and_a_node_answers_on_
             served.client.batch("TerminateJob", jobId=job, reason="no time for that")
             assert served.wait(job, timeout=10)["statusReason"] == "no time for that"
         environment = [{"name": "PATH", "value": PATH}]
-        job = plain(served, SUPERVISED, "echo ready; exec sleep 600", environment=environment, **host_files())
+        job = plain(served, SUPERVISED, WAIT, environment=environment, **host_files())
         wait_for(lambda: "ready" in served.log(job), 30, "its start")
         [node] = wait_for(lambda: ask_stacks(served, job), 30, "an answer from inside the container")
         assert "rank 0:" in node["stacks"]
@@ -66,7 +67,7 @@ def test_a_node_that_is_cut_off_is_noticed_by_its_silence_and_the_gang_goes_on(
     job = ""
     try:
         job = submit(docker, "cut", "docker", 24, "stall_timeout=15s")
-        wait_for(lambda: run.path.exists() and len(read_metrics(run)) >= 5, 120, "some iterations")
+        wait_for(lambda: len(read_metrics(run)) >= 5, 120, "some iterations")
         [network] = [n for n in docker_client.networks.list(filters={"label": "muster.gang"}) if job in n.name]
         network.reload()
         [child] = [c for c in network.containers if c.labels["muster.node"] == "1"]

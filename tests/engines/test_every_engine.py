@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-
-import pytest
 
 from tests.conftest import wait_for
-from tests.engines.sites import ENGINES, SITES, Site, kill_rank, kill_supervisor, processes
+from tests.engines.sites import POLITE, Site, kill_rank, kill_supervisor, processes
 
 CONTRACT = """python3 - <<'PYTHON'
 import json, os
@@ -23,21 +20,7 @@ mkdir -p $MUSTER_STORE/ends/$MUSTER_JOB_ID; touch $MUSTER_STORE/ends/$MUSTER_JOB
 if [ $RANK = 0 ]; then while [ $(ls $MUSTER_STORE/ends/$MUSTER_JOB_ID | wc -l) -lt $WORLD_SIZE ]; do sleep 0.05; done; fi
 """
 """Last lines of a gang whose main node is done only when the others have come here, too."""
-POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
 THIRD_TIME = "echo ready; [ $AWS_BATCH_JOB_ATTEMPT = 3 ] || exec sleep 600; while [ ! -e $MUSTER_STORE/go-$MUSTER_JOB_ID ]; do sleep 0.05; done; echo done"
-
-
-CLUSTER = {"ray"}
-"""Those that take a minute to start."""
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=[pytest.mark.cluster] if name in CLUSTER else []) for name in ENGINES],
-)
-def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with SITES[request.param](tmp_path_factory.mktemp(request.param), request) as found:
-        yield found
 
 
 def gone(job: str) -> None:

@@ -19,11 +19,9 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
-from tests.conftest import processes_of, wait_for
-from tests.engines.ray_cluster import RAY, RayCluster, alive
-
-READY = "echo ready; exec sleep 600"
-POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+from tests.conftest import alive, parent, processes_of, wait_for
+from tests.engines.ray_cluster import RAY, RayCluster
+from tests.engines.sites import POLITE, STUBBORN, WAIT
 
 
 class Bench:
@@ -38,7 +36,7 @@ class Bench:
         self.engine = RayEngine(home / "home")
         self.handles: list[str] = []
 
-    def gang(self, script: str = READY, hosts: tuple[str, ...] = ("n1", "n2", "n3"), **changes: Any) -> Gang:
+    def gang(self, script: str = WAIT, hosts: tuple[str, ...] = ("n1", "n2", "n3"), **changes: Any) -> Gang:
         count, gpus = len(hosts), changes.pop("gpus", ())
         job, cpus = changes.pop("job", "job"), changes.pop("cpus", 1.0)
         facts: dict[str, Any] = {
@@ -102,7 +100,7 @@ class Bench:
         return [line.text for line in LogFollower(self.run, job).drain() if line.attempt == attempt]
 
     def driver(self) -> int:
-        [pid] = [pid for pid in processes_of(self.home / "home") if alive(pid)]
+        [pid] = processes_of(self.home / "home")
         return pid
 
 
@@ -174,7 +172,7 @@ def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(b
     assert bench.stopped(first) == [75, 75, 75]
     assert bench.log().count("saved") == 3
     # meanwhile the place is kept: the driver and its placement group are those of the next attempt
-    second = bench.ready(bench.gang('trap "" TERM; echo ready; while :; do sleep 0.05; done', ("n1", "n2"), attempt=2))
+    second = bench.ready(bench.gang(STUBBORN, ("n1", "n2"), attempt=2))
     assert bench.driver() == driver
     assert bench.stopped(second, 0.5) == [137, 137]
 
@@ -217,14 +215,14 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ben
 
 
 def test_a_rank_and_a_supervisor_that_are_killed(bench: Bench) -> None:
-    handle = bench.ready(bench.gang("echo $$ > $MUSTER_STORE/rank-$NODE_RANK; echo ready; exec sleep 600"))
+    handle = bench.ready(bench.gang(f"echo $$ > $MUSTER_STORE/rank-$NODE_RANK; {WAIT}"))
     os.kill(int((bench.store.path / "rank-1").read_text()), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "the rank's end")
     assert bench.engine.observe(handle)[1].exit_code == 137
     outcome = read_outcome(bench.run, "job", 1, 1)
     assert outcome is not None and outcome.reason == "rank 1 was killed by SIGKILL"
     rank = int((bench.store.path / "rank-2").read_text())
-    os.kill(int(Path(f"/proc/{rank}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
+    os.kill(parent(rank), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[2].running, 20, "the supervisor's end")
     wait_for(lambda: not alive(rank), 5, "its rank dies with it")
     status = bench.engine.observe(handle)

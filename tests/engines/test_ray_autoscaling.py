@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import REPOSITORY, wait_for
-from tests.engines.ray_cluster import RayCluster, free_port
+from tests.engines.ray_cluster import RayCluster
 from tests.engines.test_ray import Bench
+from tests.worker.ranks import free_port
 
 pytest.importorskip("ray", reason="NO RAY: the ray engine is not tested (pip install 'muster[ray]')")
 pytestmark = pytest.mark.cluster

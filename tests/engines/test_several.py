@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Serving
-from tests.engines.conftest import PLAIN, host_files
+from tests.engines.images import PLAIN, host_files
 from tests.engines.test_docker_faults import plain
 
 SCRIPT = "echo on $(hostname)"

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,32 +17,11 @@ from orchestrator.engines.slurm import SlurmEngine
 from orchestrator.engines.slurm_commands import SlurmJob
 from orchestrator.engines.slurm_words import ending, waiting
 from tests.conftest import wait_for
-from tests.engines.slurm_bench import POLITE, Bench
-from tests.engines.slurm_cluster import GPUS, NODES, SlurmCluster, need_slurm
+from tests.engines.sites import POLITE, STUBBORN, WAIT
+from tests.engines.slurm_bench import Bench, slurm_bench
+from tests.engines.slurm_cluster import GPUS, NODES
 
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:
-    need_slurm()
-    found = SlurmCluster(tmp_path_factory.mktemp("slurm"))
-    try:
-        found.start()
-        found.ready()
-        yield found
-    finally:
-        found.close()
-    assert not found.processes()
-
-
-@pytest.fixture
-def bench(cluster: SlurmCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    monkeypatch.setenv("SLURM_CONF", str(cluster.conf))
-    found = Bench(cluster, tmp_path)
-    yield found
-    for handle in found.handles:
-        found.engine.stop(handle, 0.0)
-    wait_for(lambda: not cluster.processes(b"worker.supervisor"), 20, "no supervisor is left")
-    cluster.ready()
+bench = slurm_bench
 
 
 def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_left_out(bench: Bench) -> None:
@@ -97,7 +75,7 @@ def test_without_gpus_a_node_sees_none_and_two_jobs_on_one_host_have_two_ports(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
-    script = 'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; echo ready; exec sleep 600'
+    script = f'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; {WAIT}'
     pin = {"nodelist": "n1"}
     first = bench.launch(bench.gang(script, options=pin))
     second = bench.launch(bench.gang(script, options=pin, suffix="2"))
@@ -243,9 +221,7 @@ def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
     bench.engine.stop(polite, 30.0)
     assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75, 75]
     assert bench.log().count("saved") == 3 and not bench.processes(b"worker.supervisor")
-    stubborn = bench.launch(
-        bench.gang('trap "" TERM; echo ready; while :; do sleep 0.05; done', suffix="2", grace=60.0)
-    )
+    stubborn = bench.launch(bench.gang(STUBBORN, suffix="2", grace=60.0))
     bench.ready(stubborn, suffix="2")
     asked = time.monotonic()
     bench.engine.stop(stubborn, 1.0)

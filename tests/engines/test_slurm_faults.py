@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,35 +14,12 @@ from orchestrator.engines.slurm import SlurmEngine
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import read_outcome
-from tests.conftest import wait_for
-from tests.engines.slurm_bench import POLITE, Bench
-from tests.engines.slurm_cluster import SlurmCluster, need_slurm
+from tests.conftest import parent, wait_for
+from tests.engines.sites import POLITE
+from tests.engines.slurm_bench import Bench, slurm_bench
 
 pytestmark = pytest.mark.cluster
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:
-    need_slurm()
-    found = SlurmCluster(tmp_path_factory.mktemp("slurm"))
-    try:
-        found.start()
-        found.ready()
-        yield found
-    finally:
-        found.close()
-    assert not found.processes()
-
-
-@pytest.fixture
-def bench(cluster: SlurmCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    monkeypatch.setenv("SLURM_CONF", str(cluster.conf))
-    found = Bench(cluster, tmp_path)
-    yield found
-    for handle in found.handles:
-        found.engine.stop(handle, 0.0)
-    wait_for(lambda: not cluster.processes(b"worker.supervisor"), 20, "no supervisor is left")
-    cluster.ready()
+bench = slurm_bench
 
 
 def ranks(bench: Bench) -> list[int]:
@@ -53,7 +29,7 @@ def ranks(bench: Bench) -> list[int]:
 def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) -> None:
     handle = bench.launch(bench.gang(nodes=3))
     bench.ready(handle, 3)
-    parents = {pid: int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) for pid in ranks(bench)}
+    parents = {pid: parent(pid) for pid in ranks(bench)}
     nodes = {
         Path(f"/proc/{pid}/environ").read_bytes().partition(b"\0AWS_BATCH_JOB_NODE_INDEX=")[2][:1]: pid
         for pid in parents
@@ -67,7 +43,7 @@ def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) ->
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
     assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
     wait_for(lambda: ranks(bench) == [nodes[b"2"]], 5, "its rank went with it")
-    step = int(Path(f"/proc/{parents[nodes[b'2']]}/stat").read_text().rpartition(")")[2].split()[1])
+    step = parent(parents[nodes[b"2"]])
     assert b"slurmstepd" in Path(f"/proc/{step}/cmdline").read_bytes()
     os.kill(step, signal.SIGKILL)
     wait_for(lambda: not ranks(bench), 5, "supervisor and rank went with it")

@@ -4,54 +4,26 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from orchestrator import specfile
-from orchestrator.definition import compile_definition, compile_submission
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import REPOSITORY, Serving, wait_for
-from tests.engines.slurm_cluster import SlurmCluster, need_slurm
+from tests.conftest import Serving, wait_for
+from tests.engines.sites import processes
+from tests.engines.slurm_cluster import SlurmCluster, started
+from tests.engines.training import same_bits, submit
 
 long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
-CHANGES = ("nodes=2", "train.iterations=24", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
 
 
 @pytest.fixture
 def cluster(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SlurmCluster]:
-    need_slurm()
-    found = SlurmCluster(tmp_path / "slurm", default_time=getattr(request, "param", "INFINITE"))
-    monkeypatch.setenv("SLURM_CONF", str(found.conf))
-    try:
-        found.start()
-        found.ready()
+    with started(tmp_path / "slurm", **getattr(request, "param", {})) as found:
+        monkeypatch.setenv("SLURM_CONF", str(found.conf))
         yield found
-    finally:
-        found.close()
-    assert not found.processes()
-
-
-def environment(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/environ").read_bytes()
-    except OSError:
-        return b""
-
-
-def submit(serving: Serving, run: str, *changes: str) -> str:
-    """Cart-pole on two nodes as run ``run``; returns the job id."""
-    spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), [*CHANGES, *changes])
-    request = compile_definition(spec, str(REPOSITORY))
-    container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
-    container["environment"].append({"name": "MUSTER_RUN", "value": run})
-    arn = serving.client.batch("RegisterJobDefinition", **request)["jobDefinitionArn"]
-    job: str = serving.client.batch("SubmitJob", **compile_submission(spec, arn))["jobId"]
-    return job
 
 
 @long
@@ -62,26 +34,21 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
     home.mkdir()
     slurm = Serving(home, "--engine", "slurm")
     run = Store(home / "store").run("queued")
-
     local: Serving | None = None
-
-    def iterations() -> int:
-        return len(read_metrics(run)) if run.path.exists() else 0
-
     try:
-        job = submit(slurm, "queued")
-        wait_for(lambda: iterations() >= 6, 120, "some iterations")
+        job = submit(slurm, "queued", "slurm", 24)
+        wait_for(lambda: len(read_metrics(run)) >= 6, 120, "some iterations")
         # the main node is on n1; n2 hangs with all that is on it, as a machine that swaps does
-        frozen = [pid for pid in cluster.processes(b"worker.") if b"SLURMD_NODENAME=n2" in environment(pid)]
+        frozen = set(processes(job, SLURMD_NODENAME="n2"))
         assert len(frozen) >= 2, "supervisor and rank"
         for pid in frozen:
             os.kill(pid, signal.SIGSTOP)
         cluster.kill("n2")
         # meanwhile the same on the local engine, undisturbed
         local = Serving(tmp_path / "local", "--store", str(home / "store"), "--cpus", "4")
-        other = submit(local, "unqueued")
+        other = submit(local, "unqueued", "local", 24)
         wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
-        assert all(b"SLURMD_NODENAME=n2" in environment(pid) for pid in frozen), "what ran there is still there"
+        assert frozen <= set(processes(job, SLURMD_NODENAME="n2")), "what ran there is still there"
         slurm.kill()
         slurm.start()
         wait_for(lambda: slurm.detail(job)["status"] == "RUNNING", 60, "it runs again")
@@ -97,17 +64,11 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         slurm.close()
         if local is not None:
             local.close()
-    compared = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.compare", "queued", "unqueued"],
-        env={**os.environ, "MUSTER_STORE": str(home / "store")},
-        capture_output=True,
-        text=True,
-    )
-    assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
+    same_bits(home / "store", "queued", "unqueued")
 
 
 @long
-@pytest.mark.parametrize("cluster", ["2"], indirect=True)
+@pytest.mark.parametrize("cluster", [{"default_time": "2"}], indirect=True)
 def test_at_the_time_limit_it_saves_leaves_and_is_submitted_anew(cluster: SlurmCluster, tmp_path: Path) -> None:
     """Two minutes a submission: the notice comes half a minute after the start."""
     taken_back(tmp_path, iterations=500)
@@ -129,8 +90,8 @@ def taken_back(tmp_path: Path, iterations: int, then: Callable[[], None] = lambd
     slurm = Serving(home, "--engine", "slurm")
     run = Store(home / "store").run("taken")
     try:
-        job = submit(slurm, "taken", f"train.iterations={iterations}", "checkpoint.every=100000")
-        wait_for(lambda: run.path.exists() and len(read_metrics(run)) >= 6, 120, "some iterations")
+        job = submit(slurm, "taken", "slurm", iterations, "checkpoint.every=100000")
+        wait_for(lambda: len(read_metrics(run)) >= 6, 120, "some iterations")
         then()
         done = slurm.wait(job, timeout=300)
         assert done["status"] == "SUCCEEDED", (done["statusReason"], slurm.log(job)[-20:])

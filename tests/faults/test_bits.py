@@ -6,7 +6,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
+from tests.engines.training import same_bits
 
 CARTPOLE = ("job_specs/cartpole.yaml", "train.worlds=8", "checkpoint.every=4", "nodes=1")
 ANT = ("job_specs/ant.yaml", "train.worlds=4", "checkpoint.every=2", "nodes=1", "train.ppo.steps=8")
@@ -114,14 +114,8 @@ def test_stopped_and_resumed_ends_with_the_same_bits(home: Path, straight: str) 
         assert server.wait(resumed["jobId"], timeout=120)["status"] == "SUCCEEDED"
     finally:
         server.close()
-    same = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.compare", straight, run.name],
-        env={**os.environ, "MUSTER_STORE": str(home / "store")},
-        capture_output=True,
-        text=True,
-        timeout=180,
-    )
-    assert same.returncode == 0 and re.fullmatch(r"equal: \d+ tensors, 200 iterations\n", same.stdout), same
+    said = same_bits(home / "store", straight, run.name)
+    assert re.fullmatch(r"equal: \d+ tensors, 200 iterations\n", said), said
 
 
 @pytest.mark.parametrize(

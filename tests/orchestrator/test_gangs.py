@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import MAIN_LAST, MUSTER, Serving, processes_of, wait_for
+from tests.conftest import MAIN_LAST, MUSTER, Serving, parent, processes_of, wait_for
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
 
@@ -162,7 +162,7 @@ def test_a_killed_process_of_a_native_gang_costs_one_attempt_and_leaves_no_orpha
     line = wait_for(lambda: server.log(job, node=2), what="node 2's first line")[0]
     pid = int(line.split()[1])
     first = set(processes_of(server.home))
-    os.kill(pid if victim == "rank" else _parent(pid), signal.SIGKILL)
+    os.kill(pid if victim == "rank" else parent(pid), signal.SIGKILL)
     detail = server.wait(job)
     assert detail["status"] == "SUCCEEDED" and len(detail["attempts"]) == 2
     reason = detail["attempts"][0]["statusReason"]
@@ -221,10 +221,6 @@ def test_two_jobs_can_not_write_one_run(server: Serving) -> None:
     server.gang("import time; time.sleep(300)", env={"MUSTER_RUN": "shared-run"})
     with pytest.raises(ApiError, match="run shared-run is being written by job test"):
         server.gang("pass", env={"MUSTER_RUN": "shared-run"})
-
-
-def _parent(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def _mentions(pid: int, job: str) -> bool:

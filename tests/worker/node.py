@@ -14,7 +14,7 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
-from tests.conftest import wait_for
+from tests.conftest import alive, wait_for
 
 ENVIRONMENT = {
     name: value
@@ -94,13 +94,6 @@ class Node:
 
 
 Nodes = Callable[..., Node]
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
 
 
 def gone(*pids: int) -> None:

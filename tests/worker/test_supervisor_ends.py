@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from shared_store.epoch import raise_epoch
-from tests.conftest import wait_for
-from tests.worker.node import Nodes, alive, gone
+from tests.conftest import alive, wait_for
+from tests.worker.node import Nodes, gone
 
 # -- ends -------------------------------------------------------------------------------------------------------------
 
