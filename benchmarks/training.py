@@ -134,8 +134,6 @@ def measure(task: str, worlds: int, store: Path, *, stock: bool, profile: bool) 
             own.step(actions)
 
     found["simulation"] = rate(Recorded(simulate, own.device, "simulation"), steps)
-    if CUDA:
-        found["memory_gb"] = (torch.cuda.mem_get_info()[1] - torch.cuda.mem_get_info()[0]) / 1e9
     if stock:
         fresh = build_task(type(own), runner.config, ppo.share, runner.gang, 1)
         iterations = max(3, round((3e6 if CUDA else 3e3) / steps))
