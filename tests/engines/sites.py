@@ -98,6 +98,13 @@ def kill_supervisor(job: str, node: int) -> None:
                 os.kill(supervisor, signal.SIGKILL)
 
 
+def freeze(job: str, node: int) -> None:
+    """SIGSTOP to the supervisor of one node and all of its rank, as when its machine stands still."""
+    ranks = processes(job, RANK=str(node))
+    for pid in {*map(parent, ranks), *ranks}:
+        os.kill(pid, signal.SIGSTOP)
+
+
 @contextlib.contextmanager
 def local(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
     yield from _served("local", home, "--cpus", "8")

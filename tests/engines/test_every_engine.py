@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from tests.conftest import wait_for
-from tests.engines.sites import POLITE, Site, kill_rank, kill_supervisor, processes
+from tests.engines.sites import POLITE, Site, freeze, kill_rank, kill_supervisor, processes
 
 CONTRACT = """python3 - <<'PYTHON'
 import json, os
@@ -105,3 +107,18 @@ def test_what_is_killed_is_started_again_and_the_controller_may_die_meanwhile(si
     assert "rank 1 was killed by SIGKILL" in first["statusReason"], first
     assert second["spent"] and second["nodes"][1]["exitCode"] != 0, second
     assert third["exitCode"] == 0 and site.printed(job, 3).count("done") == 2
+
+
+@pytest.mark.cluster  # half a minute for each
+def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(site: Site) -> None:
+    if site.engine == "aws-batch":
+        pytest.skip("nodes on AWS have no bus to the controller: there a frozen one is found by stall_timeout alone")
+    job = site.submit(
+        "echo ready; [ $AWS_BATCH_JOB_ATTEMPT = 2 ] || exec sleep 600" + WAIT_FOR_ALL, nodes=2, attempts=2
+    )
+    site.ready(job, 1, 2)
+    freeze(job, 1)
+    detail = site.serving.wait(job, timeout=60)
+    assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
+    assert "node 1 gives no sign of life for" in detail["attempts"][0]["statusReason"], detail["attempts"]
+    gone(job)

@@ -8,6 +8,7 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
   (Of images there is none after the step: there it is as in rsl-rl.)
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws a new permutation (rsl-rl draws one and repeats the same minibatches in all epochs).
+- The objective and its gradient are one kernel (:mod:`worker.learning.objective`), and on CUDA actor and critic run side by side.
 - The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device, and on CUDA all of
   :meth:`PPO.learn` is one graph.
 - Action noise depends on (seed, iteration, step, global world index) alone: not on the number of ranks, nor on a restart.
