@@ -79,6 +79,11 @@ def _objective(
         terms[i, 4 + j] = scale * (slope * (distance * distance - 1.0) - entropy_coef) / std[j]
 
 
+def load(device: str) -> None:
+    """Compile the kernel for ``device``, or take it from the cache."""
+    wp.load_module(__name__, device)
+
+
 class Objective:
     """The clipped objective (arXiv:1707.06347, eq. 7 and 9, and rsl-rl's clipped value loss) of minibatches of one size.
 

@@ -6,15 +6,16 @@ import dataclasses
 import math
 import os
 import statistics
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+import warp
 
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang, warm_marker
 from worker.errors import TrainingError, UserError
+from worker.learning import objective
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence, Fence
 from worker.learning.evaluation import evaluate
@@ -335,9 +336,9 @@ def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Ga
     marker = warm_marker(task_type, gang.device)
     if gang.is_main and marker is not None and not marker.exists():
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
-    if warp := sys.modules.get("warp"):
-        warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
+    warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
     with user_errors(), gang.build_in_turn(marker):
+        objective.load(gang.device)
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
 
 
