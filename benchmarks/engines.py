@@ -71,7 +71,9 @@ def _speed(site: Site) -> str:
     """Median steps/s of a cart-pole training on two nodes, from its metrics."""
     if site.engine == "aws-batch":
         return "-"  # its nodes are the local engine's
-    job = submit(site.serving, "speed", site.engine, 40, "train.worlds=256", "checkpoint.every=1000")
+    job = submit(
+        site.serving, "speed", site.engine, 40, "train.worlds=256", "checkpoint.every=1000", "resources.cpus=1"
+    )
     assert site.serving.wait(job, timeout=180)["status"] == "SUCCEEDED", site.serving.detail(job)["statusReason"]
     found = [record["steps_per_second"] for record in read_metrics(Store(site.volume).run("speed"))[5:]]
     return f"{statistics.median(found):,.0f}"
@@ -106,9 +108,8 @@ def _write() -> None:
         f"{TRIES}. Memory is proportional set size in MiB:\nof the controller, and of what the engine itself runs on all its nodes "
         "together (Ray: a head and three nodes; Slurm: slurmctld and three slurmd).\n`aws-batch` is a second Muster in AWS's place: "
         "what AWS itself takes (instances, images) is not in it.\n"
-        "Steps/s: cart-pole, two nodes of 256 worlds and half a core each, which Docker enforces and the others only divide: that is its "
-        "difference, and the\nothers' are noise. On Ray the last to go is the job's driver, which keeps the gang's place for 15 s; the nodes "
-        "themselves are gone at once.\nA node's death is that of its supervisor; of a whole machine's see the tests of each engine.\n\n"
+        "Steps/s: cart-pole, two nodes of 256 worlds and a core each, all that there are. On Ray the last to go is the job's "
+        "driver, which keeps\nthe gang's place for 15 s; the nodes themselves are gone at once. A node's death is that of its supervisor; of a whole machine's see the tests of each engine.\n\n"
         "| engine | submit → first rank | rank's death → noticed | node's death → noticed | → runs again | stop → nothing left | "
         "steps/s | controller | engine |\n|---|---|---|---|---|---|---|---|---|\n"
     )
