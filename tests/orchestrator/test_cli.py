@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import REPOSITORY, Serving, run_muster, wait_for
+from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
 
 
 def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
@@ -182,3 +184,25 @@ def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -
     assert done.returncode == 0, done.stdout + done.stderr
     for rank in range(3):
         assert f"rank {rank} of 3 on node {rank}: sum = 6, expected 6" in done.stdout
+
+
+def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Serving) -> None:
+    full = server.gang("import time; time.sleep(600)", cpus="4")
+    server.wait(full, "RUNNING")
+    running = subprocess.Popen(
+        [MUSTER, "run", "job_specs/cartpole.yaml"],
+        env={**os.environ, "MUSTER_HOME": str(server.home)},
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stdout is not None
+    wait_for(lambda: "RUNNABLE" in running.stdout.readline(), 30, "the job waits")
+    running.send_signal(signal.SIGTERM)  # is taken as Ctrl-C is
+    said, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors) == (130, ""), said
+    assert "FAILED  cartpole (" in said and ": stopped with Ctrl-C" in said
+    [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]
+    never = f"job cartpole ({job['jobId'][:8]}) never started; submit it again"
+    refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
