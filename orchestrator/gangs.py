@@ -6,6 +6,7 @@ its ending before the gang is stopped. A controller that starts on the database 
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -32,12 +33,16 @@ from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import read_outcome
 
+log = logging.getLogger("muster.controller")
+
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
 _FAILED_GRACE = 5.0
 """The same for a gang whose collectives are broken: there is nothing left to save."""
 LOST = 20.0
 """Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
+_STOP_AGAIN = 1.0
+"""Seconds between two tries to stop a gang that the engine can't stop."""
 _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
@@ -51,6 +56,8 @@ class Gangs:
         self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
         self._stops: dict[tuple[str, int], Future[None]] = {}
         self._finished: dict[tuple[str, int], float] = {}
+        self._denied: dict[tuple[str, int], str] = {}
+        """Why the engine could not stop an attempt's gang when it was last asked."""
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
         """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
@@ -183,6 +190,7 @@ class Gangs:
                 self.engine.stop(handle, grace)
                 done.set_result(None)
             except BaseException as error:
+                time.sleep(_STOP_AGAIN)
                 done.set_exception(error)
             self.changed()
 
@@ -241,18 +249,28 @@ class Gangs:
         return ends
 
     def _stopped(self, job: Job, attempt: Attempt) -> bool:
-        """Stop the gang in the background; True once no process of it is left."""
+        """Stop the gang in the background; True once no process of it is left. Where the engine can't, the job says why."""
         key = (job.id, attempt.number)
         if key not in self._stops:
             grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
             assert attempt.handle is not None
             self._stops[key] = self._stop(attempt.handle, grace)
-        if not self._stops[key].done():
-            return False
-        self._finished.pop(key, None)
-        self.bus.forget(*key)
-        self._stops.pop(key).result()
-        return True
+        if self._stops[key].done():
+            error = self._stops.pop(key).exception()
+            if error is None:
+                self._finished.pop(key, None)
+                self._denied.pop(key, None)
+                self.bus.forget(*key)
+                return True
+            if not isinstance(error, EngineError):
+                raise error
+            said = f"attempt {attempt.number} can't be stopped: {' '.join(str(error).split())}; trying again"
+            if self._denied.get(key) != said:  # said once, not at every try
+                log.error("job %s: %s", job.id, said)
+            self._denied[key] = said
+        if key in self._denied:
+            job.status_reason = self._denied[key]
+        return False
 
     def _close(
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
