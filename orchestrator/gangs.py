@@ -41,12 +41,12 @@ _FAILED_GRACE = 5.0
 """The same for a gang whose collectives are broken: there is nothing left to save."""
 LOST = 20.0
 """Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
-_STOP_AGAIN = 1.0
-"""Seconds between two tries to stop a gang that the engine can't stop."""
 _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
 """An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+_STOP_AGAIN = 2.0
+"""Seconds after which a gang that could not be stopped is asked again."""
 
 
 class Gangs:
