@@ -17,7 +17,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.accounting import add_usage, charge, resource_seconds
-from orchestrator.admission import DEFAULT_DECAY, placements_of
+from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
@@ -78,11 +78,7 @@ class Gangs:
             return
         if job.first_epoch is None:
             job.first_epoch = epoch
-        nodes = [
-            {"index": i, "host": p.host, "gpus": list(p.gpus), "cpus": p.cpus, "memory": p.memory}
-            for i, p in enumerate(start.placements)
-        ]
-        number = len(job.attempts) + 1
+        number, nodes = len(job.attempts) + 1, node_records(start.placements)
         attempt = Attempt(job_id=job.id, number=number, epoch=epoch, pool=start.pool, nodes=nodes, created_at=now())
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
@@ -105,7 +101,7 @@ class Gangs:
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         needs = gang_needs(job.node_properties)
         try:
-            attempt.handle = self.engine.launch(self.engine.plan(self._gang(session, job, attempt, needs)))
+            attempt.handle = self.engine.launch(self.engine.plan(self.gang(session, job, attempt, needs)))
         except NotYet as wait:
             if job.stop_reason is None or wait.unknown:
                 job.status_reason = str(wait)
@@ -115,7 +111,8 @@ class Gangs:
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
 
-    def _gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+    def gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+        """What the engine is given to start an attempt."""
         nodes = needs.nodes[: len(attempt.nodes)]
         pool = attempt.pool or "local"
         return Gang(

@@ -138,7 +138,7 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
     typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    Console(soft_wrap=True).print(table)
+    _print_table(table)
     if plan["document"]:
         typer.echo(f"\n{plan['document']}")
 
@@ -174,7 +174,11 @@ def list_jobs(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
             escape(" ".join(reason.split())),  # a compiler's message has lines, and brackets that are no markup
         )
-    # one line a job: cut to the terminal's width, whole for another program
+    _print_table(table)
+
+
+def _print_table(table: Table) -> None:
+    """One line a row: cut, or folded where a column says so, to the terminal's width, whole for another program."""
     (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)
 
 

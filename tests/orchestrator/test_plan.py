@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.client import ApiError
-from tests.conftest import Serving
+from tests.conftest import Serving, run_muster
 
 SPEC = "job_specs/cartpole.yaml"
 
@@ -27,6 +27,33 @@ def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Se
     assert plan["registerJobDefinition"]["nodeProperties"]["numNodes"] == 3
     assert server.client.batch("DescribeJobDefinitions")["jobDefinitions"] == []
     assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
+
+
+def test_the_whole_command_is_there_where_nobody_sees_a_terminal(server: Serving) -> None:
+    whole = "python -P my_train.py " + " ".join(f"--option-{number}=value" for number in range(12))
+    (server.home / "job.yaml").write_text(
+        f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
+    )
+    narrow = run_muster("submit", str(server.home / "job.yaml"), "--dry-run", home=server.home, COLUMNS="80")
+    assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
+
+
+def test_a_plan_is_made_of_what_a_submission_would_be_given(server: Serving) -> None:
+    """With where the bus of the controller is, but not its password."""
+    seen = server.home / "seen"
+    script = f"import json, os; json.dump(dict(os.environ), open('{seen}', 'w'))"
+    (server.home / "job.yaml").write_text(
+        json.dumps({"name": "same", "priority": 7, "resources": {"cpus": 0.1}, "command": ["python", "-c", script]})
+    )
+    [node] = json.loads(server.muster("submit", str(server.home / "job.yaml"), "--dry-run", "--json").stdout)["nodes"]
+    job = json.loads(server.muster("submit", str(server.home / "job.yaml"), "--json").stdout)["jobId"]
+    assert server.wait(job)["status"] == "SUCCEEDED"
+    found, own = json.loads(seen.read_text()), {"MASTER_PORT", "MUSTER_ADDRESS", "MASTER_ADDR", "MUSTER_GANG"}
+    planned = {name: value for name, value in node["environment"].items() if name not in own}
+    differing = {name: value for name, value in planned.items() if found.get(name) != value}
+    assert differing.pop("MUSTER_BUS_TOKEN") == "…" and planned["MUSTER_BUS"] == found["MUSTER_BUS"]
+    assert differing.pop("MUSTER_RUN") == "run"
+    assert all(value.partition("#")[0] == "job" for value in differing.values()), differing
 
 
 def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
