@@ -138,7 +138,10 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
     typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    _print_table(table)
+    whole = Console(width=_WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
+    with whole.capture() as printed:
+        whole.print(table)
+    typer.echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
     if plan["document"]:
         typer.echo(f"\n{plan['document']}")
 
@@ -174,11 +177,7 @@ def list_jobs(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
             escape(" ".join(reason.split())),  # a compiler's message has lines, and brackets that are no markup
         )
-    _print_table(table)
-
-
-def _print_table(table: Table) -> None:
-    """One line a row: cut, or folded where a column says so, to the terminal's width, whole for another program."""
+    # one line a job: cut to the terminal's width, whole for another program
     (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)
 
 

@@ -29,7 +29,7 @@ def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Se
     assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
 
 
-def test_the_whole_command_is_there_where_nobody_sees_a_terminal(server: Serving) -> None:
+def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving) -> None:
     whole = "python -P my_train.py " + " ".join(f"--option-{number}=value" for number in range(12))
     (server.home / "job.yaml").write_text(
         f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
