@@ -111,6 +111,8 @@ def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
 
 def engine_queue(client: Client, engine: str) -> str:
     """The queue of an engine. Raises SpecError where the controller does not have it."""
+    if engine not in ENGINES:
+        raise SpecError(f"--engine {engine}: there is no such engine; there are {', '.join(ENGINES)}")
     queues: dict[str, str] = client.get("/api/capacity")["engines"]
     if engine not in queues:
         raise SpecError(

@@ -370,6 +370,9 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "aws.json").write_text('{"regoin": "eu-west-1"}')
     with pytest.raises(EngineError, match=r"unknown key regoin; valid: .*region"):
         AwsBatchEngine(tmp_path)
+    (tmp_path / "aws.json").write_text('{"region": "us-east-1", "job_queue": "q", "image": "i", "poll": "2"}')
+    with pytest.raises(EngineError, match=r'aws\.json: poll: expected a number, found "2"$'):
+        AwsBatchEngine(tmp_path)
 
 
 def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 from pathlib import Path
 
+import httpx
 import pytest
 
 from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
@@ -130,6 +131,25 @@ def test_commands_without_a_controller_say_how_to_start_one(tmp_path: Path) -> N
         holder.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{holder.getsockname()[1]}"
         refused(["list"], tmp_path, 1, f"no controller answers at {url}", "muster serve", MUSTER_URL=url)
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://"])
+def test_what_is_no_url_is_said(tmp_path: Path, url: str) -> None:
+    refused(["list"], tmp_path, 1, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
+
+
+def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving) -> None:
+    refused(
+        ["submit", "job_specs/cartpole.yaml", "--engine", "rya"],
+        shared_server.home,
+        2,
+        "--engine rya: there is no such engine; there are local, docker, ray, slurm, aws-batch",
+    )
+
+
+def test_a_browser_is_sent_to_the_api_s_pages(shared_server: Serving) -> None:
+    answer = httpx.get(f"{shared_server.url}/", follow_redirects=True, trust_env=False)
+    assert answer.status_code == 200 and answer.url.path == "/api/docs"
 
 
 def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
