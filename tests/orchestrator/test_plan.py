@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from orchestrator.client import ApiError
-from tests.conftest import Serving, run_muster
+from orchestrator.client import ApiError, Client
+from orchestrator.definition import compile_definition, compile_submission
+from orchestrator.engines.base import Gang, Plan
+from orchestrator.engines.local import LocalEngine
+from orchestrator.server import Server
+from orchestrator.spec import validate
+from tests.conftest import Serving, run_muster, wait_for
 
 SPEC = "job_specs/cartpole.yaml"
 
@@ -38,22 +44,31 @@ def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving)
     assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
 
 
-def test_a_plan_is_made_of_what_a_submission_would_be_given(server: Serving) -> None:
-    """With where the bus of the controller is, but not its password."""
-    seen = server.home / "seen"
-    script = f"import json, os; json.dump(dict(os.environ), open('{seen}', 'w'))"
-    (server.home / "job.yaml").write_text(
-        json.dumps({"name": "same", "priority": 7, "resources": {"cpus": 0.1}, "command": ["python", "-c", script]})
-    )
-    [node] = json.loads(server.muster("submit", str(server.home / "job.yaml"), "--dry-run", "--json").stdout)["nodes"]
-    job = json.loads(server.muster("submit", str(server.home / "job.yaml"), "--json").stdout)["jobId"]
-    assert server.wait(job)["status"] == "SUCCEEDED"
-    found, own = json.loads(seen.read_text()), {"MASTER_PORT", "MUSTER_ADDRESS", "MASTER_ADDR", "MUSTER_GANG"}
-    planned = {name: value for name, value in node["environment"].items() if name not in own}
-    differing = {name: value for name, value in planned.items() if found.get(name) != value}
-    assert differing.pop("MUSTER_BUS_TOKEN") == "…" and planned["MUSTER_BUS"] == found["MUSTER_BUS"]
-    assert differing.pop("MUSTER_RUN") == "run"
-    assert all(value.partition("#")[0] == "job" for value in differing.values()), differing
+def test_a_plan_is_made_of_what_a_submission_would_be_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, given = LocalEngine.plan, []
+
+    def noted(engine: LocalEngine, gang: Gang) -> Plan:
+        given.append(gang)
+        return plan(engine, gang)
+
+    monkeypatch.setattr(LocalEngine, "plan", noted)
+    train = {"task": "Cartpole", "worlds": 4, "iterations": 1}
+    spec = validate({"name": "same", "priority": 7, "timeout": "1h", "stall_timeout": "3m", "train": train}, "test")
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
+            client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
+            client.batch("SubmitJob", **compile_submission(spec, "same"))
+            wait_for(lambda: len(given) == 2, 30, "the launch")
+    finally:
+        server.close()
+    planned, submitted = given
+    assert (planned.priority, planned.stall_timeout, planned.timeout) == (7, 180.0, 3600)
+    assert planned.bus == submitted.bus and planned.bus_token == "…", "the password is not for who only looks"
+    own = ("job", "run", "bus_token")
+    assert planned == replace(submitted, **{name: getattr(planned, name) for name in own})
 
 
 def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:
