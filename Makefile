@@ -87,6 +87,8 @@ BUILD     ?=
 REVISION  := $(shell git rev-parse HEAD 2>/dev/null)
 COMPOSE    = $(shell docker compose version >/dev/null 2>&1 && echo docker compose || echo docker-compose) \
              --project-name muster --env-file $(CURDIR)/.cluster/environment -f containers/compose.yaml
+# as compose itself looks for it
+PORT       = $(or $(MUSTER_PORT),$(shell sed -n 's/^MUSTER_PORT=//p' .cluster/environment),8080)
 
 image:
 	docker build -f containers/Dockerfile -t $(IMAGE) --build-arg EXTRAS=$(EXTRAS) --build-arg REVISION=$(REVISION) $(BUILD) .
@@ -103,14 +105,20 @@ push:
 	umask 077; random() { od -An -N24 -tx1 /dev/urandom | tr -d ' \n'; }; \
 	printf 'RAY_AUTH_TOKEN=%s\nMUSTER_TOKEN=%s\nMUSTER_WORK=%s\n' "$$(random)" "$$(random)" "$(CURDIR)" >$@
 
+# Refused before anything is started: a port that something else than this cluster's own controller has.
+# The image is always built: one of that name may be of older files, or without Ray; what has not changed is in Docker's cache.
 cluster: .cluster/environment
-	docker image inspect $(IMAGE) >/dev/null 2>&1 || $(MAKE) image
-	$(COMPOSE) up --detach --scale worker=$(NODES)
+	@if ! docker ps --quiet --filter label=com.docker.compose.project=muster --filter publish=$(PORT) | grep -q . \
+	  && command -v $(PYTHON) >/dev/null \
+	  && ! $(PYTHON) -c 'import socket; socket.create_server(("127.0.0.1", int("$(PORT)")))' 2>/dev/null; then \
+	  echo "port $(PORT) of this machine is taken (does muster serve run?); choose another: make cluster MUSTER_PORT=8081" >&2; exit 2; fi
+	$(MAKE) image
+	MUSTER_IMAGE=$(IMAGE) $(COMPOSE) up --detach --scale worker=$(NODES)
 	@echo "waiting for the controller"; for i in $$(seq 60); do \
 	  $(COMPOSE) exec -T controller sh /muster/cluster.sh healthy 2>/dev/null && break; \
 	  test $$i -lt 60 || { $(COMPOSE) logs --tail=20; echo "the controller does not answer; its log is above" >&2; exit 1; }; sleep 2; done
 	@echo "It is up. For muster on this machine:"
-	@echo "  export MUSTER_URL=http://127.0.0.1:8080 $$(grep MUSTER_TOKEN .cluster/environment)"
+	@echo "  export MUSTER_URL=http://127.0.0.1:$(PORT) $$(grep MUSTER_TOKEN .cluster/environment)"
 
 cluster-down: .cluster/environment
 	$(COMPOSE) down --timeout 45 $(if $(VOLUMES),--volumes)

@@ -94,6 +94,14 @@ def read_pool(environment: ComputeEnvironment, first: str) -> Pool:
     return Pool(environment.name, environment.state == "ENABLED", hosts, cpus, pool_engine(environment.tags, first))
 
 
+def node_records(placements: Sequence[Placement]) -> list[dict[str, Any]]:
+    """An attempt's nodes as its record has them before they run."""
+    return [
+        {"index": index, "host": each.host, "gpus": list(each.gpus), "cpus": each.cpus, "memory": each.memory}
+        for index, each in enumerate(placements)
+    ]
+
+
 def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
     return tuple(Placement(node["host"], tuple(node["gpus"]), node["cpus"], node["memory"]) for node in attempt.nodes)
 

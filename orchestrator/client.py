@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
 
@@ -39,10 +40,21 @@ class Unreachable(Exception):
     """No controller answers; the message says where one was looked for and how to start one."""
 
 
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # of a port that there can't be
+        return False
+
+
 class Client:
     """Requests to one controller."""
 
     def __init__(self, url: str, token: str | None = None) -> None:
+        """Raises Unreachable where ``url`` is none."""
+        if not _is_url(url):
+            raise Unreachable(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {DEFAULT_URL}")
         self.url = url
         self._found = False
         self.successor: Callable[[], Client] | None = None

@@ -6,6 +6,7 @@ its ending before the gang is stopped. A controller that starts on the database 
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.accounting import add_usage, charge, resource_seconds
-from orchestrator.admission import DEFAULT_DECAY, placements_of
+from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
@@ -32,6 +33,8 @@ from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import read_outcome
 
+log = logging.getLogger("muster.controller")
+
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
 _FAILED_GRACE = 5.0
@@ -42,6 +45,8 @@ _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
 """An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+_STOP_AGAIN = 2.0
+"""Seconds after which a gang that could not be stopped is asked again."""
 
 
 class Gangs:
@@ -51,6 +56,8 @@ class Gangs:
         self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
         self._stops: dict[tuple[str, int], Future[None]] = {}
         self._finished: dict[tuple[str, int], float] = {}
+        self._denied: dict[tuple[str, int], str] = {}
+        """Why the engine could not stop an attempt's gang when it was last asked."""
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
         """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
@@ -71,11 +78,7 @@ class Gangs:
             return
         if job.first_epoch is None:
             job.first_epoch = epoch
-        nodes = [
-            {"index": i, "host": p.host, "gpus": list(p.gpus), "cpus": p.cpus, "memory": p.memory}
-            for i, p in enumerate(start.placements)
-        ]
-        number = len(job.attempts) + 1
+        number, nodes = len(job.attempts) + 1, node_records(start.placements)
         attempt = Attempt(job_id=job.id, number=number, epoch=epoch, pool=start.pool, nodes=nodes, created_at=now())
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
@@ -98,7 +101,7 @@ class Gangs:
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         needs = gang_needs(job.node_properties)
         try:
-            attempt.handle = self.engine.launch(self.engine.plan(self._gang(session, job, attempt, needs)))
+            attempt.handle = self.engine.launch(self.engine.plan(self.gang(session, job, attempt, needs)))
         except NotYet as wait:
             if job.stop_reason is None or wait.unknown:
                 job.status_reason = str(wait)
@@ -108,7 +111,8 @@ class Gangs:
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
 
-    def _gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+    def gang(self, session: Session, job: Job, attempt: Attempt, needs: GangNeeds) -> Gang:
+        """What the engine is given to start an attempt."""
         nodes = needs.nodes[: len(attempt.nodes)]
         pool = attempt.pool or "local"
         return Gang(
@@ -183,6 +187,7 @@ class Gangs:
                 self.engine.stop(handle, grace)
                 done.set_result(None)
             except BaseException as error:
+                time.sleep(_STOP_AGAIN)
                 done.set_exception(error)
             self.changed()
 
@@ -241,18 +246,28 @@ class Gangs:
         return ends
 
     def _stopped(self, job: Job, attempt: Attempt) -> bool:
-        """Stop the gang in the background; True once no process of it is left."""
+        """Stop the gang in the background; True once no process of it is left. Where the engine can't, the job says why."""
         key = (job.id, attempt.number)
         if key not in self._stops:
             grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
             assert attempt.handle is not None
             self._stops[key] = self._stop(attempt.handle, grace)
-        if not self._stops[key].done():
-            return False
-        self._finished.pop(key, None)
-        self.bus.forget(*key)
-        self._stops.pop(key).result()
-        return True
+        if self._stops[key].done():
+            error = self._stops.pop(key).exception()
+            if error is None:
+                self._finished.pop(key, None)
+                self._denied.pop(key, None)
+                self.bus.forget(*key)
+                return True
+            if not isinstance(error, EngineError):
+                raise error
+            said = f"attempt {attempt.number} can't be stopped: {' '.join(str(error).split())}; trying again"
+            if self._denied.get(key) != said:  # said once, not at every try
+                log.error("job %s: %s", job.id, said)
+            self._denied[key] = said
+        if key in self._denied:
+            job.status_reason = self._denied[key]
+        return False
 
     def _close(
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]

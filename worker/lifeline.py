@@ -20,6 +20,8 @@ PORT = 29499
 """Where the main node listens: below the port of torch.distributed."""
 _IDLE, _INTERVAL, _PROBES = 5, 5, 3
 """Keepalive: a host that is gone is noticed after ``_IDLE + _INTERVAL * _PROBES`` seconds."""
+_WORDS = {"gang": str, "node": int, "code": int, "reason": str}
+"""What a child says; anything else is a stranger's."""
 _ARRIVAL = 1800.0
 """Seconds that a child may take to come after the main node: its instance pulls an image of many gigabytes."""
 
@@ -56,7 +58,7 @@ class MainEnd:
         found = None
         for line in list(self._lines):
             there = line.read()
-            ours = line.told.get("gang") == self._gang
+            ours = line.told.get("gang") == self._gang and "node" in line.told
             if ours:
                 self._missing.discard(line.told["node"])
             if not there:
@@ -72,7 +74,7 @@ def _loss(told: dict[str, Any]) -> Loss | None:
     code = told.get("code")
     if code is None:
         return Loss(f"node {told['node']} vanished: its supervisor or its host died", 1)
-    return Loss(f"node {told['node']}: {told['reason']}", int(code)) if code not in (0, EX_TEMPFAIL) else None
+    return Loss(f"node {told['node']}: {told.get('reason', '')}", code) if code not in (0, EX_TEMPFAIL) else None
 
 
 class _Line:
@@ -93,8 +95,10 @@ class _Line:
             while chunk := self._connection.recv(65536):
                 *whole, self._partial = (self._partial + chunk).split(b"\n")
                 for line in whole:
-                    with contextlib.suppress(ValueError, TypeError):  # a stranger
-                        self.told |= json.loads(line)
+                    with contextlib.suppress(ValueError, RecursionError):  # a stranger
+                        words = json.loads(line)
+                        if isinstance(words, dict) and all(type(words[key]) is _WORDS.get(key) for key in words):
+                            self.told |= words
         except BlockingIOError:
             return True
         except OSError:

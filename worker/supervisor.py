@@ -188,6 +188,9 @@ class Supervisor:
     def _order_save(self, command: Command) -> None:
         """Ask the ranks to save now (SIGUSR2); the answer follows when the first save after that is durable."""
         rank = self.ranks[0]
+        if rank.running and rank.heard is None and self.contract.stall_timeout is not None:  # which only a training has
+            command.reply(f"job {self.contract.job[:8]} has not begun its first iteration: nothing to save yet")
+            return
         if not rank.running or rank.heard is None:
             command.reply("not training: there is nothing to save now")
             return

@@ -9,7 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -62,6 +62,11 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
         if request.method == "DELETE":
             body = {"tagKeys": request.query_params.getlist("tagKeys")}
         return JSONResponse(await run_in_threadpool(batch.call, controller, name, {**body, "resourceArn": arn}))
+
+    @app.get("/", include_in_schema=False)
+    def front() -> RedirectResponse:
+        """For a person with a browser: the API's pages are all that there is to see."""
+        return RedirectResponse("/api/docs")
 
     @app.post("/", include_in_schema=False)
     async def cloudwatch_logs(request: Request) -> Response:

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from orchestrator.api.arns import plain_name
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
+from orchestrator.jobs import Status
 from orchestrator.tables import Job, JobDefinition, JobQueue
 from shared_store.layout import Run, StoreError
 
@@ -57,12 +58,19 @@ class Context:
 
 
 def find_run(controller: Controller, name: str) -> Run:
-    """The run called ``name``. Raises ClientError (404) naming the nearest one that exists."""
+    """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run."""
     try:
         run = controller.store.run(name)
     except StoreError as error:
         raise ClientError(str(error)) from None
     if run.description() is None:
+        with controller.database.session() as session:
+            query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
+            job = session.scalars(query.limit(1)).first()
+            if job is not None:
+                over = Status(job.status).is_terminal
+                what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
+                raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
         runs = [each.name for each in controller.store.runs()]
         nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
         others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"

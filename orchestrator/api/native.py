@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from fastapi import APIRouter, Header, Request
@@ -17,6 +17,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
+from orchestrator.admission import node_records
 from orchestrator.api import auth, rules, runs
 from orchestrator.api.batch import validate
 from orchestrator.api.context import find_run
@@ -26,11 +27,10 @@ from orchestrator.controller import Controller
 from orchestrator.database import find_job
 from orchestrator.definition import gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
-from orchestrator.gangs import GRACE
 from orchestrator.jobs import Status
-from orchestrator.pools import engine_options, own_queues, queue_engines
+from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
-from orchestrator.tables import Job, JobQueue
+from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
@@ -106,34 +106,21 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         queue = session.get(JobQueue, body.queue)
         if queue is None:
             raise ClientError(f"there is no queue {body.queue!r}")
-        pool = queue.environments[0]
-        options = engine_options(session, pool, queue.name)
-    placements = place(needs.shape, hosts)
-    if placements is None:
-        raise ClientError(str(never_fits(needs.shape, hosts)))
-    planned = _planned(
-        controller,
-        Gang(
-            job="job",
-            attempt=1,
-            epoch=1,
-            job_epoch=1,
+        placements = place(needs.shape, hosts)
+        if placements is None:
+            raise ClientError(str(never_fits(needs.shape, hosts)))
+        job = Job(
+            id="job",
+            name=definition["jobDefinitionName"],
+            queue=queue.name,
+            kind="multinode",
             run=needs.setting("MUSTER_RUN") or "run",
-            store=str(controller.store.path),
-            queue=body.queue,
-            pool=pool,
-            main=needs.main,
-            commands=[node.command for node in needs.nodes],
-            environments=[node.environment for node in needs.nodes],
-            placements=placements,
-            grace=GRACE,
-            directory=needs.setting("MUSTER_DIRECTORY") or None,
-            containers=[node.container for node in needs.nodes],
-            title=definition["jobDefinitionName"],
             timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
-            options=options,
-        ),
-    )
+            priority=definition.get("schedulingPriority", 0),
+        )
+        attempt = Attempt(number=1, epoch=1, pool=queue.environments[0], nodes=node_records(placements))
+        gang = controller.gangs.gang(session, job, attempt, needs)  # neither of them is stored
+    planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
         {
             "index": node.contract.node_index,

@@ -111,6 +111,8 @@ def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
 
 def engine_queue(client: Client, engine: str) -> str:
     """The queue of an engine. Raises SpecError where the controller does not have it."""
+    if engine not in ENGINES:
+        raise SpecError(f"--engine {engine}: there is no such engine; there are {', '.join(ENGINES)}")
     queues: dict[str, str] = client.get("/api/capacity")["engines"]
     if engine not in queues:
         raise SpecError(
@@ -138,7 +140,10 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
     typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    Console(soft_wrap=True).print(table)
+    whole = Console(width=_WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
+    with whole.capture() as printed:
+        whole.print(table)
+    typer.echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
     if plan["document"]:
         typer.echo(f"\n{plan['document']}")
 

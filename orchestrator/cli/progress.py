@@ -26,7 +26,7 @@ def follow(client: Client, job_id: str) -> int:
     if detail["kind"] != "train":
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
-    seen, reason = 0, None
+    seen, reason, attempts = 0, None, []
     with display:
         while True:
             try:
@@ -38,7 +38,7 @@ def follow(client: Client, job_id: str) -> int:
                     display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
                 records = (
                     client.get(f"/api/runs/{detail['run']}/metrics", after=seen)
-                    if job["status"] not in ("SUBMITTED", "RUNNABLE")
+                    if attempts  # a job that never started, even one that is over, has no run
                     else []
                 )
             except Unreachable:

@@ -78,7 +78,7 @@ class AwsBatchEngine:
     address: str | None = None  # nodes on AWS do not reach this machine
 
     def __init__(self, home: Path) -> None:
-        """Raises EngineError: there is no configuration, or there are no credentials. AWS itself is not asked yet."""
+        """Raises EngineError: there is no configuration, AWS does not answer, or it does not know the credentials or the queue."""
         self.config = load_config(home)
         try:
             session = boto3.Session(region_name=self.config.region, profile_name=self.config.profile)
@@ -97,6 +97,7 @@ class AwsBatchEngine:
         self._hosts: dict[str, tuple[float, Host]] = {}
         self._gangs: dict[str, _Watched] = {}
         self._lock = threading.Lock()
+        self._check_queue()
 
     def capacity(self) -> Sequence[Host]:
         """One host: what the queue's compute environments may grow to.
@@ -172,6 +173,22 @@ class AwsBatchEngine:
             watched.logs.finish()
         while len(self._gangs) > _REMEMBERED and next(iter(self._gangs)) != facts["gang"]:
             del self._gangs[next(iter(self._gangs))]
+
+    def _check_queue(self) -> None:
+        """Later AWS may be away for a while, and a gang waits for it; what is wrong from the start would wait for ever."""
+        queue, where = self.config.job_queue, self.config.endpoint_url or self.config.region
+        try:
+            found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
+        except ClientError as error:
+            raise EngineError(f"AWS Batch ({where}) refuses: {_words(error)}; see `aws configure`") from None
+        except (BotoCoreError, ResponseParserError) as error:
+            raise EngineError(
+                f"AWS Batch ({where}) does not answer: {error}; see region and endpoint_url in aws.json"
+            ) from None
+        if not found:
+            raise EngineError(
+                f"AWS Batch ({where}) has no job queue {queue}; see `muster aws status`, or make it with `muster aws up`"
+            )
 
     # -- starting -----------------------------------------------------------------------------------------------------
 

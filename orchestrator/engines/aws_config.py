@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from orchestrator.engines.base import EngineError
 
@@ -58,6 +58,14 @@ class AwsConfig:
         return replace(self, **changes)
 
 
+_WORDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
+_KINDS = {
+    name: get_args(kind) or ((int, float) if kind is float else (kind,))
+    for name, kind in get_type_hints(AwsConfig).items()
+}
+"""The types of a key's values."""
+
+
 def config_path(home: Path) -> Path:
     return home / "aws.json"
 
@@ -67,9 +75,15 @@ def load_config(home: Path) -> AwsConfig:
     path = config_path(home)
     try:
         told = json.loads(path.read_text())
+        if not isinstance(told, dict):
+            raise EngineError(f"{path}: expected a mapping; `muster aws up` writes it anew")
         known = {field.name for field in fields(AwsConfig)}
         if unknown := set(told) - known:
             raise EngineError(f"{path}: unknown key {min(unknown)}; valid: {', '.join(sorted(known))}")
+        for name, kinds in _KINDS.items():
+            if name in told and type(told[name]) not in kinds:
+                wanted = _WORDS[float if float in kinds else kinds[0]]
+                raise EngineError(f"{path}: {name}: expected {wanted}, found {json.dumps(told[name])}")
         return AwsConfig(**told)
     except FileNotFoundError:
         raise EngineError(

@@ -8,8 +8,12 @@ from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
 
-PRIVATE = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE")
-"""Variables of the controller that a job does not get."""
+PRIVATE = (
+    *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE"),
+    *("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_SECURITY_TOKEN"),
+    *("AWS_CONTAINER_AUTHORIZATION_TOKEN", "RAY_AUTH_TOKEN"),
+)
+"""Variables of the controller that a job does not get: what it speaks to its database and its engines with."""
 
 
 class EngineError(Exception):

@@ -100,7 +100,7 @@ class LocalEngine:
 
     def _start(self, plan: Plan, index: int, port: int) -> int:
         node = plan.nodes[index]
-        inherited = {name: value for name, value in os.environ.items() if name not in PRIVATE}
+        inherited = {name: value for name, value in os.environ.items() if name not in (*PRIVATE, "SLURM_JWT")}
         contract = {**node.contract.to_env(), "MASTER_PORT": str(port)}
         env = {
             **inherited,

@@ -99,7 +99,10 @@ def _why_no_watch(code: int, errors: Sequence[str]) -> str:
 
 def ray_environment(head: str) -> dict[str, str]:
     """For a process that imports Ray: always with an explicit word about the token, since Ray aborts where sides differ."""
-    inherited = {name: value for name, value in os.environ.items() if name not in PRIVATE and not name.startswith("PG")}
+    withheld = {*PRIVATE} - {"RAY_AUTH_TOKEN"}
+    inherited = {
+        name: value for name, value in os.environ.items() if name not in withheld and not name.startswith("PG")
+    }
     known = any(inherited.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
     mode = "token" if known or (Path.home() / ".ray" / "auth_token").exists() else "disabled"
     return {"RAY_AUTH_MODE": mode, **inherited, "RAY_ADDRESS": head, "RAY_USAGE_STATS_ENABLED": "0"}

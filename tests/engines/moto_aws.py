@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from moto.batch import models as batch
+from moto.cloudformation.parsing import ResourceMap
 from moto.ec2.models import ec2_backends
 from moto.ec2.models.route_tables import RouteTable
 from moto.efs.models import AccessPoint
@@ -35,6 +36,31 @@ def _definition(
     )
 
 
+_environment_of = batch.ComputeEnvironment.create_from_cloudformation_json.__func__
+
+
+def _environment(
+    cls: Any, resource_name: str, cloudformation_json: dict[str, Any], account_id: str, region_name: str, **_: Any
+) -> Any:
+    """moto wants a service role; AWS takes its service-linked one, which it makes with the first compute environment."""
+    roles = batch.batch_backends[account_id][region_name].iam_backend
+    made = (role for role in roles.roles.values() if role.name == "AWSServiceRoleForBatch")
+    role = next(made, None) or roles.create_service_linked_role("batch.amazonaws.com", "", "")
+    properties = {"ServiceRole": role.arn, **cloudformation_json["Properties"]}
+    return _environment_of(cls, resource_name, {"Properties": properties}, account_id, region_name)
+
+
+_delete = ResourceMap.delete
+
+
+def _delete_stack(resources: ResourceMap) -> None:
+    """moto does not know the newer word for a resource that outlives its stack, where that was ever whole."""
+    for resource in resources._resource_json_map.values():
+        if resource.get("DeletionPolicy") == "RetainExceptOnCreate":
+            resource["DeletionPolicy"] = "Retain"
+    _delete(resources)
+
+
 @contextmanager
 def moto_server() -> Iterator[str]:
     """The URL of a moto that has no account's state yet."""
@@ -42,6 +68,8 @@ def moto_server() -> Iterator[str]:
     AccessPoint.physical_resource_id = property(lambda point: point.access_point_id)  # what `Ref` of one gives
     RouteTable.delete = lambda table, account, region: ec2_backends[account][region].route_tables.pop(table.id, None)
     batch.JobDefinition.create_from_cloudformation_json = classmethod(_definition)
+    batch.ComputeEnvironment.create_from_cloudformation_json = classmethod(_environment)
+    ResourceMap.delete = _delete_stack
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     try:

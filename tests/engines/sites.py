@@ -136,16 +136,18 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
     """A second Muster plays AWS; its nodes write to a volume that the controller does not see."""
     from orchestrator.engines.aws_config import AwsConfig, save_config
 
-    os.environ.update(AWS_ACCESS_KEY_ID="any", AWS_SECRET_ACCESS_KEY="any")
-    aws = Serving(home / "aws", "--cpus", "8")
-    try:
-        settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
-        told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
-        (home / "home").mkdir()
-        save_config(home / "home", AwsConfig(**told))
-        yield from _served("aws-batch", home / "home", volume=home / "volume")
-    finally:
-        aws.close()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "any")
+        aws = Serving(home / "aws", "--cpus", "8")
+        try:
+            settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
+            told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url}
+            (home / "home").mkdir()
+            save_config(home / "home", AwsConfig(**told, **settings))
+            yield from _served("aws-batch", home / "home", volume=home / "volume")
+        finally:
+            aws.close()
 
 
 def _served(engine: str, home: Path, *options: str, volume: Path | None = None, **needs: Any) -> Iterator[Site]:

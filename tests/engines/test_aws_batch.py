@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import boto3
 import pytest
 
 from orchestrator.engines.aws_batch import AwsBatchEngine
@@ -21,7 +22,7 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
-from tests.conftest import Serving, processes_of, wait_for
+from tests.conftest import Serving, processes_of, run_muster, wait_for
 from tests.engines.sites import POLITE, WAIT
 
 JOB = "6f1d0c5e-0000-4000-8000-00000000aaaa"
@@ -331,7 +332,9 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -
     assert said.startswith("AWS Batch: ") and "CPUs" in said
     host = bench.engine.capacity()[0]
     assert (host.name, host.single) == ("aws-batch/default", False) and host.cpus > 0
-    away = Bench(bench.aws, bench.home, endpoint_url="http://127.0.0.1:9")
+    away = Bench(bench.aws, bench.home)
+    nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
+    away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
     [node] = away.engine.observe(handle)
     assert node.running and "does not answer" in node.waiting
     with pytest.raises(NotYet, match="does not answer"):
@@ -367,6 +370,28 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "aws.json").write_text('{"regoin": "eu-west-1"}')
     with pytest.raises(EngineError, match=r"unknown key regoin; valid: .*region"):
         AwsBatchEngine(tmp_path)
+    (tmp_path / "aws.json").write_text('{"region": "us-east-1", "job_queue": "q", "image": "i", "poll": "2"}')
+    with pytest.raises(EngineError, match=r'aws\.json: poll: expected a number, found "2"$'):
+        AwsBatchEngine(tmp_path)
+
+
+def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match=r"127\.0\.0\.1:9\) does not answer: .*endpoint_url in aws\.json"):
+        Bench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
+    with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
+        Bench(aws, tmp_path / "queue", job_queue="robots")
+    assert run_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
+    keyed = Serving(tmp_path / "keyed")
+    try:
+        with pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
+            Bench(keyed, tmp_path / "credentials")
+    finally:
+        keyed.close()
+
+
+def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: Bench) -> None:
+    examined = run_muster("doctor", "--engine", "aws-batch", home=bench.home)
+    assert examined.returncode == 0 and "ok  engine aws-batch 1 host" in examined.stdout, examined.stdout
 
 
 YAML = """

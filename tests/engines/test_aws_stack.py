@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import subprocess
@@ -96,6 +97,7 @@ def test_the_template_is_clean() -> None:
     linter = Path(sys.executable).parent / "cfn-lint"
     done = subprocess.run([linter, "--include-checks", "I", "--", str(TEMPLATE)], capture_output=True, text=True)
     problems = [line for line in done.stdout.splitlines() if line[:1] in "EW"]
+    assert done.returncode == 0, done.stdout + done.stderr
     assert problems == [] and TEMPLATE.stat().st_size < 51_200, (problems, "CloudFormation takes no more in a request")
 
 
@@ -180,11 +182,19 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
     assert data["NetworkInterfaces"][0]["InterfaceType"] == "efa"
 
 
+def test_the_compute_environment_can_be_changed_where_it_is_and_a_failed_create_leaves_no_volume() -> None:
+    """What moto allows and AWS does not: an update in place with a service role of one's own."""
+    environment, volume = _resource("ComputeEnvironment"), _resource("FileSystem")
+    assert "ReplaceComputeEnvironment: false" in environment
+    assert not [line for line in environment if line.startswith("ServiceRole:")]
+    assert {"DeletionPolicy: RetainExceptOnCreate", "UpdateReplacePolicy: Retain"} <= set(volume)
+
+
 def test_roles_allow_no_more_than_they_must(account: Account) -> None:
     iam = account.client("iam")
     unlimited = {"batch:Describe", "batch:ListJobs", "ecr:GetAuthorizationToken"}
     documents = []
-    for logical in ("JobRole", "InstanceRole", "WorkstationRole", "BatchServiceRole"):
+    for logical in ("JobRole", "InstanceRole", "WorkstationRole"):
         role = account.physical(logical)
         for name in iam.list_role_policies(RoleName=role)["PolicyNames"]:
             documents.append(iam.get_role_policy(RoleName=role, PolicyName=name)["PolicyDocument"])
@@ -325,3 +335,15 @@ def _section(name: str) -> list[str]:
     start = lines.index(f"{name}:") + 1
     end = next((number for number in range(start, len(lines)) if lines[number][:1].isalpha()), len(lines))
     return lines[start:end]
+
+
+def _resource(name: str) -> list[str]:
+    """Lines of one resource, without indentation and comments."""
+    lines = iter(_section("Resources"))
+    found = []
+    for line in lines:
+        if line.startswith(f"  {name}:"):
+            found = [
+                each.partition(" #")[0].strip() for each in itertools.takewhile(lambda each: each[2:3] == " ", lines)
+            ]
+    return found

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines import ENGINES, make_engine
+from orchestrator.engines import ENGINES, make_engine, slurm_commands
 from orchestrator.engines.base import EngineError
+from orchestrator.engines.ray_cluster import ray_environment
 from tests.conftest import run_muster
 from tests.engines.slurm_cluster import need_slurm
 
@@ -50,3 +51,14 @@ def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
     assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
     with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):
         make_engine("kubernetes", tmp_path)
+
+
+def test_what_an_engine_s_own_commands_hand_on_to_jobs_is_without_the_other_engines_secrets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"):
+        monkeypatch.setenv(name, "secret")
+    assert {name for name, value in slurm_commands.environment().items() if value == "secret"} == {"SLURM_JWT"}
+    assert {name for name, value in ray_environment("h:1").items() if value == "secret"} == {
+        *("RAY_AUTH_TOKEN", "SLURM_JWT")
+    }

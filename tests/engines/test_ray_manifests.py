@@ -45,6 +45,21 @@ def test_the_launcher_s_file_holds_ray_s_own_schema_and_muster_is_told_how_far_i
     assert "--env=RAY_AUTH_MODE=token" in config["docker"]["run_options"]
 
 
+def test_the_image_has_what_ray_s_launcher_needs_in_it() -> None:
+    """``bash --login`` for every command, rsync into the container, ssh and boto3 on the head, and a volume that its user may write."""
+    config, text = load("cluster.yaml"), (MANIFESTS / "cluster.yaml").read_text()
+    dockerfile = (REPOSITORY / "containers" / "Dockerfile").read_text()
+    packages = re.search(r"apt-get install -y --no-install-recommends (.*?) \\\n", dockerfile)
+    assert packages and {"openssh-client", "rsync"} <= set(packages[1].split())
+    path = re.search(r"^ENV PATH=(\S+):\$PATH", dockerfile, re.MULTILINE)
+    assert path and f"echo 'export PATH={path[1]}:$PATH' >/etc/profile.d/muster.sh" in dockerfile
+    assert "EXTRAS=worker,ray,aws" in text
+    commands = config["initialization_commands"]
+    mounting = next(index for index, command in enumerate(commands) if "mount -t nfs4" in command)
+    image = config["docker"]["image"]
+    assert f"sudo chown $(docker run --rm {image} id -u) /muster /muster/ray-token" in commands[mounting + 1 :]
+
+
 def test_the_kuberay_manifest_is_a_raycluster_whose_nodes_share_token_and_volume() -> None:
     manifest = load("raycluster.yaml")
     assert (manifest["apiVersion"], manifest["kind"]) == ("ray.io/v1", "RayCluster")

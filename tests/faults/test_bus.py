@@ -190,6 +190,16 @@ def test_training_does_not_notice_a_controller_that_is_killed_and_comes_back(ser
     assert server.muster("stop", job["id"]).returncode == 0
 
 
+def test_a_training_that_still_starts_has_nothing_to_save(server: Serving) -> None:
+    starts = {"MUSTER_STALL_TIMEOUT": "300", "MUSTER_ON_CHILD_FAILURE": "restart"}  # as a training has them
+    job = server.gang("import time; time.sleep(600)", env=starts)
+    server.wait(job, "RUNNING")
+    wait_for(lambda: server.muster("stacks", job).returncode == 0, 30, "the node on the bus")
+    said = server.muster("checkpoint", job)
+    assert said.stdout == f"job {job[:8]} has not begun its first iteration: nothing to save yet\n"
+    assert said.returncode == 1
+
+
 def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(server: Serving) -> None:
     job = submit(server, "train.iterations=100000", "stall_timeout=4s")
     wait_for_iteration(server, job["run"], 6)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
+import subprocess
 from pathlib import Path
 
+import httpx
 import pytest
 
-from tests.conftest import REPOSITORY, Serving, run_muster, wait_for
+from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
 
 
 def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
@@ -130,6 +133,25 @@ def test_commands_without_a_controller_say_how_to_start_one(tmp_path: Path) -> N
         refused(["list"], tmp_path, 1, f"no controller answers at {url}", "muster serve", MUSTER_URL=url)
 
 
+@pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://"])
+def test_what_is_no_url_is_said(tmp_path: Path, url: str) -> None:
+    refused(["list"], tmp_path, 1, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
+
+
+def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving) -> None:
+    refused(
+        ["submit", "job_specs/cartpole.yaml", "--engine", "rya"],
+        shared_server.home,
+        2,
+        "--engine rya: there is no such engine; there are local, docker, ray, slurm, aws-batch",
+    )
+
+
+def test_a_browser_is_sent_to_the_api_s_pages(shared_server: Serving) -> None:
+    answer = httpx.get(f"{shared_server.url}/", follow_redirects=True, trust_env=False)
+    assert answer.status_code == 200 and answer.url.path == "/api/docs"
+
+
 def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
     home = shared_server.home
     refused(["show", "nonsense"], home, 2, "job nonsense does not exist")
@@ -182,3 +204,25 @@ def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -
     assert done.returncode == 0, done.stdout + done.stderr
     for rank in range(3):
         assert f"rank {rank} of 3 on node {rank}: sum = 6, expected 6" in done.stdout
+
+
+def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Serving) -> None:
+    full = server.gang("import time; time.sleep(600)", cpus="4")
+    server.wait(full, "RUNNING")
+    running = subprocess.Popen(
+        [MUSTER, "run", "job_specs/cartpole.yaml"],
+        env={**os.environ, "MUSTER_HOME": str(server.home)},
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stdout is not None
+    wait_for(lambda: "RUNNABLE" in running.stdout.readline(), 30, "the job waits")
+    running.send_signal(signal.SIGTERM)  # is taken as Ctrl-C is
+    said, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors) == (130, ""), said
+    assert "FAILED  cartpole (" in said and ": stopped with Ctrl-C" in said
+    [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]
+    never = f"job cartpole ({job['jobId'][:8]}) never started; submit it again"
+    refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)

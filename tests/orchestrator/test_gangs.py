@@ -6,12 +6,18 @@ import json
 import os
 import signal
 import subprocess
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.conftest import MAIN_LAST, MUSTER, Serving, parent, processes_of, wait_for
+from orchestrator.client import Client
+from orchestrator.engines.base import EngineError
+from orchestrator.engines.local import LocalEngine
+from orchestrator.server import Server
+from tests.conftest import MAIN_LAST, MUSTER, Serving, parent, processes_of, submit_gang, wait_for
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
 
@@ -228,3 +234,38 @@ def _mentions(pid: int, job: str) -> bool:
         return f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{pid}/environ").read_bytes()
     except OSError:
         return False
+
+
+def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stop, asked, allowed = LocalEngine.stop, [], threading.Event()
+
+    def stop_if_allowed(engine: LocalEngine, handle: str, grace: float) -> None:
+        asked.append(handle)
+        if not allowed.is_set():
+            raise EngineError("not authorized\nto perform TerminateJob")
+        stop(engine, handle, grace)
+
+    monkeypatch.setattr(LocalEngine, "stop", stop_if_allowed)
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+
+            def detail() -> dict[str, Any]:
+                found: dict[str, Any] = client.get(f"/api/jobs/{job}")
+                return found
+
+            job = submit_gang(client, "import time; time.sleep(600)")
+            wait_for(lambda: detail()["status"] == "RUNNING", 30, "its start")
+            client.batch("TerminateJob", jobId=job, reason="enough")
+            wait_for(lambda: len(asked) > 2, 30, "another try")
+            said = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
+            assert (detail()["status"], detail()["statusReason"]) == ("RUNNING", said)
+            allowed.set()
+            wait_for(lambda: (detail()["status"], detail()["statusReason"]) == ("FAILED", "enough"), 30, "the end")
+    finally:
+        server.close()
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {said}"]
+    assert processes_of(tmp_path) == []

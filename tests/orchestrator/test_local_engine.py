@@ -164,15 +164,22 @@ PRINT_ENVIRONMENT = "import json, os; print(json.dumps(dict(os.environ)))"
 
 
 def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = ("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD")
+    own = (
+        *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD"),
+        *("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"),  # of the other engines
+    )
     for name in own:
         monkeypatch.setenv(name, "/the/controller's/own")
     monkeypatch.setenv("INHERITED", "yes")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "the controller's")
     gang = bench.gang(
         nodes=2,
         main=1,
         commands=[["python", "-c", PRINT_ENVIRONMENT]] * 2,
-        environments=[{"MINE": "first", "MUSTER_EPOCH": "99", "RANK": "99"}, {"MINE": "second", "INHERITED": "no"}],
+        environments=[
+            {"MINE": "first", "AWS_ACCESS_KEY_ID": "the job's", "MUSTER_EPOCH": "99", "RANK": "99"},
+            {"MINE": "second", "INHERITED": "no"},
+        ],
         placements=[Placement("localhost", ("3", "1"), 2, 64), Placement("localhost", (), 0.5, 64)],
         attempt=4,
         epoch=7,
@@ -190,6 +197,7 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, m
     first, second = bench.environments(2)
     assert (first["MINE"], second["MINE"]) == ("first", "second")
     assert (first["INHERITED"], second["INHERITED"]) == ("yes", "no")
+    assert (first["AWS_ACCESS_KEY_ID"], second.get("AWS_ACCESS_KEY_ID")) == ("the job's", None)
     assert (first["CUDA_VISIBLE_DEVICES"], second["CUDA_VISIBLE_DEVICES"]) == ("3,1", "")
     assert (first["RANK"], second["RANK"]) == ("1", "0"), "the main node has rank 0, whatever its index"
     assert first["MUSTER_EPOCH"] == "7", "a job's environment can't replace the contract"

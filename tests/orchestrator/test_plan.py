@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from orchestrator.client import ApiError
-from tests.conftest import Serving
+from orchestrator.client import ApiError, Client
+from orchestrator.definition import compile_definition, compile_submission
+from orchestrator.engines.base import Gang, Plan
+from orchestrator.engines.local import LocalEngine
+from orchestrator.server import Server
+from orchestrator.spec import validate
+from tests.conftest import Serving, run_muster, wait_for
 
 SPEC = "job_specs/cartpole.yaml"
 
@@ -27,6 +33,42 @@ def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(server: Se
     assert plan["registerJobDefinition"]["nodeProperties"]["numNodes"] == 3
     assert server.client.batch("DescribeJobDefinitions")["jobDefinitions"] == []
     assert server.client.batch("ListJobs", jobQueue="default")["jobSummaryList"] == []
+
+
+def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving) -> None:
+    whole = "python -P my_train.py " + " ".join(f"--option-{number}=value" for number in range(12))
+    (server.home / "job.yaml").write_text(
+        f"name: long\nresources: {{cpus: 0.1}}\ncommand: [{whole.replace(' ', ', ')}]\n"
+    )
+    narrow = run_muster("submit", str(server.home / "job.yaml"), "--dry-run", home=server.home, COLUMNS="80")
+    assert narrow.stdout.splitlines()[2].rstrip().endswith(whole), narrow.stdout
+
+
+def test_a_plan_is_made_of_what_a_submission_would_be_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, given = LocalEngine.plan, []
+
+    def noted(engine: LocalEngine, gang: Gang) -> Plan:
+        given.append(gang)
+        return plan(engine, gang)
+
+    monkeypatch.setattr(LocalEngine, "plan", noted)
+    train = {"task": "Cartpole", "worlds": 4, "iterations": 1}
+    spec = validate({"name": "same", "priority": 7, "timeout": "1h", "stall_timeout": "3m", "train": train}, "test")
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
+            client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
+            client.batch("SubmitJob", **compile_submission(spec, "same"))
+            wait_for(lambda: len(given) == 2, 30, "the launch")
+    finally:
+        server.close()
+    planned, submitted = given
+    assert (planned.priority, planned.stall_timeout, planned.timeout) == (7, 180.0, 3600)
+    assert planned.bus == submitted.bus and planned.bus_token == "…", "the password is not for who only looks"
+    own = ("job", "run", "bus_token")
+    assert planned == replace(submitted, **{name: getattr(planned, name) for name in own})
 
 
 def test_a_job_that_fits_nowhere_has_no_plan(server: Serving) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import socket
+import time
 
 import pytest
 
@@ -48,6 +50,23 @@ def test_a_death_without_a_word_and_a_stranger() -> None:
     assert main.lost() is None
     del child
     assert heard(main).reason == "node 1 vanished: its supervisor or its host died"
+
+
+def test_what_no_child_would_say_is_passed_over() -> None:
+    main, ours = MainEnd(contract(0, 2, "127.91.0.4")), contract(0, 2, "127.91.0.4").gang
+    strangers = [
+        *({"gang": ours}, {"gang": ours, "node": "1"}, {"gang": ours, "node": None, "code": 3}),
+        *({"gang": ours, "code": "three", "reason": 3}, {"gang": ours, "more": 1}),
+    ]
+    for words in strangers:
+        with socket.create_connection(("127.91.0.4", lifeline.PORT)) as stranger:
+            stranger.sendall(json.dumps(words).encode() + b"\n")
+    for _ in range(20):
+        assert main.lost() is None
+        time.sleep(0.01)
+    with socket.create_connection(("127.91.0.4", lifeline.PORT)) as child:
+        child.sendall(json.dumps({"gang": ours, "node": 1, "code": 3}).encode() + b"\n")
+    assert heard(main) == Loss("node 1: ", 3), "one that lost half of its last word"
 
 
 def test_a_child_that_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
