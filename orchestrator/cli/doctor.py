@@ -149,6 +149,6 @@ def _controller() -> Finding:
 
 def _engine(name: str) -> str:
     with tempfile.TemporaryDirectory() as scratch:
-        hosts = make_engine(name, Path(scratch)).capacity()
+        hosts = [host for host in make_engine(name, Path(scratch)).capacity() if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{len(hosts)} host{'s' if len(hosts) != 1 else ''}, {cpus:g} CPUs, {gpus} GPUs"

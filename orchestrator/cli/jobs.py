@@ -60,10 +60,11 @@ def submit_spec(
     if spec.queue not in capacity["queues"]:
         raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")
     hosts = [
-        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"])
+        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"], host["away"])
         for host in capacity["hosts"]
     ]
-    if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
+    shape = gang_needs(definition["nodeProperties"]).shape
+    if impossible := never_fits(shape, hosts, elastic=capacity["elastic"]):
         raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))

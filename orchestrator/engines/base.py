@@ -37,10 +37,12 @@ class Host:
     """MiB."""
     single: bool = False
     """Takes one node of a gang at most."""
+    away: bool = False
+    """Takes no node now, and may again: an engine that queues is given a gang that needs it, and waits for it."""
 
     def left(self, cpus: float, gpus: tuple[str, ...], memory: int) -> Host:
         """The same host with that much of it."""
-        return Host(self.name, cpus, gpus, memory, self.single)
+        return Host(self.name, cpus, gpus, memory, self.single, self.away)
 
 
 def engine_of(host: str) -> str:
@@ -182,6 +184,8 @@ class Engine(Protocol):
     name: str
     queues: bool
     """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
+    elastic: bool
+    """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
     images: bool
     """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
     address: str | None

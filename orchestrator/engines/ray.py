@@ -41,6 +41,7 @@ class RayEngine:
 
     name = "ray"
     queues = False
+    elastic = True
     images = False
 
     def __init__(self, home: Path, address: str | None = None) -> None:

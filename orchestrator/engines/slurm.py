@@ -51,6 +51,7 @@ class SlurmEngine:
 
     name = "slurm"
     queues = True
+    elastic = True
     images = False
 
     def __init__(self) -> None:

@@ -22,8 +22,11 @@ _AWAY = re.compile(
 )
 _HOSTS_AGE = 10.0
 """Seconds for which a picture of all hosts holds."""
-_GONE = ("DOWN", "DRAIN", "FAIL", "FUTURE", "UNKNOWN", "NOT_RESPONDING", "MAINT")
-"""Words in a node's state that mean that nothing can start there."""
+_AWAY_STATES = frozenset(
+    {"DOWN", "DRAIN", "DRAINED", "DRAINING", "ERROR", "FAIL", "FAILING", "INVAL", "INVALID_REG"}
+    | {"MAINT", "MAINTENANCE", "NOT_RESPONDING", "UNKNOWN"}
+)
+"""Words of a node's state that mean that nothing can start there now. ``POWERED_DOWN`` is none: Slurm boots such a node for a job."""
 
 
 class Unreachable(EngineError):
@@ -180,17 +183,26 @@ class Hosts:
 
 
 def list_hosts() -> list[Host]:
-    """Nodes on which jobs can start, with all that they have. Raises EngineError."""
+    """The nodes with all that they have; those on which nothing can start now are away. Raises EngineError."""
     hosts = []
     for line in call("scontrol", "--oneliner", "show", "nodes").splitlines():
         fields = dict(re.findall(r"(\w+)=(\S*)", line))
-        if "NodeName" not in fields or any(word in fields.get("State", "") for word in _GONE):
+        state = _words(fields.get("State", ""))
+        if "NodeName" not in fields or "FUTURE" in state:
             continue
         gpus = sum(int(count) for count in re.findall(r"(?:^|,)gpu:(?:[^:,()]+:)?(\d+)", fields.get("Gres", "")))
         cpus = float(fields.get("CPUEfctv") or fields.get("CPUTot", "1"))
         ids = tuple(str(number) for number in range(gpus))
-        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, int(fields.get("RealMemory", "0")), single=True))
+        memory, away = int(fields.get("RealMemory", "0")), bool(state & _AWAY_STATES)
+        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, away=away))
     return hosts
+
+
+def _words(state: str) -> set[str]:
+    """``DOWN*+CLOUD`` in words. A node that is off, or booting, does not respond and is none the worse for that."""
+    words = {word.rstrip("*~#!%$@^-") for word in state.split("+")}
+    powers = any(word.startswith(("POWERED_", "POWERING_")) for word in words)
+    return words - {"NOT_RESPONDING"} if powers else words
 
 
 def address_of_this_machine() -> str | None:
