@@ -31,11 +31,13 @@ class Node:
         marks: Variables that every process of the node, and of no other, has in its environment.
         lease: Seconds without :meth:`beat` after which the node is ended: its driver is gone, or cut off.
         """
-        self.marks, self.lease = {f"{name}={value}".encode() for name, value in marks.items()}, lease
+        self.marks, self.lease = [f"{name}={value}" for name, value in marks.items()], lease
         self.heard = time.monotonic()
         self._order: tuple[list[str], dict[str, str], str | None] | None = None
         self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
+        self._reaper: subprocess.Popen[bytes] | None = None
+        """For where the actor is killed: Ray does that to the actors of a driver that died."""
         self._problem = ""
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
@@ -131,9 +133,11 @@ class Node:
                 os._exit(1)
         assert self._order is not None
         command, environment, directory = self._order
-        from shared_store.tied import tied  # it is there by now, and of the same version: see facts()
+        from shared_store.reaper import start_reaper  # it is there by now, and of the same version: see facts()
+        from shared_store.tied import tied
 
         try:
+            self._reaper = start_reaper(self.marks)
             self._process = subprocess.Popen(
                 tied(command),
                 env=environment,
@@ -165,24 +169,7 @@ class Node:
 
     def _end(self) -> None:
         """SIGKILL to everything here that carries the marks, until nothing is left."""
-        while pids := self._left():
-            for pid in pids:
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.kill(pid, signal.SIGKILL)
-            time.sleep(0.02)
+        if self._reaper is not None:
+            from shared_store.reaper import end_marked
 
-    def _left(self) -> list[int]:
-        found = []
-        for entry in os.listdir("/proc"):
-            if not entry.isdigit() or int(entry) == os.getpid():
-                continue
-            try:
-                with open(f"/proc/{entry}/environ", "rb") as file:
-                    if not self.marks <= set(file.read().split(b"\0")):
-                        continue
-                with open(f"/proc/{entry}/stat") as status:
-                    if status.read().rpartition(")")[2].split()[0] not in "ZX":
-                        found.append(int(entry))
-            except OSError:
-                continue
-        return found
+            end_marked(self.marks)
