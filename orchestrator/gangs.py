@@ -235,6 +235,8 @@ class Gangs:
             seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
             if self.bus.met(job.id, attempt.number, record["index"]):
                 seen["met"] = True  # the next controller must miss it, too, if it does not come back
+            if node.gpus:
+                seen["devices"] = list(node.gpus)  # "gpus" are the scheduler's, which counts with them
             records.append({**record, "address": node.address, **seen})
         if records != attempt.nodes:
             attempt.nodes = records

@@ -20,7 +20,7 @@ from orchestrator.cli.progress import evaluated, follow
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines import ENGINES
-from orchestrator.engines.base import Host
+from orchestrator.engines.base import Host, engine_of
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, schema
 
@@ -208,6 +208,16 @@ def _used(attempt: dict[str, Any]) -> str:
     return f", {used:.0f} {kind.upper()}-seconds" + (f" of which {lost:.0f} lost" if lost >= 1 else "")
 
 
+def _gpus(node: dict[str, Any]) -> str:
+    """Which GPUs a node has; how many, where only its engine knows which."""
+    if not node["gpus"]:
+        return ""
+    known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
+    if known:
+        return f", GPUs {','.join(known)}"
+    return f", {len(node['gpus'])} GPU{'s' if len(node['gpus']) != 1 else ''}"
+
+
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
     """Show a job: its state and why, its attempts and nodes, its run and results."""
     with Client.connect() as client:
@@ -248,10 +258,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         )
         for node in attempt["nodes"]:
             state = "running" if node["running"] else f"exit {node.get('exitCode', '?')}: {node.get('reason', '')}"
-            gpus = f", GPUs {','.join(node['gpus'])}" if node["gpus"] else ""
-            console.print(
-                f"    node {node['index']}  {node.get('address', '-')} on {node['host']}{gpus}  {state}", markup=False
-            )
+            where = f"{node['host']}{_gpus(node)}"
+            console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
 
 

@@ -173,6 +173,8 @@ class NodeStatus:
     """What the node's supervisor said on stderr, where it could not say it in the store."""
     waiting: str = ""
     """Why the node, which counts as running, has not been started yet by an engine that queues."""
+    gpus: tuple[str, ...] = ()
+    """Ids of those that it has, from an engine that hands them out itself and tells."""
 
 
 GangStatus = Sequence[NodeStatus]

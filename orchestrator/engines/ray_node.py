@@ -43,8 +43,16 @@ class Node:
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
         threading.Thread(target=self._keep, name="keeper", daemon=True).start()
 
-    def facts(self, directory: str | None, store: str) -> dict[str, Any]:
-        """What the driver has to know before it starts anything: the version of Muster here, a free port, what is missing."""
+    def facts(self, version: str, directory: str | None, store: str, run: str, epoch: int) -> dict[str, Any]:
+        """What the driver has to know before it starts anything: the version of Muster here, the GPUs, what is missing.
+
+        Args:
+            version: Of Muster, the driver's; the driver refuses another one.
+            directory: Working directory of the node.
+            store: Path of the shared volume.
+            run: The run, to which the controller has given ``epoch`` on that volume.
+            epoch: The gang's.
+        """
         try:
             from shared_store import __version__ as muster
         except ImportError as error:
@@ -55,7 +63,8 @@ class Node:
             }
         if not os.path.isdir(store):
             return {"problem": f"store {store} is not there: it has to be on a volume that all nodes share"}
-        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": ""}
+        problem = _foreign(store, run, epoch) if muster == version else ""
+        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": problem}
 
     def free_port(self, address: str) -> int:
         """The first port from 29500 that nobody listens on at ``address``; 0 where there is none."""
@@ -173,3 +182,15 @@ class Node:
             from shared_store.reaper import end_marked
 
             end_marked(self.marks)
+
+
+def _foreign(store: str, run: str, epoch: int) -> str:
+    """Why the store here is not the controller's; empty where it is. For a node with the driver's version of Muster."""
+    from shared_store.epoch import StaleEpoch, find_epoch
+    from shared_store.layout import Store, StoreError
+
+    try:
+        find_epoch(Store(store).run(run), epoch)
+    except (StaleEpoch, StoreError, ValueError, OSError) as error:
+        return str(error)
+    return ""

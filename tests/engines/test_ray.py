@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -137,6 +138,7 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
     )
     gang = bench.gang(script, main=1, gpus=("1",), directory=str(bench.home))
     plan = bench.engine.plan(gang)
+    assert "# node 1, the main node, on ray/n2\n" in plan.document and plan.document.count("ray.io/node-id") == 3
     handle = bench.launch(gang)
     status = bench.ended(handle)
     assert [node.exit_code for node in status] == [1, 0, 2]
@@ -151,7 +153,7 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
         assert {name: found.get(name) for name in told} == told
         assert found["MASTER_ADDR"] == at["n2"] and found["GREETING"] == "hello"
         assert not [name for name in found if name.startswith("RAY_")], "the cluster's token is not for jobs"
-        assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1")
+        assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1") and status[index].gpus == (found["CUDA_VISIBLE_DEVICES"],)
     outcomes = [read_outcome(bench.run, "job", 1, index) for index in range(3)]
     assert [outcome.exit_code for outcome in outcomes if outcome] == [1, 0, 2]
     started = [int((bench.store.path / f"start-{rank}").read_text()) for rank in range(3)]
@@ -212,6 +214,15 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ben
         assert bench.log(attempt=2) == []
     finally:
         shutil.rmtree(fake)
+
+
+def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_runs(bench: Bench) -> None:
+    # what such a node finds: not the epoch that the controller has written
+    handle = bench.launch(dataclasses.replace(bench.gang(hosts=("n2",)), epoch=2))
+    [node] = bench.ended(handle)
+    assert node.detail.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
+    assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.detail
+    assert bench.log() == [] and read_outcome(bench.run, "job", 1, 0) is None
 
 
 def test_a_rank_and_a_supervisor_that_are_killed(bench: Bench) -> None:

@@ -6,9 +6,11 @@ import json
 import os
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from orchestrator.cli.jobs import _gpus
 from tests.conftest import REPOSITORY, Serving, run_muster, wait_for
 
 
@@ -182,3 +184,17 @@ def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -
     assert done.returncode == 0, done.stdout + done.stderr
     for rank in range(3):
         assert f"rank {rank} of 3 on node {rank}: sum = 6, expected 6" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("node", "said"),
+    [
+        ({"host": "localhost", "gpus": ["2", "3"]}, ", GPUs 2,3"),
+        ({"host": "ray/n1", "gpus": ["0", "1"]}, ", 2 GPUs"),
+        ({"host": "ray/n1", "gpus": ["0"], "devices": ["5"]}, ", GPUs 5"),
+        ({"host": "slurm/n1", "gpus": ["0"]}, ", 1 GPU"),
+        ({"host": "ray/n1", "gpus": []}, ""),
+    ],
+)
+def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, Any], said: str) -> None:
+    assert _gpus(node) == said
