@@ -33,6 +33,8 @@ JobArgument = Annotated[
     str, typer.Argument(help="Job id, the first letters of one (4 or more), or a job name (the newest).")
 ]
 
+_PATIENCE = 3.0
+"""Seconds after which a stop that takes its time says why."""
 _WHOLE = 1000
 """Columns of a table for another program."""
 _COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
@@ -275,9 +277,13 @@ def stop(
             typer.echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
+        said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
+            if detail["statusReason"] != said and time.monotonic() > patience:
+                said = detail["statusReason"]
+                typer.echo(f"{detail['name']} ({detail['id'][:8]}): {said}", err=True)
     if not wait:
         typer.echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return

@@ -170,7 +170,8 @@ class NodeStatus:
     exit_code: int | None = None
     """128 + n for signal n; None while it runs, or where nobody saw the end."""
     detail: str = ""
-    """What the node's supervisor said on stderr, where it could not say it in the store."""
+    """What the node's supervisor said on stderr, where it could not say it in the store; of a node that runs, why nothing can be
+    told it now."""
     waiting: str = ""
     """Why the node, which counts as running, has not been started yet by an engine that queues."""
     gpus: tuple[str, ...] = ()

@@ -20,6 +20,7 @@ _LIMIT = 30.0
 _AWAY = re.compile(
     r"(?i)unable to contact|connection (refused|timed out)|socket timed out|not responding|zero bytes|try again"
 )
+_UNCONFIGURED = re.compile("Could not establish a configuration source|resolve_ctls_from_dns_srv")
 _HOSTS_AGE = 10.0
 """Seconds for which a picture of all hosts holds."""
 _AWAY_STATES = frozenset(
@@ -51,6 +52,8 @@ def call(*command: str, text: str | None = None) -> str:
         Unreachable: slurmctld does not answer.
         EngineError: It refused, in its own words.
     """
+    if (told := os.environ.get("SLURM_CONF")) and not os.path.exists(told):  # Slurm itself would try for a minute
+        raise Unreachable(f"SLURM_CONF is {told}, which is not there; set it to the cluster's slurm.conf")
     try:
         done = subprocess.run(
             command, input=text, capture_output=True, text=True, timeout=_LIMIT, env=environment(), errors="replace"
@@ -70,6 +73,11 @@ def call(*command: str, text: str | None = None) -> str:
     why = "; ".join(dict.fromkeys(said)) or f"exit code {done.returncode}"
     if _AWAY.search(why):
         raise Unreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
+    if _UNCONFIGURED.search(why):
+        raise EngineError(
+            "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/slurm.conf, or set "
+            "SLURM_CONF to its path"
+        )
     raise EngineError(why)
 
 
@@ -106,6 +114,8 @@ class Jobs:
         """Why there is no newer picture."""
         self._jobs: Mapping[str, SlurmJob] = {}
         self._taken = 0.0
+        self._late = False
+        """Somebody has waited for the newer picture in vain: nobody else needs to."""
         self._lock, self._looked = threading.Lock(), threading.Event()
         self._looked.set()
 
@@ -119,7 +129,8 @@ class Jobs:
         """
         if time.monotonic() - self._taken > age:
             self._look()
-            self._looked.wait(2.0)
+            if not self._looked.wait(0.0 if self._late else 2.0):
+                self._late = True
         if number not in self._jobs and self._taken <= since:
             raise Unreachable(self._trouble or "slurmctld has not answered yet")
         return self._jobs.get(number)
@@ -143,6 +154,11 @@ class Jobs:
             self._look()
         return self._trouble
 
+    @property
+    def trouble(self) -> str | None:
+        """Why the picture is an old one."""
+        return self._trouble or ("slurmctld has not answered yet; see `scontrol ping`" if self._late else None)
+
     def _look(self) -> None:
         with self._lock:
             if not self._looked.is_set():
@@ -156,6 +172,7 @@ class Jobs:
         except EngineError:
             pass  # noted
         finally:
+            self._late = False
             self._looked.set()
 
 
