@@ -142,10 +142,10 @@ class Node:
                 os._exit(1)
         assert self._order is not None
         command, environment, directory = self._order
-        from shared_store.reaper import start_reaper  # it is there by now, and of the same version: see facts()
-        from shared_store.tied import tied
-
         try:
+            from shared_store.reaper import start_reaper  # it is there by now, and of the same version: see facts()
+            from shared_store.tied import tied
+
             self._reaper = start_reaper(self.marks)
             self._process = subprocess.Popen(
                 tied(command),
@@ -156,7 +156,7 @@ class Node:
                 stderr=self._said,
                 start_new_session=True,
             )
-        except (OSError, ValueError) as error:
+        except (ImportError, OSError, ValueError) as error:
             self._problem = f"can't start the node: {error}"
             self._started.set()
             return
