@@ -158,6 +158,8 @@ class Gangs:
         if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
             attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
             session.commit()
+        if attempt.ending is not None and (trouble := next((n.detail for n in status if n.running and n.detail), "")):
+            job.status_reason = f"{attempt.status_reason}; waits for {trouble}"
         if attempt.ending is not None and not self._finishing(job, attempt, status) and self._stopped(job, attempt):
             ends = self._ends(job, attempt, self.engine.observe(attempt.handle))
             self._close(
@@ -240,6 +242,8 @@ class Gangs:
             seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
             if self.bus.met(job.id, attempt.number, record["index"]):
                 seen["met"] = True  # the next controller must miss it, too, if it does not come back
+            if node.gpus:
+                seen["devices"] = list(node.gpus)  # "gpus" are the scheduler's, which counts with them
             records.append({**record, "address": node.address, **seen})
         if records != attempt.nodes:
             attempt.nodes = records

@@ -88,6 +88,7 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     return {
         "engines": own_queues(controller.engine.names),
         "hosts": [asdict(host) for host in controller.engine.capacity(names)],
+        "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
         "queues": queues,
     }

@@ -123,8 +123,9 @@ def resume(
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
-        hosts = controller.engine.capacity(queue_engines(session, spec.queue, controller.engine.names[0]))
-        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
+        engines = queue_engines(session, spec.queue, controller.engine.names[0])
+        hosts, elastic = controller.engine.capacity(engines), controller.engine.is_elastic(engines)
+        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts, elastic):
             raise ClientError(f"run {run.name}: {impossible}")
         registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
         if chosen and checkpoint is not None:

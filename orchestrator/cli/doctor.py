@@ -148,6 +148,7 @@ def _controller() -> Finding:
 
 
 def _engine(name: str) -> str:
-    hosts = make_engine(name, muster_home()).capacity()  # an engine that launches nothing writes nothing there
+    # an engine that launches nothing writes nothing there
+    hosts = [host for host in make_engine(name, muster_home()).capacity() if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{len(hosts)} host{'s' if len(hosts) != 1 else ''}, {cpus:g} CPUs, {gpus} GPUs"

@@ -20,7 +20,7 @@ from orchestrator.cli.progress import evaluated, follow
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines import ENGINES
-from orchestrator.engines.base import Host
+from orchestrator.engines.base import Host, engine_of
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, schema
 
@@ -33,6 +33,8 @@ JobArgument = Annotated[
     str, typer.Argument(help="Job id, the first letters of one (4 or more), or a job name (the newest).")
 ]
 
+_PATIENCE = 3.0
+"""Seconds after which a stop that takes its time says why."""
 _WHOLE = 1000
 """Columns of a table for another program."""
 _COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
@@ -60,10 +62,11 @@ def submit_spec(
     if spec.queue not in capacity["queues"]:
         raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")
     hosts = [
-        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"])
+        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"], host["away"])
         for host in capacity["hosts"]
     ]
-    if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts):
+    shape = gang_needs(definition["nodeProperties"]).shape
+    if impossible := never_fits(shape, hosts, elastic=capacity["elastic"]):
         raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
@@ -212,6 +215,16 @@ def _used(attempt: dict[str, Any]) -> str:
     return f", {used:.0f} {kind.upper()}-seconds" + (f" of which {lost:.0f} lost" if lost >= 1 else "")
 
 
+def _gpus(node: dict[str, Any]) -> str:
+    """Which GPUs a node has; how many, where only its engine knows which."""
+    if not node["gpus"]:
+        return ""
+    known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
+    if known:
+        return f", GPUs {','.join(known)}"
+    return f", {len(node['gpus'])} GPU{'s' if len(node['gpus']) != 1 else ''}"
+
+
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
     """Show a job: its state and why, its attempts and nodes, its run and results."""
     with Client.connect() as client:
@@ -252,10 +265,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         )
         for node in attempt["nodes"]:
             state = "running" if node["running"] else f"exit {node.get('exitCode', '?')}: {node.get('reason', '')}"
-            gpus = f", GPUs {','.join(node['gpus'])}" if node["gpus"] else ""
-            console.print(
-                f"    node {node['index']}  {node.get('address', '-')} on {node['host']}{gpus}  {state}", markup=False
-            )
+            where = f"{node['host']}{_gpus(node)}"
+            console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
 
 
@@ -271,9 +282,13 @@ def stop(
             typer.echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
+        said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
+            if detail["statusReason"] != said and time.monotonic() > patience:
+                said = detail["statusReason"]
+                typer.echo(f"{detail['name']} ({detail['id'][:8]}): {said}", err=True)
     if not wait:
         typer.echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return

@@ -74,6 +74,7 @@ class AwsBatchEngine:
 
     name = "aws-batch"
     queues = True
+    elastic = True
     images = True
     address: str | None = None  # nodes on AWS do not reach this machine
 

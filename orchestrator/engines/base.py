@@ -41,10 +41,12 @@ class Host:
     """MiB."""
     single: bool = False
     """Takes one node of a gang at most."""
+    away: bool = False
+    """Takes no node now, and may again: an engine that queues is given a gang that needs it, and waits for it."""
 
     def left(self, cpus: float, gpus: tuple[str, ...], memory: int) -> Host:
         """The same host with that much of it."""
-        return Host(self.name, cpus, gpus, memory, self.single)
+        return Host(self.name, cpus, gpus, memory, self.single, self.away)
 
 
 def engine_of(host: str) -> str:
@@ -172,9 +174,12 @@ class NodeStatus:
     exit_code: int | None = None
     """128 + n for signal n; None while it runs, or where nobody saw the end."""
     detail: str = ""
-    """What the node's supervisor said on stderr, where it could not say it in the store."""
+    """What the node's supervisor said on stderr, where it could not say it in the store; of a node that runs, why nothing can be
+    told it now."""
     waiting: str = ""
     """Why the node, which counts as running, has not been started yet by an engine that queues."""
+    gpus: tuple[str, ...] = ()
+    """Ids of those that it has, from an engine that hands them out itself and tells."""
 
 
 GangStatus = Sequence[NodeStatus]
@@ -186,6 +191,8 @@ class Engine(Protocol):
     name: str
     queues: bool
     """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
+    elastic: bool
+    """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
     images: bool
     """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
     address: str | None

@@ -59,6 +59,7 @@ class DockerEngine:
 
     name = "docker"
     queues = False
+    elastic = False
     images = True
 
     def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:

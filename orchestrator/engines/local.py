@@ -31,6 +31,7 @@ class LocalEngine:
 
     name = "local"
     queues = False
+    elastic = False
     images = False
     address: str | None = None
 

@@ -55,8 +55,13 @@ def mounts_of(container: Mapping[str, Any], store: str) -> tuple[Mount, ...]:
     return tuple(found)
 
 
-def with_mounts(command: Sequence[str], mounts: Sequence[Mount]) -> list[str]:
+def with_mounts(command: Sequence[str], mounts: Sequence[Mount], engine: str = "local") -> list[str]:
     """``command`` so that it sees the mounts; it keeps its process id.
+
+    Args:
+        command: What is to be run.
+        mounts: What it sees.
+        engine: Name of the engine that will run it, for what is said.
 
     Raises:
         EngineError: This process may not mount, or a path can't be used.
@@ -65,7 +70,7 @@ def with_mounts(command: Sequence[str], mounts: Sequence[Mount]) -> list[str]:
         return list(command)
     if os.geteuid() != 0 or not shutil.which("unshare"):
         raise EngineError(
-            f"volume {mounts[0].target}: the local engine mounts only as root; start `muster serve` as root, "
+            f"volume {mounts[0].target}: the {engine} engine mounts only as root; start `muster serve` as root, "
             "or take the volumes out of the job definition and use $MUSTER_STORE"
         )
     for mount in mounts:

@@ -24,6 +24,7 @@ from typing import Any
 
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
 from orchestrator.engines.mounts import mounts_of, with_mounts
+from orchestrator.engines.ray_bundles import in_words
 from orchestrator.engines.ray_cluster import Watch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray_folder import LEASE, NEW, Folder
 from shared_store.files import read_json, write_json
@@ -41,6 +42,7 @@ class RayEngine:
 
     name = "ray"
     queues = False
+    elastic = True
     images = False
 
     def __init__(self, home: Path, address: str | None = None) -> None:
@@ -123,10 +125,11 @@ class RayEngine:
     # -- gangs --------------------------------------------------------------------------------------------------------
 
     def plan(self, gang: Gang) -> Plan:
-        """Addresses of machines that are not there yet are empty; the port is chosen on the main node's machine."""
+        """With the placement group. Addresses of machines that are not there yet are empty; the port is chosen on the main node's."""
         machines = self._machines()
         addresses = [machines[p.host]["address"] if p.host in machines else "" for p in gang.placements]
-        return Plan(gang, node_plans(gang, addresses, _PORT))
+        plan = Plan(gang, node_plans(gang, addresses, _PORT))
+        return dataclasses.replace(plan, document=in_words(self._document(plan)))
 
     def launch(self, plan: Plan) -> str:
         gang = plan.gang
@@ -168,10 +171,12 @@ class RayEngine:
             self._let_go(_job(gang))
         status = []
         for node in state["nodes"]:
+            gpus = tuple(filter(None, node.get("gpus", "").split(",")))
             if node["running"] and driven:
-                status.append(NodeStatus(True, node["address"], waiting="" if node["started"] else state["why"]))
+                waiting = "" if node["started"] else state["why"]
+                status.append(NodeStatus(True, node["address"], waiting=waiting, gpus=gpus))
             else:
-                status.append(NodeStatus(False, node["address"], node["code"], node["detail"]))
+                status.append(NodeStatus(False, node["address"], node["code"], node["detail"], gpus=gpus))
             if driven and state["phase"] == "running" and not node["running"] and node["code"] is None:
                 until = time.monotonic() + (_SUSPECT_IF_SILENT if node.get("silent") else _SUSPECT)
                 self._suspects.setdefault(node["ray_node"], until)
@@ -227,7 +232,7 @@ class RayEngine:
                     "contract": dataclasses.asdict(node.contract),
                     "command": list(node.command),
                     "environment": dict(node.environment),
-                    "prefix": with_mounts([], mounts_of(container, gang.store)),
+                    "prefix": with_mounts([], mounts_of(container, gang.store), self.name),
                     "cpus": placement.cpus,
                     "gpus": len(placement.gpus),
                     "memory": placement.memory,

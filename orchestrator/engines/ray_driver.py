@@ -23,8 +23,9 @@ from typing import Any
 import ray
 
 from orchestrator.engines import ray_node
+from orchestrator.engines.ray_bundles import STRATEGY, bundle_of, selector_of
 from orchestrator.engines.ray_folder import NEW, Folder
-from orchestrator.engines.ray_gang import Gang, bundle_of
+from orchestrator.engines.ray_gang import Gang
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""
@@ -95,11 +96,11 @@ class Driver:
             ray.util.remove_placement_group(self.group)
             self.group = None
         if self.group is None:
-            selectors = [{"ray.io/node-id": pin} if pin else {} for pin in pins]
+            selectors = [selector_of(node) for node in gang.plan["nodes"]]
             # names have to be unique, and a dead driver's group stays until Ray has noticed its death
             name = f"muster {gang.name} {uuid.uuid4().hex[:8]}"
             self.group = ray.util.placement_group(
-                bundles, strategy="STRICT_SPREAD", name=name, bundle_label_selector=selectors
+                bundles, strategy=STRATEGY, name=name, bundle_label_selector=selectors
             )
             self.key = key
         gang.phase, gang.why, self._told_to_leave = "placing", "waits for its placement group", False

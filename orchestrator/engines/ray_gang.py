@@ -13,6 +13,7 @@ import ray
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from orchestrator.engines import ray_node
+from orchestrator.engines.ray_bundles import bundle_of
 from orchestrator.engines.ray_folder import LEASE, Folder
 from shared_store import __version__
 from shared_store.contract import NodeContract
@@ -38,6 +39,7 @@ class Gang:
                 "running": True,
                 "started": False,
                 "address": "",
+                "gpus": "",
                 "code": None,
                 "detail": "",
                 "ray_node": node["pin"] or "",
@@ -96,9 +98,10 @@ class Gang:
                     max_concurrency=6,
                 ).remote({"MUSTER_GANG": self.name, "NODE_RANK": str(_contract(node["contract"]).node_rank)}, LEASE)
             )
-        directory, store = self.plan["directory"], self.plan["nodes"][0]["contract"]["store"]
+        contract = _contract(self.plan["nodes"][0]["contract"])
+        about = self.plan["directory"], contract.store, contract.run, contract.epoch
         for index, node in enumerate(self.actors):
-            self.asked[node.facts.remote(directory, store)] = ("facts", index)
+            self.asked[node.facts.remote(__version__, *about)] = ("facts", index)
         self.heard = [time.monotonic()] * len(self.nodes)
         self.phase, self.why = "starting", "starting an actor on each node"
 
@@ -173,7 +176,9 @@ class Gang:
         node = self.nodes[index]
         if kind == "facts":
             node["facts"] = answer
-            host = self.plan["nodes"][index]["host"]
+            wanted = self.plan["nodes"][index]
+            host = wanted["host"]
+            node["gpus"] = answer.get("gpus", "") if wanted["gpus"] else ""
             if answer["problem"]:
                 self.fail(f"node {index} on {host}: {answer['problem']}")
             elif answer["version"] != __version__:
@@ -217,13 +222,6 @@ class Gang:
         self.actors, self.asked = [], {}
         self.phase = "stopped"
         self.folder.plan(self.name).unlink(missing_ok=True)
-
-
-def bundle_of(node: Mapping[str, Any]) -> dict[str, float]:
-    bundle = {"CPU": node["cpus"], "memory": node["memory"] * 2**20}
-    if node["gpus"]:
-        bundle["GPU"] = node["gpus"]
-    return bundle
 
 
 def _contract(told: Mapping[str, Any]) -> NodeContract:

@@ -31,18 +31,28 @@ class Node:
         marks: Variables that every process of the node, and of no other, has in its environment.
         lease: Seconds without :meth:`beat` after which the node is ended: its driver is gone, or cut off.
         """
-        self.marks, self.lease = {f"{name}={value}".encode() for name, value in marks.items()}, lease
+        self.marks, self.lease = [f"{name}={value}" for name, value in marks.items()], lease
         self.heard = time.monotonic()
         self._order: tuple[list[str], dict[str, str], str | None] | None = None
         self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
+        self._reaper: subprocess.Popen[bytes] | None = None
+        """For where the actor is killed: Ray does that to the actors of a driver that died."""
         self._problem = ""
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
         threading.Thread(target=self._keep, name="keeper", daemon=True).start()
 
-    def facts(self, directory: str | None, store: str) -> dict[str, Any]:
-        """What the driver has to know before it starts anything: the version of Muster here, a free port, what is missing."""
+    def facts(self, version: str, directory: str | None, store: str, run: str, epoch: int) -> dict[str, Any]:
+        """What the driver has to know before it starts anything: the version of Muster here, the GPUs, what is missing.
+
+        Args:
+            version: Of Muster, the driver's; the driver refuses another one.
+            directory: Working directory of the node.
+            store: Path of the shared volume.
+            run: The run, to which the controller has given ``epoch`` on that volume.
+            epoch: The gang's.
+        """
         try:
             from shared_store import __version__ as muster
         except ImportError as error:
@@ -53,7 +63,8 @@ class Node:
             }
         if not os.path.isdir(store):
             return {"problem": f"store {store} is not there: it has to be on a volume that all nodes share"}
-        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": ""}
+        problem = _foreign(store, run, epoch) if muster == version else ""
+        return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": problem}
 
     def free_port(self, address: str) -> int:
         """The first port from 29500 that nobody listens on at ``address``; 0 where there is none."""
@@ -131,9 +142,11 @@ class Node:
                 os._exit(1)
         assert self._order is not None
         command, environment, directory = self._order
-        from shared_store.tied import tied  # it is there by now, and of the same version: see facts()
-
         try:
+            from shared_store.reaper import start_reaper  # it is there by now, and of the same version: see facts()
+            from shared_store.tied import tied
+
+            self._reaper = start_reaper(self.marks)
             self._process = subprocess.Popen(
                 tied(command),
                 env=environment,
@@ -143,7 +156,7 @@ class Node:
                 stderr=self._said,
                 start_new_session=True,
             )
-        except (OSError, ValueError) as error:
+        except (ImportError, OSError, ValueError) as error:
             self._problem = f"can't start the node: {error}"
             self._started.set()
             return
@@ -165,24 +178,19 @@ class Node:
 
     def _end(self) -> None:
         """SIGKILL to everything here that carries the marks, until nothing is left."""
-        while pids := self._left():
-            for pid in pids:
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.kill(pid, signal.SIGKILL)
-            time.sleep(0.02)
+        if self._reaper is not None:
+            from shared_store.reaper import end_marked
 
-    def _left(self) -> list[int]:
-        found = []
-        for entry in os.listdir("/proc"):
-            if not entry.isdigit() or int(entry) == os.getpid():
-                continue
-            try:
-                with open(f"/proc/{entry}/environ", "rb") as file:
-                    if not self.marks <= set(file.read().split(b"\0")):
-                        continue
-                with open(f"/proc/{entry}/stat") as status:
-                    if status.read().rpartition(")")[2].split()[0] not in "ZX":
-                        found.append(int(entry))
-            except OSError:
-                continue
-        return found
+            end_marked(self.marks)
+
+
+def _foreign(store: str, run: str, epoch: int) -> str:
+    """Why the store here is not the controller's; empty where it is. For a node with the driver's version of Muster."""
+    from shared_store.epoch import StaleEpoch, find_epoch
+    from shared_store.layout import Store, StoreError
+
+    try:
+        find_epoch(Store(store).run(run), epoch)
+    except (StaleEpoch, StoreError, ValueError, OSError) as error:
+        return str(error)
+    return ""

@@ -65,7 +65,6 @@ def look(state: GlobalState) -> dict[str, Any]:
             "gpus": int(node["Resources"].get("GPU", 0.0)),
             "memory": int(node["Resources"].get("memory", 0.0) / 2**20),
             "head": "node:__internal_head__" in node["Resources"],
-            "labels": node["Labels"],
         }
         for node in state.node_table()
         if node["Alive"] and node["NodeID"] not in draining

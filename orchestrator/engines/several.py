@@ -28,6 +28,10 @@ class Several:
         """Those that queue by themselves."""
         return frozenset(name for name, engine in self.engines.items() if engine.queues)
 
+    def is_elastic(self, names: Iterable[str]) -> bool:
+        """Whether one of these engines may have more hosts later."""
+        return any(self.engines[name].elastic for name in names if name in self.engines)
+
     @property
     def addresses(self) -> Sequence[str]:
         """Of this machine as the engines' nodes see it, beside loopback."""

@@ -21,6 +21,7 @@ import re
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,8 @@ _LOOK = 0.3
 """Seconds between two looks at a job that is being stopped."""
 _AGAIN = 2.0
 """Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
+_PATIENCE = 5.0
+"""Seconds for which a launch waits for sbatch, which tries for longer where slurmctld is away: other jobs wait meanwhile."""
 _FORGOTTEN = "0"
 """Number of a job that Slurm does not know any more."""
 _SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit code (\d+)|(.+))$", re.MULTILINE)
@@ -51,6 +54,7 @@ class SlurmEngine:
 
     name = "slurm"
     queues = True
+    elastic = True
     images = False
 
     def __init__(self) -> None:
@@ -60,6 +64,8 @@ class SlurmEngine:
         self._jobs = Jobs()
         self._submitted: dict[str, float] = {}
         self._submitting = threading.Lock()
+        self._pending: dict[str, Future[str]] = {}
+        """Submissions that are not answered, by gang."""
 
     def capacity(self) -> Sequence[Host]:
         return self._hosts.get()
@@ -83,15 +89,19 @@ class SlurmEngine:
             "native": any(environment.get("MUSTER_ON_CHILD_FAILURE") for environment in gang.environments),
             "output": output_path(gang),
         }
-        if trouble := self._jobs.away():
-            raise NotYet(f"Slurm: {trouble}", unknown=True)
-        with self._submitting:  # one look and one submission at a time
-            try:
-                number = self._find(facts) or self._submit(gang, script)
-            except Unreachable as error:
-                raise NotYet(f"Slurm: {error}", unknown=True) from error
-            self._submitted[number] = time.monotonic()
-        return json.dumps({**facts, "slurm": number})
+        patience = 0.0 if self._pending else _PATIENCE
+        if gang.name not in self._pending:
+            if trouble := self._jobs.away():
+                raise NotYet(f"Slurm: {trouble}", unknown=True)
+            self._begin(gang, facts, script)
+        pending = self._pending[gang.name]
+        if not wait([pending], patience).done:
+            raise NotYet("Slurm: slurmctld has not answered yet; see `scontrol ping`", unknown=True)
+        del self._pending[gang.name]
+        try:
+            return json.dumps({**facts, "slurm": pending.result()})
+        except Unreachable as error:
+            raise NotYet(f"Slurm: {error}", unknown=True) from error
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
@@ -99,13 +109,15 @@ class SlurmEngine:
         try:
             job = self._job(facts)
         except Unreachable as error:
-            return [NodeStatus(True, "", waiting=f"Slurm: {error}")] * count
+            return [NodeStatus(True, "", detail=f"Slurm: {error}", waiting=f"Slurm: {error}")] * count
+        trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
         if job is not None and job.state in QUEUED:
-            return [NodeStatus(True, "", waiting=waiting(job))] * count
+            return [NodeStatus(True, "", detail=trouble, waiting=waiting(job))] * count
         run = Store(facts["store"]).run(facts["run"])
         ends = _outcomes(run, facts)
         said = _said(facts)
-        return [_node(facts, job, said, index, ends.get(index)) for index in range(count)]
+        nodes = [_node(facts, job, said, index, ends.get(index)) for index in range(count)]
+        return [dataclasses.replace(node, detail=trouble) if node.running else node for node in nodes]
 
     def stop(self, handle: str, grace: float) -> None:
         facts = json.loads(handle)
@@ -135,6 +147,22 @@ class SlurmEngine:
             time.sleep(_LOOK)
 
     # -- jobs ---------------------------------------------------------------------------------------------------------
+
+    def _begin(self, gang: Gang, facts: Mapping[str, Any], script: str) -> None:
+        """Submit the gang in the background."""
+        pending: Future[str] = Future()
+
+        def submit() -> None:
+            try:
+                with self._submitting:  # one look and one submission at a time
+                    number = self._find(facts) or self._submit(gang, script)
+                    self._submitted[number] = time.monotonic()
+                pending.set_result(number)
+            except BaseException as error:
+                pending.set_exception(error)
+
+        self._pending[gang.name] = pending
+        threading.Thread(target=submit, name="sbatch", daemon=True).start()
 
     def _find(self, facts: Mapping[str, Any]) -> str | None:
         """The number of a gang that was submitted before: its controller died, or sbatch's answer was lost. Raises EngineError."""

@@ -20,10 +20,14 @@ _LIMIT = 30.0
 _AWAY = re.compile(
     r"(?i)unable to contact|connection (refused|timed out)|socket timed out|not responding|zero bytes|try again"
 )
+_UNCONFIGURED = re.compile("Could not establish a configuration source|resolve_ctls_from_dns_srv")
 _HOSTS_AGE = 10.0
 """Seconds for which a picture of all hosts holds."""
-_GONE = ("DOWN", "DRAIN", "FAIL", "FUTURE", "UNKNOWN", "NOT_RESPONDING", "MAINT")
-"""Words in a node's state that mean that nothing can start there."""
+_AWAY_STATES = frozenset(
+    {"DOWN", "DRAIN", "DRAINED", "DRAINING", "ERROR", "FAIL", "FAILING", "INVAL", "INVALID_REG"}
+    | {"MAINT", "MAINTENANCE", "NOT_RESPONDING", "UNKNOWN"}
+)
+"""Words of a node's state that mean that nothing can start there now. ``POWERED_DOWN`` is none: Slurm boots such a node for a job."""
 
 
 class Unreachable(EngineError):
@@ -48,6 +52,8 @@ def call(*command: str, text: str | None = None) -> str:
         Unreachable: slurmctld does not answer.
         EngineError: It refused, in its own words.
     """
+    if (told := os.environ.get("SLURM_CONF")) and not os.path.exists(told):  # Slurm itself would try for a minute
+        raise Unreachable(f"SLURM_CONF is {told}, which is not there; set it to the cluster's slurm.conf")
     try:
         done = subprocess.run(
             command, input=text, capture_output=True, text=True, timeout=_LIMIT, env=environment(), errors="replace"
@@ -67,6 +73,11 @@ def call(*command: str, text: str | None = None) -> str:
     why = "; ".join(dict.fromkeys(said)) or f"exit code {done.returncode}"
     if _AWAY.search(why):
         raise Unreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
+    if _UNCONFIGURED.search(why):
+        raise EngineError(
+            "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/slurm.conf, or set "
+            "SLURM_CONF to its path"
+        )
     raise EngineError(why)
 
 
@@ -103,6 +114,8 @@ class Jobs:
         """Why there is no newer picture."""
         self._jobs: Mapping[str, SlurmJob] = {}
         self._taken = 0.0
+        self._late = False
+        """Somebody has waited for the newer picture in vain: nobody else needs to."""
         self._lock, self._looked = threading.Lock(), threading.Event()
         self._looked.set()
 
@@ -116,7 +129,8 @@ class Jobs:
         """
         if time.monotonic() - self._taken > age:
             self._look()
-            self._looked.wait(2.0)
+            if not self._looked.wait(0.0 if self._late else 2.0):
+                self._late = True
         if number not in self._jobs and self._taken <= since:
             raise Unreachable(self._trouble or "slurmctld has not answered yet")
         return self._jobs.get(number)
@@ -140,6 +154,11 @@ class Jobs:
             self._look()
         return self._trouble
 
+    @property
+    def trouble(self) -> str | None:
+        """Why the picture is an old one."""
+        return self._trouble or ("slurmctld has not answered yet; see `scontrol ping`" if self._late else None)
+
     def _look(self) -> None:
         with self._lock:
             if not self._looked.is_set():
@@ -153,6 +172,7 @@ class Jobs:
         except EngineError:
             pass  # noted
         finally:
+            self._late = False
             self._looked.set()
 
 
@@ -180,17 +200,26 @@ class Hosts:
 
 
 def list_hosts() -> list[Host]:
-    """Nodes on which jobs can start, with all that they have. Raises EngineError."""
+    """The nodes with all that they have; those on which nothing can start now are away. Raises EngineError."""
     hosts = []
     for line in call("scontrol", "--oneliner", "show", "nodes").splitlines():
         fields = dict(re.findall(r"(\w+)=(\S*)", line))
-        if "NodeName" not in fields or any(word in fields.get("State", "") for word in _GONE):
+        state = _words(fields.get("State", ""))
+        if "NodeName" not in fields or "FUTURE" in state:
             continue
         gpus = sum(int(count) for count in re.findall(r"(?:^|,)gpu:(?:[^:,()]+:)?(\d+)", fields.get("Gres", "")))
         cpus = float(fields.get("CPUEfctv") or fields.get("CPUTot", "1"))
         ids = tuple(str(number) for number in range(gpus))
-        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, int(fields.get("RealMemory", "0")), single=True))
+        memory, away = int(fields.get("RealMemory", "0")), bool(state & _AWAY_STATES)
+        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, away=away))
     return hosts
+
+
+def _words(state: str) -> set[str]:
+    """``DOWN*+CLOUD`` in words. A node that is off, or booting, does not respond and is none the worse for that."""
+    words = {word.rstrip("*~#!%$@^-") for word in state.split("+")}
+    powers = any(word.startswith(("POWERED_", "POWERING_")) for word in words)
+    return words - {"NOT_RESPONDING"} if powers else words
 
 
 def address_of_this_machine() -> str | None:

@@ -41,6 +41,7 @@ _WAITS = {
     "BadConstraints": "no node has what it asks for; look at `resources`, muster:constraint and muster:gpu",
     "NodeDown": "a node that it needs is down",
     "ReqNodeNotAvail": "nodes that it needs are down, drained or reserved",
+    "Nodes required for job are DOWN": "nodes that it needs are down, drained or reserved",
     "JobHeldUser": "it is held; release it with scontrol release",
     "JobHeldAdmin": "an administrator holds it; ask them",
     "InvalidAccount": "the account is not valid; look at muster:account",

@@ -19,7 +19,17 @@ def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[
         shape: The gang.
         free: What is free of each host, in the order in which hosts are filled.
         most: No more nodes than this; None for the gang's size.
+
+    Hosts that are away are taken only where the gang can't start without them.
     """
+    there = [host for host in free if not host.away]
+    placements = _place(shape, there, most)
+    if placements is None and len(there) < len(free) and (most is None or most >= shape.minimum):
+        return _place(shape, [*there, *(host for host in free if host.away)], shape.minimum)
+    return placements
+
+
+def _place(shape: Shape, free: Sequence[Host], most: int | None) -> tuple[Placement, ...] | None:
     count = len(shape.nodes) if most is None else min(most, len(shape.nodes))
     if len(shape.groups) == 1:  # equal nodes: how many fit is a sum, and no other number needs to be tried
         count = min(count, _seats(shape.nodes[0], free, count))
@@ -33,16 +43,39 @@ def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[
     return None
 
 
-def never_fits(shape: Shape, hosts: Sequence[Host]) -> str | None:
-    """Why the gang could not start even if all that the hosts have were free; None where it could."""
-    if place(shape, hosts):
+def never_fits(shape: Shape, hosts: Sequence[Host], elastic: bool = False) -> str | None:
+    """Why the gang could not start even if all that the hosts have were free; None where it could.
+
+    ``elastic``: more hosts may come, no larger than those that are known.
+    """
+    if place(shape, hosts) or (elastic and not hosts):
         return None
     for node in shape.nodes[: shape.minimum]:
         if not any(_room(node, host) for host in hosts):
             best = max(hosts, key=lambda h: (len(h.gpus) >= node.gpus, h.cpus >= node.cpus, h.memory), default=None)
             has = amounts(best.cpus, len(best.gpus), best.memory) if best else "nothing: there is no host"
             return f"each node needs {amounts(*node)}; the largest host has {has}"
+    if elastic:
+        return None
+    if too_few := _too_few_hosts(shape, hosts):
+        return too_few
     return f"{needs(shape)}; all hosts together have {together(hosts)}"
+
+
+def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
+    """That there are not enough hosts, where each takes one node; None where that is not why."""
+    if not all(host.single for host in hosts):
+        return None
+    wanted = {"": (shape.minimum, len(hosts))}
+    for node, indices in shape.groups:
+        count = sum(index < shape.minimum for index in indices)
+        wanted[f" with {amounts(*node)}"] = count, sum(_room(node, host) for host in hosts)
+    for what, (count, found) in wanted.items():
+        if found < count:
+            at_least = "at least " if shape.minimum < len(shape.nodes) else ""
+            there = f"there {'is' if found == 1 else 'are'} {found}"
+            return f"needs {at_least}{count} host{'s' if count != 1 else ''}{what}, one for each node; {there}"
+    return None
 
 
 def affordable(shape: Shape, cpus: float = inf, gpus: float = inf) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines.base import Gang, NodeStatus, Placement
+from orchestrator.engines.base import Gang, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
@@ -54,7 +54,17 @@ class Bench:
         return dataclasses.replace(gang, **changes)
 
     def launch(self, gang: Gang) -> str:
-        handle = self.engine.launch(self.engine.plan(gang))
+        plan = self.engine.plan(gang)
+
+        def launched() -> str | None:
+            try:
+                return self.engine.launch(plan)
+            except NotYet as reason:
+                if "has not answered" in str(reason):
+                    return None
+                raise
+
+        handle: str = wait_for(launched, 60, "an answer")
         self.handles.append(handle)
         return handle
 

@@ -8,6 +8,7 @@ import pytest
 
 from orchestrator.engines import ENGINES, make_engine, slurm_commands
 from orchestrator.engines.base import EngineError
+from orchestrator.engines.mounts import Mount, with_mounts
 from orchestrator.engines.ray_cluster import ray_environment
 from tests.conftest import run_muster
 from tests.engines.slurm_cluster import need_slurm
@@ -45,6 +46,27 @@ def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Pat
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
     assert refused.stderr.startswith("muster: slurmctld does not answer (")
     assert refused.stderr.endswith("see `scontrol ping`\n")
+
+
+def test_slurm_without_its_configuration_is_said_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need_slurm()
+    if Path("/etc/slurm/slurm.conf").exists():
+        pytest.skip("this machine belongs to a cluster")
+    monkeypatch.delenv("SLURM_CONF", raising=False)
+    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path)
+    assert bad.returncode == 1
+    assert "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/" in bad.stdout
+    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf", timeout=20)
+    assert "SLURM_CONF is /no/slurm.conf, which is not there; set it to the cluster's slurm.conf" in bad.stdout
+
+
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    with pytest.raises(
+        EngineError, match=f"^volume /mnt: the {engine} engine mounts only as root; start `muster serve`"
+    ):
+        with_mounts(["true"], [Mount("/data", "/mnt")], engine)
 
 
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -137,6 +138,7 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
     )
     gang = bench.gang(script, main=1, gpus=("1",), directory=str(bench.home))
     plan = bench.engine.plan(gang)
+    assert "# node 1, the main node, on ray/n2\n" in plan.document and plan.document.count("ray.io/node-id") == 3
     handle = bench.launch(gang)
     status = bench.ended(handle)
     assert [node.exit_code for node in status] == [1, 0, 2]
@@ -151,7 +153,7 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
         assert {name: found.get(name) for name in told} == told
         assert found["MASTER_ADDR"] == at["n2"] and found["GREETING"] == "hello"
         assert not [name for name in found if name.startswith("RAY_")], "the cluster's token is not for jobs"
-        assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1")
+        assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1") and status[index].gpus == (found["CUDA_VISIBLE_DEVICES"],)
     outcomes = [read_outcome(bench.run, "job", 1, index) for index in range(3)]
     assert [outcome.exit_code for outcome in outcomes if outcome] == [1, 0, 2]
     started = [int((bench.store.path / f"start-{rank}").read_text()) for rank in range(3)]
@@ -214,6 +216,15 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ben
         shutil.rmtree(fake)
 
 
+def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_runs(bench: Bench) -> None:
+    # what such a node finds: not the epoch that the controller has written
+    handle = bench.launch(dataclasses.replace(bench.gang(hosts=("n2",)), epoch=2))
+    [node] = bench.ended(handle)
+    assert node.detail.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
+    assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.detail
+    assert bench.log() == [] and read_outcome(bench.run, "job", 1, 0) is None
+
+
 def test_a_rank_and_a_supervisor_that_are_killed(bench: Bench) -> None:
     handle = bench.ready(bench.gang(f"echo $$ > $MUSTER_STORE/rank-$NODE_RANK; {WAIT}"))
     os.kill(int((bench.store.path / "rank-1").read_text()), signal.SIGKILL)
@@ -240,6 +251,19 @@ def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
     assert bench.engine.launch(bench.engine.plan(gang)) == handle and bench.driver() == driver
     assert bench.log().count("ready") == 3, "found, not started twice"
     assert bench.stopped(handle) == [143, 143, 143]
+
+
+def test_an_actor_that_is_killed_takes_what_its_rank_started_with_it(bench: Bench) -> None:
+    script = f"[ $NODE_RANK = 0 ] || {{ setsid sleep 577 & echo $! > $MUSTER_STORE/apart; }}; echo $PPID > $MUSTER_STORE/supervisor-$NODE_RANK; {WAIT}"
+    handle = bench.ready(bench.gang(script, ("n1", "n2")))
+    apart = int((bench.store.path / "apart").read_text())
+    supervisor = int((bench.store.path / "supervisor-1").read_text())
+    wait_for(lambda: os.getsid(apart) == apart, 5, "a session of its own")
+    os.kill(parent(supervisor), signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 30, "the node's end is seen")
+    wait_for(lambda: not alive(apart), 10, "nothing of the node is left")
+    assert bench.engine.observe(handle)[0].running, "the other node goes on"
+    bench.engine.stop(handle, 5.0)
 
 
 def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines import slurm_script
+from orchestrator.engines import slurm_commands, slurm_script
 from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
 from orchestrator.engines.slurm import SlurmEngine
-from orchestrator.engines.slurm_commands import SlurmJob
+from orchestrator.engines.slurm_commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm_words import ending, waiting
-from tests.conftest import wait_for
+from tests.conftest import Serving, wait_for
 from tests.engines.sites import POLITE, STUBBORN, WAIT
 from tests.engines.slurm_bench import Bench, slurm_bench
 from tests.engines.slurm_cluster import GPUS, NODES
@@ -24,16 +24,69 @@ from tests.engines.slurm_cluster import GPUS, NODES
 bench = slurm_bench
 
 
-def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_left_out(bench: Bench) -> None:
+def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: Bench) -> None:
     hosts = bench.engine.capacity()
     assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
         (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
     ]
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
     try:
-        assert [host.name for host in SlurmEngine().capacity()] == ["slurm/n1", "slurm/n3"]
+        assert [host.away for host in SlurmEngine().capacity()] == [False, True, False]
+        handle = bench.launch(bench.gang(nodes=3))
+        wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].waiting, 20, "it is queued")
+        bench.engine.stop(handle, 0.0)
     finally:
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
+
+
+def test_a_job_for_more_hosts_than_there_are_now_is_taken_and_says_what_it_waits_for(
+    bench: Bench, tmp_path: Path
+) -> None:
+    spec = tmp_path / "job.yaml"
+    spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
+    bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
+    served = Serving(tmp_path / "home", "--engine", "slurm")
+    try:
+
+        def waits(reason: str) -> None:
+            wait_for(lambda: reason in served.detail("large")["statusReason"], 20, reason)
+
+        done = served.muster("submit", str(spec))
+        assert done.returncode == 0, done.stderr
+        waits("Slurm: nodes that it needs are down, drained or reserved")
+        served.muster("stop", "large")
+        done = served.muster("submit", str(spec), "--set", "nodes=4")
+        assert done.returncode == 0, done.stderr
+        waits("needs 4 hosts, one for each node; there are 3")
+        refused = served.muster("submit", str(spec), "--set", "resources.cpus=9")
+        assert refused.returncode == 2 and "the largest host has 4 CPUs" in refused.stderr, refused.stderr
+        assert served.muster("stop", "large").returncode == 0
+    finally:
+        served.close()
+        bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
+
+
+@pytest.mark.parametrize(
+    ("state", "away"),
+    [
+        ("IDLE", False),
+        ("MIXED+PLANNED", False),
+        ("IDLE+CLOUD+POWERED_DOWN", False),
+        ("IDLE+CLOUD+POWERING_DOWN", False),
+        ("ALLOCATED+CLOUD+NOT_RESPONDING+POWERING_UP", False),
+        ("DOWN*", True),
+        ("DOWN+CLOUD+POWERED_DOWN", True),
+        ("IDLE+DRAIN", True),
+        ("IDLE+NOT_RESPONDING", True),
+        ("IDLE+MAINTENANCE", True),
+    ],
+)
+def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_is_away(
+    state: str, away: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = f"NodeName=n1 CPUTot=4 RealMemory=8192 State={state} Gres=gpu:2\nNodeName=n2 State=FUTURE\n"
+    monkeypatch.setattr(slurm_commands, "call", lambda *command: line)
+    assert [(host.name, host.away) for host in list_hosts()] == [("slurm/n1", away)]
 
 
 def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
@@ -274,6 +327,11 @@ def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
             "Slurm: a limit of the account or QOS is reached (QOSMaxCpuPerUserLimit; job 5)",
         ),
         ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", "Slurm: nodes that it needs are down, drained or reserved"),
+        (
+            "PENDING",
+            "Nodes required for job are DOWN, DRAINED or reserved for jobs in higher priority partitions",
+            "Slurm: nodes that it needs are down, drained or reserved",
+        ),
         ("PENDING", "SomethingNew", "Slurm: waits (SomethingNew; job 5)"),
         ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
     ],

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from orchestrator.engines import slurm
 from orchestrator.engines.base import EngineError, NotYet
 from orchestrator.engines.slurm import SlurmEngine
+from orchestrator.engines.slurm_commands import call
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import read_outcome
-from tests.conftest import parent, wait_for
+from tests.conftest import MUSTER, Serving, parent, wait_for
 from tests.engines.sites import POLITE
 from tests.engines.slurm_bench import Bench, slurm_bench
 
@@ -101,6 +105,48 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         bench.cluster.start("n2")
 
 
+def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    go = threading.Event()
+
+    def slow(*command: str, text: str | None = None) -> str:
+        assert go.wait(60)
+        return call(*command, text=text)
+
+    monkeypatch.setattr(slurm, "call", slow)
+    monkeypatch.setattr(slurm, "_PATIENCE", 0.2)
+    gang = bench.gang("exit 4")
+    plan = bench.engine.plan(gang)
+    for _ in range(3):
+        asked = time.monotonic()
+        with pytest.raises(NotYet, match="Slurm: slurmctld has not answered yet; see `scontrol ping`") as late:
+            bench.engine.launch(plan)
+        assert late.value.unknown and time.monotonic() - asked < 5
+    go.set()
+    handle = bench.launch(gang)
+    assert [node.exit_code for node in bench.ended(handle)] == [4]
+    assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
+
+
+def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: Bench, tmp_path: Path) -> None:
+    served = Serving(tmp_path / "home", "--engine", "slurm")
+    daemon = bench.cluster.daemons["slurmctld"]
+    try:
+        job = served.gang("import time; print('ready', flush=True); time.sleep(600)", env={"MUSTER_DIRECTORY": "/tmp"})
+        served.wait(job, "RUNNING")
+        daemon.send_signal(signal.SIGSTOP)
+        command = [MUSTER, "stop", job]
+        stopping = subprocess.Popen(
+            command, env={**os.environ, "MUSTER_HOME": str(served.home)}, stderr=subprocess.PIPE, text=True
+        )
+        assert stopping.stderr is not None
+        assert "stopped by the user; waits for Slurm: slurmctld " in stopping.stderr.readline()
+        daemon.send_signal(signal.SIGCONT)
+        assert stopping.wait(120) == 0 and served.detail(job)["status"] == "FAILED"
+    finally:
+        daemon.send_signal(signal.SIGCONT)
+        served.close()
+
+
 @pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="half a minute: MUSTER_LONG=1, in make bits")
 def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
     handle = bench.launch(bench.gang(POLITE, 2))
@@ -108,7 +154,7 @@ def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
     bench.saved(handle)
     bench.cluster.kill("slurmctld")
     with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
-        bench.launch(bench.gang(suffix="2"))
+        bench.launch(bench.gang(suffix="2"))  # asks again while there is no answer
     assert all(node.running for node in bench.engine.observe(handle)), "no news is no end"
     with pytest.raises(EngineError, match=r"^slurmctld does not answer \(.*\); see `scontrol ping`$"):
         SlurmEngine()

@@ -8,10 +8,12 @@ import signal
 import socket
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
+from orchestrator.cli.jobs import _gpus
 from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
 
 
@@ -226,3 +228,17 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]
     never = f"job cartpole ({job['jobId'][:8]}) never started; submit it again"
     refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
+
+
+@pytest.mark.parametrize(
+    ("node", "said"),
+    [
+        ({"host": "localhost", "gpus": ["2", "3"]}, ", GPUs 2,3"),
+        ({"host": "ray/n1", "gpus": ["0", "1"]}, ", 2 GPUs"),
+        ({"host": "ray/n1", "gpus": ["0"], "devices": ["5"]}, ", GPUs 5"),
+        ({"host": "slurm/n1", "gpus": ["0"]}, ", 1 GPU"),
+        ({"host": "ray/n1", "gpus": []}, ""),
+    ],
+)
+def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, Any], said: str) -> None:
+    assert _gpus(node) == said

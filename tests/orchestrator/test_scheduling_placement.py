@@ -88,6 +88,47 @@ def test_why_a_gang_never_fits_is_told_of_the_nodes_that_it_can_not_do_without()
     )
 
 
+def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Host:
+    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, away=away)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "minimum", "why"),
+    [
+        ([node(0.5)] * 3, 3, "needs 3 hosts, one for each node; there are 2"),
+        ([node(0.5)] * 4, 3, "needs at least 3 hosts, one for each node; there are 2"),
+        (
+            [node(1, 1)] * 2,
+            2,
+            "needs 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1",
+        ),
+    ],
+)
+def test_too_few_hosts_that_take_a_node_each_are_counted_in_hosts(
+    nodes: list[NodeShape], minimum: int, why: str
+) -> None:
+    hosts = [single("a"), single("b", gpus=1)]
+    shape = gang(*nodes, minimum=minimum)
+    assert never_fits(shape, hosts) == why
+    assert never_fits(shape, hosts, elastic=True) is None, "more may come"
+
+
+def test_where_hosts_come_and_go_only_a_node_that_is_larger_than_any_is_refused() -> None:
+    assert never_fits(gang(node(8)), [], elastic=True) is None, "nobody knows what will come"
+    assert never_fits(gang(node(8)), [single("a")], elastic=True) == (
+        "each node needs 8 CPUs, 0 GPUs, 100 MiB; the largest host has 4 CPUs, 0 GPUs, 8 GiB"
+    )
+
+
+def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:
+    hosts = [single("a", away=True), single("b"), single("c")]
+    assert where(gang(*[node()] * 2), *hosts) == "b c"
+    assert where(gang(*[node()] * 3, minimum=2), *hosts) == "b c", "fewer nodes start now"
+    assert where(gang(*[node()] * 3), *hosts) == "b c a"
+    assert never_fits(gang(*[node()] * 3), hosts) is None
+    assert where(gang(*[node()] * 4), *hosts) is None
+
+
 nodes = st.builds(node, st.sampled_from([0.5, 1, 2, 3, 5]), st.integers(0, 3), st.sampled_from([100, 500, 2000]))
 hosts_strategy = st.lists(
     st.tuples(st.sampled_from([0, 1, 2.5, 4, 8]), st.integers(0, 4), st.sampled_from([50, 1000, 4000])), max_size=4
