@@ -37,10 +37,17 @@ class Host:
     """MiB."""
     single: bool = False
     """Takes one node of a gang at most."""
+    machine: str = ""
+    """Hosts of several engines that are one machine have the same, and what one of them gives away the others lack; empty: it
+    has a machine of its own."""
 
     def left(self, cpus: float, gpus: tuple[str, ...], memory: int) -> Host:
         """The same host with that much of it."""
-        return Host(self.name, cpus, gpus, memory, self.single)
+        return Host(self.name, cpus, gpus, memory, self.single, self.machine)
+
+
+HERE = "localhost"
+"""The machine of hosts that are the controller's own."""
 
 
 def engine_of(host: str) -> str:

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import docker
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
@@ -27,6 +28,7 @@ from docker.models.networks import Network
 from docker.types import DeviceRequest, IPAMConfig, IPAMPool, Mount, Ulimit
 
 from orchestrator.engines.base import (
+    HERE,
     EngineError,
     Gang,
     GangStatus,
@@ -83,6 +85,7 @@ class DockerEngine:
             cpus or self._cores,
             tuple(gpus if gpus is not None else visible_gpus()),
             int(info["MemTotal"] / 2**20),
+            machine=HERE if _is_here(str(self._client.api.base_url), str(info["Name"])) else "",
         )
         self.address = self._gateway()
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
@@ -295,6 +298,16 @@ class DockerEngine:
                 pass  # a container that is still going; the next stop removes it
         for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
             del self._copies[key]
+
+
+def _is_here(url: str, name: str) -> bool:
+    """Whether the Docker Engine at ``url``, on a machine of this name, is this machine's own.
+
+    A socket is taken for that, also by a controller in a container, which has another host name. One that is forwarded from
+    another machine is not: there less is handed out than there is, and never anything twice.
+    """
+    host = urlsplit(url).hostname  # docker-py has "localhost" for a Unix socket, and "ssh" for a machine behind SSH
+    return host in ("localhost", "127.0.0.1", "::1") or name == socket.gethostname()
 
 
 def _facts(gang: Gang) -> dict[str, Any]:

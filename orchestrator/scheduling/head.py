@@ -41,6 +41,7 @@ class Head:
     pools: tuple[str, ...]
     """Those whose hosts it is the head of."""
     hosts: frozenset[str]
+    """Those, and all that are one machine with one of them."""
     seat: Seat
     """Where it could start at ``spare.at``, with its smallest number of nodes."""
     spare: Spare
@@ -71,7 +72,7 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
         room: What is free now; not changed.
         holders: Every gang that holds resources.
     """
-    hosts = frozenset(host for pool in pools for host in room.members[pool])
+    hosts = room.reach(pools)
     ends = sorted(each for each in holders if each.pool in pools or any(p.host in hosts for p in each.placements))
     count = _fewest(job.shape, pools, room, [(each.pool, each.placements) for each in ends])
     at = ends[count - 1].end if count else inf
@@ -83,8 +84,10 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
     seat = _seat(job.shape, pools, then)
     if seat is None:
         return None
-    chosen = {placement.host for placement in seat.placements}
-    left = {name: less(then.hosts[name], [p for p in seat.placements if p.host == name]) for name in chosen}
+    chosen = {host for placement in seat.placements for host in room.beside(placement.host)}
+    left = {
+        name: less(then.hosts[name], [p for p in seat.placements if name in room.beside(p.host)]) for name in chosen
+    }
     spare = Spare(at, seat.pool, left, then.cpus[seat.pool] - sum(placement.cpus for placement in seat.placements))
     awaits = tuple(
         each
@@ -109,7 +112,7 @@ def victims(
         snapshot: The pass.
         ending: Jobs that are being stopped: what they hold counts as coming free.
     """
-    hosts = {host for pool in pools for host in room.members[pool]}
+    hosts = room.reach(pools)
     near = [gang for gang in snapshot.running if gang.pool in pools or any(p.host in hosts for p in gang.placements)]
     coming = room.copy()
     for gang in near:

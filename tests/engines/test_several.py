@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Serving
+from tests.conftest import Serving, wait_for
 from tests.engines.images import PLAIN, host_files
 from tests.engines.test_docker_faults import plain
 
@@ -23,6 +23,22 @@ def lines(served: Serving, *arguments: str) -> list[str]:
     done = served.muster(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
+
+
+@pytest.mark.usefixtures("docker_client")
+def test_the_cores_of_one_machine_are_handed_out_once(tmp_path: Path) -> None:
+    served = Serving(tmp_path, "--engine", "local", "--engine", "docker", "--cpus", "1")
+    try:
+        first = served.gang("import time; time.sleep(300)", cpus="0.95")
+        served.wait(first, "RUNNING")
+        second = plain(served, PLAIN, SCRIPT, "docker", **host_files())  # wants a tenth of a core
+        reason = wait_for(lambda: "needs" in (r := served.detail(second)["statusReason"]) and r, 20, "a reason")
+        assert "; 0.05 CPUs, 0 GPUs, " in reason and reason.endswith(f" free until job test ({first[:8]}) ends"), reason
+        served.client.batch("TerminateJob", jobId=first, reason="enough")
+        assert served.wait(second)["status"] == "SUCCEEDED", served.detail(second)
+        assert served.detail(second)["attempts"][0]["startedAt"] >= served.detail(first)["stoppedAt"]
+    finally:
+        served.close()
 
 
 @pytest.mark.usefixtures("docker_client")
