@@ -19,7 +19,7 @@ from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
+from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.pools import engine_options
@@ -42,6 +42,8 @@ _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
 """An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
+_STOP_AGAIN = 2.0
+"""Seconds after which a gang that could not be stopped is asked again."""
 
 
 class Gangs:
@@ -146,11 +148,14 @@ class Gangs:
         status = self.engine.observe(attempt.handle)
         ends = self._ends(job, attempt, status)
         main = gang_needs(job.node_properties).main
-        if job.status == Status.STARTING and status[main].waiting:
+        runs = f"attempt {attempt.number} runs on {_size(job, len(status))}"
+        if status[main].waiting:
             job.status_reason = status[main].waiting
         elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
-            job.move(Status.RUNNING, f"attempt {attempt.number} runs on {_size(job, len(status))}")
+            job.move(Status.RUNNING, runs)
+        elif attempt.ending is None:
+            job.status_reason = runs  # it can be seen again
         if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
             attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
             session.commit()
@@ -183,6 +188,7 @@ class Gangs:
                 self.engine.stop(handle, grace)
                 done.set_result(None)
             except BaseException as error:
+                time.sleep(_STOP_AGAIN)
                 done.set_exception(error)
             self.changed()
 
@@ -202,6 +208,8 @@ class Gangs:
         for index, end in enumerate(ends):
             if index != main and not needs.is_native:
                 continue  # on AWS a child's death changes nothing
+            if engine_of(attempt.nodes[index]["host"]) not in self.engine.names:
+                continue  # the bus does not listen where its nodes look for it
             silence = self.bus.silence(job.id, attempt.number, index, bool(attempt.nodes[index].get("met")))
             if end is None and silence is not None and silence > LOST:
                 reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
@@ -235,13 +243,14 @@ class Gangs:
             seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
             if self.bus.met(job.id, attempt.number, record["index"]):
                 seen["met"] = True  # the next controller must miss it, too, if it does not come back
-            records.append({**record, "address": node.address, **seen})
+            address = node.address or record.get("address", "")  # of a node that can't be seen it stays known
+            records.append({**record, "address": address, **seen})
         if records != attempt.nodes:
             attempt.nodes = records
         return ends
 
     def _stopped(self, job: Job, attempt: Attempt) -> bool:
-        """Stop the gang in the background; True once no process of it is left."""
+        """Stop the gang in the background, again where that failed; True once no process of it is left."""
         key = (job.id, attempt.number)
         if key not in self._stops:
             grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
@@ -249,9 +258,13 @@ class Gangs:
             self._stops[key] = self._stop(attempt.handle, grace)
         if not self._stops[key].done():
             return False
+        try:
+            self._stops.pop(key).result()
+        except EngineError as error:
+            job.status_reason = str(error)
+            return False
         self._finished.pop(key, None)
         self.bus.forget(*key)
-        self._stops.pop(key).result()
         return True
 
     def _close(

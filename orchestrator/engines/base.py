@@ -177,7 +177,7 @@ class NodeStatus:
     detail: str = ""
     """What the node's supervisor said on stderr, where it could not say it in the store."""
     waiting: str = ""
-    """Why the node, which counts as running, has not been started yet by an engine that queues."""
+    """Why the node, which counts as running, has not been started yet by an engine that queues, or can't be seen now."""
 
 
 GangStatus = Sequence[NodeStatus]
