@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 import socket
 import threading
@@ -39,11 +40,14 @@ from orchestrator.engines.base import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.docker_answers import NoAnswer, answered, unanswered
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store.layout import Store
 from shared_store.logs import format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
+
+log = logging.getLogger("muster.engines")
 
 STORE, KERNELS = "/muster/store", "/muster/kernels"
 """Where a container of an image with Muster finds the store and the cache of compiled kernels."""
@@ -75,10 +79,8 @@ class DockerEngine:
         try:
             self._client = docker.from_env(timeout=120)
             info = self._client.info()
-        except (DockerException, OSError) as error:
-            raise EngineError(
-                f"no Docker Engine answers ({error}); start it (systemctl start docker), or set DOCKER_HOST"
-            ) from error
+        except (DockerException, OSError, ValueError) as error:  # ValueError: of a DOCKER_HOST with half a port
+            raise EngineError(unanswered(error)) from error
         self._cores = float(info["NCPU"])
         self._host = Host(
             f"docker/{info['Name']}",
@@ -93,6 +95,7 @@ class DockerEngine:
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
         self._copies: dict[str, threading.Thread] = {}
         self._ended: dict[str, dict[int, NodeStatus]] = {}
+        self._away = False
 
     def capacity(self) -> Sequence[Host]:
         return [self._host]
@@ -102,6 +105,48 @@ class DockerEngine:
         return Plan(gang, self._nodes(gang, _addresses(_subnet(gang.name, 0), len(gang.placements))))
 
     def launch(self, plan: Plan) -> str:
+        with answered():
+            return self._launch(plan)
+
+    def observe(self, handle: str) -> GangStatus:
+        """While Docker Engine does not answer, the nodes count as running."""
+        facts = json.loads(handle)
+        try:
+            with answered():
+                status = self._observe(facts)
+            self._away = False
+        except NoAnswer as error:
+            if not self._away:  # said once, not at every look
+                log.warning("engine docker: %s", error)
+            self._away = True
+            return [NodeStatus(True, address, waiting=str(error)) for address in facts["addresses"]]
+        return status
+
+    def stop(self, handle: str, grace: float) -> None:
+        facts = json.loads(handle)
+        with answered():
+            found = self._containers(facts["gang"])
+            if found:
+                with ThreadPoolExecutor(len(found)) as pool:
+                    list(pool.map(lambda container: _stop(container, grace), found.values()))
+            self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
+            while len(self._ended) > _REMEMBERED:
+                del self._ended[next(iter(self._ended))]
+            self._remove(facts["gang"])
+
+    def _gateway(self) -> str | None:
+        """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
+        try:
+            [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
+            with socket.socket() as probe:
+                probe.bind((config["Gateway"], 0))
+            return str(config["Gateway"])
+        except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
+            return None
+
+    # -- starting -----------------------------------------------------------------------------------------------------
+
+    def _launch(self, plan: Plan) -> str:
         gang = plan.gang
         images = [self._image(str(container.get("image") or "")) for container in gang.containers]
         there = self._containers(gang.name)
@@ -119,49 +164,14 @@ class DockerEngine:
                     container = self._create(gang, nodes[index], images[index], network, addresses[index])
                     container.start()
                     self._follow(container, facts, index)
-        except APIError as error:
+        except BaseException as error:
             self._remove(gang.name)  # never half a gang
-            raise EngineError(f"CannotStartContainerError: Error response from daemon: {error.explanation}") from error
-        except BaseException:
-            self._remove(gang.name)
+            # 500: it has tried, and said why it can't; beyond that nobody has
+            if isinstance(error, APIError) and (error.status_code or 500) <= 500:
+                why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
+                raise EngineError(why) from error
             raise
         return json.dumps(facts)
-
-    def observe(self, handle: str) -> GangStatus:
-        facts = json.loads(handle)
-        found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
-        status = []
-        for index, address in enumerate(facts["addresses"]):
-            container = found.get(index)
-            if container is None:
-                status.append(ended.get(index) or NodeStatus(False, address))
-                continue
-            self._follow(container, facts, index)
-            status.append(self._status(container, facts, index, address))
-        return status
-
-    def stop(self, handle: str, grace: float) -> None:
-        facts = json.loads(handle)
-        found = self._containers(facts["gang"])
-        if found:
-            with ThreadPoolExecutor(len(found)) as pool:
-                list(pool.map(lambda container: _stop(container, grace), found.values()))
-        self._ended[facts["gang"]] = dict(enumerate(self.observe(handle)))
-        while len(self._ended) > _REMEMBERED:
-            del self._ended[next(iter(self._ended))]
-        self._remove(facts["gang"])
-
-    def _gateway(self) -> str | None:
-        """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
-        try:
-            [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
-            with socket.socket() as probe:
-                probe.bind((config["Gateway"], 0))
-            return str(config["Gateway"])
-        except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
-            return None
-
-    # -- starting -----------------------------------------------------------------------------------------------------
 
     def _image(self, name: str) -> Image:
         """The image; where it is not here it is pulled meanwhile. Raises NotYet, and EngineError in AWS's words."""
@@ -169,7 +179,9 @@ class DockerEngine:
             return self._client.images.get(name)
         except ImageNotFound:
             pass
-        except (APIError, DockerException) as error:
+        except DockerException as error:
+            if isinstance(error, APIError) and error.is_server_error():
+                raise
             raise EngineError(f"CannotInspectContainerError: image {name!r}: {error}") from error
         pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
         if not pull.done():
@@ -177,9 +189,10 @@ class DockerEngine:
             raise NotYet(f"pulling image {name}")
         try:
             return pull.result()
-        except (APIError, DockerException) as error:
+        except DockerException as error:
             why = error.explanation if isinstance(error, APIError) and error.explanation else str(error)
-            raise EngineError(f"CannotPullContainerError: Error response from daemon: {why}") from error
+            why = f"CannotPullContainerError: Error response from daemon: {why} (image {name})"
+            raise EngineError(why) from error
 
     def _network(self, gang: str) -> tuple[Network, str]:
         """The gang's network and its subnet, ``a.b.c.0/24``."""
@@ -244,6 +257,18 @@ class DockerEngine:
         found = self._client.containers.list(all=True, filters={"label": f"{_GANG}={gang}"}, ignore_removed=True)
         return {int(container.labels[_NODE]): container for container in found}
 
+    def _observe(self, facts: Mapping[str, Any]) -> GangStatus:
+        found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
+        status = []
+        for index, address in enumerate(facts["addresses"]):
+            container = found.get(index)
+            if container is None:
+                status.append(ended.get(index) or NodeStatus(False, address))
+                continue
+            self._follow(container, facts, index)
+            status.append(self._status(container, facts, index, address))
+        return status
+
     def _status(self, container: Container, facts: Mapping[str, Any], index: int, address: str) -> NodeStatus:
         state = container.attrs["State"]
         if state["Status"] in ("created", "running", "paused", "restarting"):
@@ -254,7 +279,10 @@ class DockerEngine:
         if container.labels.get("muster.plain"):
             self._settle(facts, index, state, detail)
         elif code and not detail:
-            detail = container.logs(tail=1).decode(errors="replace").strip()
+            try:
+                detail = container.logs(tail=1).decode(errors="replace").strip()
+            except APIError:  # a logging driver that can't be read
+                detail = ""
         return NodeStatus(False, address, code, detail)
 
     def _settle(self, facts: Mapping[str, Any], index: int, state: Mapping[str, Any], detail: str) -> None:
@@ -280,8 +308,8 @@ class DockerEngine:
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
             return
-        log = run.log(facts["job"], facts["attempt"], index)
-        copy = threading.Thread(target=_copy_log, args=(container, log), name=f"log {key}", daemon=True)
+        path = run.log(facts["job"], facts["attempt"], index)
+        copy = threading.Thread(target=_copy_log, args=(container, path), name=f"log {key}", daemon=True)
         self._copies[key] = copy
         copy.start()
 

@@ -218,7 +218,9 @@ def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(ben
             return str(error)
         raise AssertionError("it was launched")
 
-    assert wait_for(refused, 60, "the pull fails").startswith("CannotPullContainerError: Error response from daemon: ")
+    words = wait_for(refused, 60, "the pull fails")
+    assert words.startswith("CannotPullContainerError: Error response from daemon: ")
+    assert words.endswith(" (image muster-test-missing:1)")
     assert bench.left() == (0, 0)
 
 
