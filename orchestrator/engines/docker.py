@@ -13,9 +13,8 @@ import json
 import logging
 import os
 import socket
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -41,10 +40,10 @@ from orchestrator.engines.base import (
     node_plans,
 )
 from orchestrator.engines.docker_answers import NoAnswer, answered, unanswered
+from orchestrator.engines.docker_logs import LogCopy
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store.layout import Store
-from shared_store.logs import format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
 
 log = logging.getLogger("muster.engines")
@@ -93,7 +92,7 @@ class DockerEngine:
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
         self._pulls: dict[str, Future[Image]] = {}
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
-        self._copies: dict[str, threading.Thread] = {}
+        self._copies: dict[str, LogCopy] = {}
         self._ended: dict[str, dict[int, NodeStatus]] = {}
         self._away = False
 
@@ -289,7 +288,9 @@ class DockerEngine:
         """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written."""
         copy = self._copies.get(f"{facts['gang']}/{index}")
         if copy is not None:
-            copy.join(timeout=10.0)
+            copy.wait(10.0)
+            if copy.trouble is not None and not isinstance(copy.trouble, APIError):  # that one will stay
+                raise copy.trouble
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None or not run.path.exists():
             return
@@ -303,15 +304,13 @@ class DockerEngine:
     def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
         key = f"{facts['gang']}/{index}"
-        if not container.labels.get("muster.plain") or key in self._copies:
+        before = self._copies.get(key)
+        if not container.labels.get("muster.plain") or (before is not None and not before.is_due_again):
             return
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
             return
-        path = run.log(facts["job"], facts["attempt"], index)
-        copy = threading.Thread(target=_copy_log, args=(container, path), name=f"log {key}", daemon=True)
-        self._copies[key] = copy
-        copy.start()
+        self._copies[key] = LogCopy(container, run.log(facts["job"], facts["attempt"], index), before)
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():
@@ -409,23 +408,3 @@ def _stop(container: Container, grace: float) -> None:
             container.stop(timeout=int(max(1.0, grace)))
     except (NotFound, APIError):
         pass  # it ended meanwhile, or is being removed
-
-
-def _copy_log(container: Container, log: Path) -> None:
-    """Append what a container prints to ``log`` until it ends; what is there already is not copied twice."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    copied = log.read_bytes().count(b"\n") if log.exists() else 0
-    with open(log, "a", encoding="utf-8", errors="backslashreplace") as file:
-        for number, line in enumerate(_lines(container)):
-            if number >= copied:
-                file.write(format_line(time.time(), 0, "o", line))
-                file.flush()
-
-
-def _lines(container: Container) -> Iterator[str]:
-    rest = b""
-    for chunk in container.logs(stream=True, follow=True):
-        *whole, rest = (rest + chunk).split(b"\n")
-        yield from (line.decode(errors="backslashreplace") for line in whole)
-    if rest:
-        yield rest.decode(errors="backslashreplace")

@@ -182,6 +182,35 @@ def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: B
     assert [node.exit_code for node in bench.ended(handle, successor)] == [0, 0]
 
 
+def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_printed(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("echo early; sleep 2; echo late", 1))
+    log = bench.store.run("run").log(JOB, 1, 0)
+    early = wait_for(lambda: log.exists() and log.read_text(), 10, "the first line")
+    log.unlink()  # what the first controller still writes is lost with it
+    log.write_text("half a li")  # as a disk that is full leaves it
+    bench.ended(handle, bench.another())
+    lines = log.read_text()
+    assert lines.startswith(early) and bench.log() == ["early", "late"], lines
+
+
+def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> None:
+    log = bench.store.run("run").log(JOB, 1, 0)
+    log.mkdir(parents=True)
+    long = "x" * 40_000  # Docker keeps it in pieces of 16 KiB
+    handle = bench.launch(bench.gang(f"echo {long}; echo done; exit 3", 1))
+
+    def refused() -> bool:
+        try:
+            return not bench.engine.observe(handle)
+        except IsADirectoryError:
+            return True
+
+    wait_for(refused, 20, "the store's error")
+    log.rmdir()
+    [node] = wait_for(lambda: not refused() and bench.ended(handle), 20, "the end")
+    assert node.exit_code == 3 and bench.log() == [long, "done"]
+
+
 def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
     polite = bench.launch(bench.gang(POLITE, 2))
     wait_for(lambda: bench.log().count("ready") == 2, 20, "both are ready")

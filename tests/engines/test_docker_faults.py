@@ -124,6 +124,7 @@ def test_a_docker_engine_that_goes_away_is_waited_for(
         wait_for(lambda: says(second, "RUNNING", "attempt 1 runs on 1 node"), 20, "it is seen again")
         served.client.batch("TerminateJob", jobId=second, reason="enough")
         assert served.wait(second)["statusReason"] == "enough"
+        assert served.log(second) == ["ready", "saved"], "its log goes on where it was"
     finally:
         served.close()
     assert served.process.stderr is not None
