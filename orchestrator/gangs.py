@@ -229,9 +229,11 @@ class Gangs:
                 outcome = read_outcome(run, job.id, attempt.number, record["index"])
                 if outcome:
                     message = outcome.error.message if outcome.error else None
+                    # a supervisor sees that its rank was killed; only the engine knows for what
+                    starved = outcome.signal == "SIGKILL" and node.detail.startswith("OutOfMemoryError")
                     end = NodeEnd(
                         outcome.exit_code,
-                        outcome.reason,
+                        node.detail if starved else outcome.reason,
                         outcome.error.time if outcome.error else outcome.ended,
                         message,
                     )

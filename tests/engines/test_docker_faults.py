@@ -15,6 +15,7 @@ import pytest
 from orchestrator.client import ApiError
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
+from shared_store.outcomes import read_outcome
 from tests.conftest import Serving, wait_for
 from tests.engines.images import PATH, PLAIN, SUPERVISED, host_files
 from tests.engines.sites import POLITE, WAIT
@@ -130,6 +131,25 @@ def test_a_docker_engine_that_goes_away_is_waited_for(
     assert served.process.stderr is not None
     said = served.process.stderr.read()
     assert said.count("no Docker Engine answers") <= 2 and "Traceback" not in said and "store" not in said, said
+
+
+@pytest.mark.usefixtures("docker_client")
+def test_memory_beyond_the_limit_is_named_under_a_supervisor_too(tmp_path: Path) -> None:
+    served = Serving(tmp_path, "--engine", "docker")
+    try:
+        needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "128"}]
+        environment = [{"name": "PATH", "value": PATH}]
+        script = "exec python3 -c 'x = bytearray(300 << 20); print(len(x))'"
+        files = {**host_files(), "resourceRequirements": needs}
+        job = plain(served, SUPERVISED, script, environment=environment, **files)
+        if served.wait(job)["status"] == "SUCCEEDED":
+            pytest.skip("THIS KERNEL DOES NOT LIMIT MEMORY")
+        [node] = served.detail(job)["attempts"][0]["nodes"]
+        assert node["reason"] == "OutOfMemoryError: Container killed due to memory usage", (node, served.log(job))
+        outcome = read_outcome(Store(tmp_path / "store").run(served.detail(job)["run"]), job, 1, 0)
+        assert node["exitCode"] == 137 and outcome is not None and outcome.signal == "SIGKILL", (node, outcome)
+    finally:
+        served.close()
 
 
 def ask_stacks(served: Serving, job: str) -> Any:
