@@ -16,6 +16,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -43,6 +44,7 @@ from orchestrator.engines.docker_answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker_logs import LogCopy
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
+from shared_store import __version__
 from shared_store.layout import Store
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
 
@@ -52,6 +54,8 @@ STORE, KERNELS = "/muster/store", "/muster/kernels"
 """Where a container of an image with Muster finds the store and the cache of compiled kernels."""
 _GANG, _NODE = "muster.gang", "muster.node"
 """Labels of containers and networks."""
+_VERSION = "muster.version"
+"""Label of images that have Muster in them."""
 _REMEMBERED = 256
 """Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
 _PORT = 29500
@@ -148,6 +152,8 @@ class DockerEngine:
     def _launch(self, plan: Plan) -> str:
         gang = plan.gang
         images = [self._image(str(container.get("image") or "")) for container in gang.containers]
+        for image, container, command in zip(images, gang.containers, gang.commands, strict=True):
+            _check_image(str(container["image"]), image, command)
         there = self._containers(gang.name)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
@@ -216,7 +222,7 @@ class DockerEngine:
 
     def _create(self, gang: Gang, node: NodePlan, image: Image, network: Network, address: str) -> Container:
         container = gang.containers[node.contract.node_index]
-        supervised = "muster.version" in (image.labels or {})
+        supervised = _VERSION in (image.labels or {})
         entrypoint = list((image.attrs.get("Config") or {}).get("Entrypoint") or [])
         options = {**_limits(container, node, self._cores), **_linux(container)}
         mounts = [Mount(m.target, m.source, "bind", read_only=m.read_only) for m in mounts_of(container, gang.store)]
@@ -325,6 +331,21 @@ class DockerEngine:
                 pass  # a container that is still going; the next stop removes it
         for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
             del self._copies[key]
+
+
+def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
+    """Raises EngineError where the image lacks the Muster that the command needs, or has another one than the controller."""
+    version = (image.labels or {}).get(_VERSION)
+    module = next((b for a, b in pairwise(command) if a == "-m" and b.startswith("worker.")), None)
+    if version is None and module is not None:
+        raise EngineError(
+            f"image {name} has no Muster in it (no label {_VERSION}), which {module} needs: build it FROM the image of "
+            "containers/Dockerfile"
+        )
+    if version not in (None, __version__):
+        raise EngineError(
+            f"image {name} has Muster {version}, the controller {__version__}: build it anew with the controller's version"
+        )
 
 
 def _is_here(url: str, name: str) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
+from shared_store import __version__
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
@@ -250,6 +251,30 @@ def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(ben
     words = wait_for(refused, 60, "the pull fails")
     assert words.startswith("CannotPullContainerError: Error response from daemon: ")
     assert words.endswith(" (image muster-test-missing:1)")
+    assert bench.left() == (0, 0)
+
+
+def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_starts(bench: Bench) -> None:
+    gang = bench.gang()
+    train = Gang(**{**gang.__dict__, "commands": [["python", "-P", "-m", "worker.train"]] * 2})
+    with pytest.raises(EngineError) as refused:
+        bench.engine.launch(bench.engine.plan(train))
+    assert str(refused.value) == (
+        f"image {PLAIN} has no Muster in it (no label muster.version), which worker.train needs: build it FROM the image of "
+        "containers/Dockerfile"
+    )
+    old = "muster-test-old:1"
+    bench.client.api.import_image_from_data(
+        bytes(1024), repository="muster-test-old", tag="1", changes=["LABEL muster.version=0.0.1"]
+    )
+    try:
+        with pytest.raises(EngineError) as refused:
+            bench.engine.launch(bench.engine.plan(bench.gang(image=old)))
+    finally:
+        bench.client.images.remove(old)
+    assert str(refused.value) == (
+        f"image {old} has Muster 0.0.1, the controller {__version__}: build it anew with the controller's version"
+    )
     assert bench.left() == (0, 0)
 
 
