@@ -154,7 +154,7 @@ class Gangs:
         elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
             job.move(Status.RUNNING, runs)
-        elif attempt.ending is None:
+        elif attempt.ending is None and job.status_reason != runs:
             job.status_reason = runs  # it can be seen again
         if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
             attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code

@@ -152,9 +152,10 @@ class DockerEngine:
     def _launch(self, plan: Plan) -> str:
         gang = plan.gang
         images = [self._image(str(container.get("image") or "")) for container in gang.containers]
-        for image, container, command in zip(images, gang.containers, gang.commands, strict=True):
-            _check_image(str(container["image"]), image, command)
         there = self._containers(gang.name)
+        for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
+            if index not in there:
+                _check_image(str(gang.containers[index]["image"]), image, command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
         nodes = self._nodes(gang, addresses)

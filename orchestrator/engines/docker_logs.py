@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -50,6 +51,8 @@ class LogCopy:
             _copy(self._container, self._path)
             self._check_ended()
         except Exception as error:
+            if isinstance(error, struct.error):  # half a frame's head
+                error = requests.ConnectionError(f"the log of container {self._container.name} was cut off")
             self._ended, self.trouble = time.monotonic(), error
             # of an engine that went away its observer speaks
             if not isinstance(error, requests.RequestException | HTTPError) and self._known != str(error):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -84,10 +85,11 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
     seat = _seat(job.shape, pools, then)
     if seat is None:
         return None
-    chosen = {host for placement in seat.placements for host in room.beside(placement.host)}
-    left = {
-        name: less(then.hosts[name], [p for p in seat.placements if name in room.beside(p.host)]) for name in chosen
-    }
+    chosen: defaultdict[str, list[Placement]] = defaultdict(list)
+    for placement in seat.placements:
+        for name in room.beside(placement.host):
+            chosen[name].append(placement)
+    left = {name: less(then.hosts[name], taken) for name, taken in chosen.items()}
     spare = Spare(at, seat.pool, left, then.cpus[seat.pool] - sum(placement.cpus for placement in seat.placements))
     awaits = tuple(
         each

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
-from tests.conftest import wait_for
+from tests.conftest import REPOSITORY, wait_for
 from tests.engines.images import PATH, PLAIN, SUPERVISED, host_files
 from tests.engines.sites import POLITE, STUBBORN, WAIT
 
@@ -276,6 +277,27 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
         f"image {old} has Muster 0.0.1, the controller {__version__}: build it anew with the controller's version"
     )
     assert bench.left() == (0, 0)
+
+
+def test_images_that_are_built_here_say_the_controller_s_version() -> None:
+    said = (REPOSITORY / "containers" / "Dockerfile").read_text()
+    assert f"muster.version={__version__} " in said and f"image.version={__version__} " in said
+
+
+@pytest.mark.parametrize(
+    ("url", "name", "here"),
+    [
+        ("http+docker://localhost", "in-another-container", True),
+        ("http://127.0.0.1:2375", "elsewhere", True),
+        ("http://gpu-1:2375", "gpu-1", False),
+        ("http+docker://ssh", "gpu-1", False),
+        ("http+docker://ssh", socket.gethostname(), True),
+    ],
+)
+def test_a_docker_engine_of_this_machine_is_known_as_such(url: str, name: str, here: bool) -> None:
+    from orchestrator.engines.docker import _is_here
+
+    assert _is_here(url, name) is here
 
 
 def test_a_command_that_is_not_in_the_image_fails_and_leaves_nothing(bench: Bench) -> None:
