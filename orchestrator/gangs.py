@@ -20,7 +20,7 @@ from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet
+from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.pools import engine_options
@@ -150,11 +150,14 @@ class Gangs:
         status = self.engine.observe(attempt.handle)
         ends = self._ends(job, attempt, status)
         main = gang_needs(job.node_properties).main
-        if job.status == Status.STARTING and status[main].waiting:
+        runs = f"attempt {attempt.number} runs on {_size(job, len(status))}"
+        if status[main].waiting:
             job.status_reason = status[main].waiting
         elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
-            job.move(Status.RUNNING, f"attempt {attempt.number} runs on {_size(job, len(status))}")
+            job.move(Status.RUNNING, runs)
+        elif attempt.ending is None and job.status_reason != runs:
+            job.status_reason = runs  # it can be seen again
         if attempt.ending is None and (verdict := self._verdict(job, attempt, ends, main)):
             attempt.ending, attempt.status_reason, attempt.exit_code = verdict.ending, verdict.reason, verdict.exit_code
             session.commit()
@@ -209,6 +212,8 @@ class Gangs:
         for index, end in enumerate(ends):
             if index != main and not needs.is_native:
                 continue  # on AWS a child's death changes nothing
+            if engine_of(attempt.nodes[index]["host"]) not in self.engine.names:
+                continue  # the bus does not listen where its nodes look for it
             silence = self.bus.silence(job.id, attempt.number, index, bool(attempt.nodes[index].get("met")))
             if end is None and silence is not None and silence > LOST:
                 reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
@@ -228,9 +233,11 @@ class Gangs:
                 outcome = read_outcome(run, job.id, attempt.number, record["index"])
                 if outcome:
                     message = outcome.error.message if outcome.error else None
+                    # a supervisor sees that its rank was killed; only the engine knows for what
+                    starved = outcome.signal == "SIGKILL" and node.detail.startswith("OutOfMemoryError")
                     end = NodeEnd(
                         outcome.exit_code,
-                        outcome.reason,
+                        node.detail if starved else outcome.reason,
                         outcome.error.time if outcome.error else outcome.ended,
                         message,
                     )
@@ -244,7 +251,8 @@ class Gangs:
                 seen["met"] = True  # the next controller must miss it, too, if it does not come back
             if node.gpus:
                 seen["devices"] = list(node.gpus)  # "gpus" are the scheduler's, which counts with them
-            records.append({**record, "address": node.address, **seen})
+            address = node.address or record.get("address", "")  # of a node that can't be seen it stays known
+            records.append({**record, "address": address, **seen})
         if records != attempt.nodes:
             attempt.nodes = records
         return ends

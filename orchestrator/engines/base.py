@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
@@ -43,10 +43,17 @@ class Host:
     """Takes one node of a gang at most."""
     away: bool = False
     """Takes no node now, and may again: an engine that queues is given a gang that needs it, and waits for it."""
+    machine: str = ""
+    """Hosts of several engines that are one machine have the same, and what one of them gives away the others lack; empty: it
+    has a machine of its own."""
 
     def left(self, cpus: float, gpus: tuple[str, ...], memory: int) -> Host:
         """The same host with that much of it."""
-        return Host(self.name, cpus, gpus, memory, self.single, self.away)
+        return replace(self, cpus=cpus, gpus=gpus, memory=memory)
+
+
+HERE = "localhost"
+"""The machine of hosts that are the controller's own."""
 
 
 def engine_of(host: str) -> str:
@@ -177,7 +184,7 @@ class NodeStatus:
     """What the node's supervisor said on stderr, where it could not say it in the store; of a node that runs, why nothing can be
     told it now."""
     waiting: str = ""
-    """Why the node, which counts as running, has not been started yet by an engine that queues."""
+    """Why the node, which counts as running, has not been started yet by an engine that queues, or can't be seen now."""
     gpus: tuple[str, ...] = ()
     """Ids of those that it has, from an engine that hands them out itself and tells."""
 

@@ -10,14 +10,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 import socket
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import docker
 from docker.errors import APIError, DockerException, ImageNotFound, NotFound
@@ -27,6 +29,7 @@ from docker.models.networks import Network
 from docker.types import DeviceRequest, IPAMConfig, IPAMPool, Mount, Ulimit
 
 from orchestrator.engines.base import (
+    HERE,
     EngineError,
     Gang,
     GangStatus,
@@ -37,16 +40,22 @@ from orchestrator.engines.base import (
     Plan,
     node_plans,
 )
+from orchestrator.engines.docker_answers import NoAnswer, answered, unanswered
+from orchestrator.engines.docker_logs import LogCopy
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
+from shared_store import __version__
 from shared_store.layout import Store
-from shared_store.logs import format_line
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
+
+log = logging.getLogger("muster.engines")
 
 STORE, KERNELS = "/muster/store", "/muster/kernels"
 """Where a container of an image with Muster finds the store and the cache of compiled kernels."""
 _GANG, _NODE = "muster.gang", "muster.node"
 """Labels of containers and networks."""
+_VERSION = "muster.version"
+"""Label of images that have Muster in them."""
 _REMEMBERED = 256
 """Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
 _PORT = 29500
@@ -74,23 +83,23 @@ class DockerEngine:
         try:
             self._client = docker.from_env(timeout=120)
             info = self._client.info()
-        except (DockerException, OSError) as error:
-            raise EngineError(
-                f"no Docker Engine answers ({error}); start it (systemctl start docker), or set DOCKER_HOST"
-            ) from error
+        except (DockerException, OSError, ValueError) as error:  # ValueError: of a DOCKER_HOST with half a port
+            raise EngineError(unanswered(error)) from error
         self._cores = float(info["NCPU"])
         self._host = Host(
             f"docker/{info['Name']}",
             cpus or self._cores,
             tuple(gpus if gpus is not None else visible_gpus()),
             int(info["MemTotal"] / 2**20),
+            machine=HERE if _is_here(str(self._client.api.base_url), str(info["Name"])) else "",
         )
         self.address = self._gateway()
         self._kernels = Path(os.environ.get("WARP_CACHE_PATH", home / "kernels"))
         self._pulls: dict[str, Future[Image]] = {}
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
-        self._copies: dict[str, threading.Thread] = {}
+        self._copies: dict[str, LogCopy] = {}
         self._ended: dict[str, dict[int, NodeStatus]] = {}
+        self._away = False
 
     def capacity(self) -> Sequence[Host]:
         return [self._host]
@@ -100,9 +109,54 @@ class DockerEngine:
         return Plan(gang, self._nodes(gang, _addresses(_subnet(gang.name, 0), len(gang.placements))))
 
     def launch(self, plan: Plan) -> str:
+        with answered():
+            return self._launch(plan)
+
+    def observe(self, handle: str) -> GangStatus:
+        """While Docker Engine does not answer, the nodes count as running."""
+        facts = json.loads(handle)
+        try:
+            with answered():
+                status = self._observe(facts)
+            self._away = False
+        except NoAnswer as error:
+            if not self._away:  # said once, not at every look
+                log.warning("engine docker: %s", error)
+            self._away = True
+            return [NodeStatus(True, address, waiting=str(error)) for address in facts["addresses"]]
+        return status
+
+    def stop(self, handle: str, grace: float) -> None:
+        facts = json.loads(handle)
+        with answered():
+            found = self._containers(facts["gang"])
+            if found:
+                with ThreadPoolExecutor(len(found)) as pool:
+                    list(pool.map(lambda container: _stop(container, grace), found.values()))
+            self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
+            while len(self._ended) > _REMEMBERED:
+                del self._ended[next(iter(self._ended))]
+            self._remove(facts["gang"])
+
+    def _gateway(self) -> str | None:
+        """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
+        try:
+            [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
+            with socket.socket() as probe:
+                probe.bind((config["Gateway"], 0))
+            return str(config["Gateway"])
+        except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
+            return None
+
+    # -- starting -----------------------------------------------------------------------------------------------------
+
+    def _launch(self, plan: Plan) -> str:
         gang = plan.gang
         images = [self._image(str(container.get("image") or "")) for container in gang.containers]
         there = self._containers(gang.name)
+        for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
+            if index not in there:
+                _check_image(str(gang.containers[index]["image"]), image, command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
         nodes = self._nodes(gang, addresses)
@@ -117,49 +171,14 @@ class DockerEngine:
                     container = self._create(gang, nodes[index], images[index], network, addresses[index])
                     container.start()
                     self._follow(container, facts, index)
-        except APIError as error:
+        except BaseException as error:
             self._remove(gang.name)  # never half a gang
-            raise EngineError(f"CannotStartContainerError: Error response from daemon: {error.explanation}") from error
-        except BaseException:
-            self._remove(gang.name)
+            # 500: it has tried, and said why it can't; beyond that nobody has
+            if isinstance(error, APIError) and (error.status_code or 500) <= 500:
+                why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
+                raise EngineError(why) from error
             raise
         return json.dumps(facts)
-
-    def observe(self, handle: str) -> GangStatus:
-        facts = json.loads(handle)
-        found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
-        status = []
-        for index, address in enumerate(facts["addresses"]):
-            container = found.get(index)
-            if container is None:
-                status.append(ended.get(index) or NodeStatus(False, address))
-                continue
-            self._follow(container, facts, index)
-            status.append(self._status(container, facts, index, address))
-        return status
-
-    def stop(self, handle: str, grace: float) -> None:
-        facts = json.loads(handle)
-        found = self._containers(facts["gang"])
-        if found:
-            with ThreadPoolExecutor(len(found)) as pool:
-                list(pool.map(lambda container: _stop(container, grace), found.values()))
-        self._ended[facts["gang"]] = dict(enumerate(self.observe(handle)))
-        while len(self._ended) > _REMEMBERED:
-            del self._ended[next(iter(self._ended))]
-        self._remove(facts["gang"])
-
-    def _gateway(self) -> str | None:
-        """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
-        try:
-            [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
-            with socket.socket() as probe:
-                probe.bind((config["Gateway"], 0))
-            return str(config["Gateway"])
-        except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
-            return None
-
-    # -- starting -----------------------------------------------------------------------------------------------------
 
     def _image(self, name: str) -> Image:
         """The image; where it is not here it is pulled meanwhile. Raises NotYet, and EngineError in AWS's words."""
@@ -167,7 +186,9 @@ class DockerEngine:
             return self._client.images.get(name)
         except ImageNotFound:
             pass
-        except (APIError, DockerException) as error:
+        except DockerException as error:
+            if isinstance(error, APIError) and error.is_server_error():
+                raise
             raise EngineError(f"CannotInspectContainerError: image {name!r}: {error}") from error
         pull = self._pulls.pop(name, None) or self._puller.submit(self._client.images.pull, name)
         if not pull.done():
@@ -175,9 +196,10 @@ class DockerEngine:
             raise NotYet(f"pulling image {name}")
         try:
             return pull.result()
-        except (APIError, DockerException) as error:
+        except DockerException as error:
             why = error.explanation if isinstance(error, APIError) and error.explanation else str(error)
-            raise EngineError(f"CannotPullContainerError: Error response from daemon: {why}") from error
+            why = f"CannotPullContainerError: Error response from daemon: {why} (image {name})"
+            raise EngineError(why) from error
 
     def _network(self, gang: str) -> tuple[Network, str]:
         """The gang's network and its subnet, ``a.b.c.0/24``."""
@@ -202,7 +224,7 @@ class DockerEngine:
 
     def _create(self, gang: Gang, node: NodePlan, image: Image, network: Network, address: str) -> Container:
         container = gang.containers[node.contract.node_index]
-        supervised = "muster.version" in (image.labels or {})
+        supervised = _VERSION in (image.labels or {})
         entrypoint = list((image.attrs.get("Config") or {}).get("Entrypoint") or [])
         options = {**_limits(container, node, self._cores), **_linux(container)}
         mounts = [Mount(m.target, m.source, "bind", read_only=m.read_only) for m in mounts_of(container, gang.store)]
@@ -242,6 +264,18 @@ class DockerEngine:
         found = self._client.containers.list(all=True, filters={"label": f"{_GANG}={gang}"}, ignore_removed=True)
         return {int(container.labels[_NODE]): container for container in found}
 
+    def _observe(self, facts: Mapping[str, Any]) -> GangStatus:
+        found, ended = self._containers(facts["gang"]), self._ended.get(facts["gang"], {})
+        status = []
+        for index, address in enumerate(facts["addresses"]):
+            container = found.get(index)
+            if container is None:
+                status.append(ended.get(index) or NodeStatus(False, address))
+                continue
+            self._follow(container, facts, index)
+            status.append(self._status(container, facts, index, address))
+        return status
+
     def _status(self, container: Container, facts: Mapping[str, Any], index: int, address: str) -> NodeStatus:
         state = container.attrs["State"]
         if state["Status"] in ("created", "running", "paused", "restarting"):
@@ -252,14 +286,19 @@ class DockerEngine:
         if container.labels.get("muster.plain"):
             self._settle(facts, index, state, detail)
         elif code and not detail:
-            detail = container.logs(tail=1).decode(errors="replace").strip()
+            try:
+                detail = container.logs(tail=1).decode(errors="replace").strip()
+            except APIError:  # a logging driver that can't be read
+                detail = ""
         return NodeStatus(False, address, code, detail)
 
     def _settle(self, facts: Mapping[str, Any], index: int, state: Mapping[str, Any], detail: str) -> None:
         """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written."""
         copy = self._copies.get(f"{facts['gang']}/{index}")
         if copy is not None:
-            copy.join(timeout=10.0)
+            copy.wait(10.0)
+            if copy.trouble is not None and not isinstance(copy.trouble, APIError):  # that one will stay
+                raise copy.trouble
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None or not run.path.exists():
             return
@@ -273,15 +312,13 @@ class DockerEngine:
     def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
         key = f"{facts['gang']}/{index}"
-        if not container.labels.get("muster.plain") or key in self._copies:
+        before = self._copies.get(key)
+        if not container.labels.get("muster.plain") or (before is not None and not before.is_due_again):
             return
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
             return
-        log = run.log(facts["job"], facts["attempt"], index)
-        copy = threading.Thread(target=_copy_log, args=(container, log), name=f"log {key}", daemon=True)
-        self._copies[key] = copy
-        copy.start()
+        self._copies[key] = LogCopy(container, run.log(facts["job"], facts["attempt"], index), before)
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():
@@ -296,6 +333,31 @@ class DockerEngine:
                 pass  # a container that is still going; the next stop removes it
         for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
             del self._copies[key]
+
+
+def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
+    """Raises EngineError where the image lacks the Muster that the command needs, or has another one than the controller."""
+    version = (image.labels or {}).get(_VERSION)
+    module = next((b for a, b in pairwise(command) if a == "-m" and b.startswith("worker.")), None)
+    if version is None and module is not None:
+        raise EngineError(
+            f"image {name} has no Muster in it (no label {_VERSION}), which {module} needs: build it FROM the image of "
+            "containers/Dockerfile"
+        )
+    if version not in (None, __version__):
+        raise EngineError(
+            f"image {name} has Muster {version}, the controller {__version__}: build it anew with the controller's version"
+        )
+
+
+def _is_here(url: str, name: str) -> bool:
+    """Whether the Docker Engine at ``url``, on a machine of this name, is this machine's own.
+
+    A socket is taken for that, also by a controller in a container, which has another host name. One that is forwarded from
+    another machine is not: there less is handed out than there is, and never anything twice.
+    """
+    host = urlsplit(url).hostname  # docker-py has "localhost" for a Unix socket, and "ssh" for a machine behind SSH
+    return host in ("localhost", "127.0.0.1", "::1") or name == socket.gethostname()
 
 
 def _facts(gang: Gang) -> dict[str, Any]:
@@ -369,23 +431,3 @@ def _stop(container: Container, grace: float) -> None:
             container.stop(timeout=int(max(1.0, grace)))
     except (NotFound, APIError):
         pass  # it ended meanwhile, or is being removed
-
-
-def _copy_log(container: Container, log: Path) -> None:
-    """Append what a container prints to ``log`` until it ends; what is there already is not copied twice."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    copied = log.read_bytes().count(b"\n") if log.exists() else 0
-    with open(log, "a", encoding="utf-8", errors="backslashreplace") as file:
-        for number, line in enumerate(_lines(container)):
-            if number >= copied:
-                file.write(format_line(time.time(), 0, "o", line))
-                file.flush()
-
-
-def _lines(container: Container) -> Iterator[str]:
-    rest = b""
-    for chunk in container.logs(stream=True, follow=True):
-        *whole, rest = (rest + chunk).split(b"\n")
-        yield from (line.decode(errors="backslashreplace") for line in whole)
-    if rest:
-        yield rest.decode(errors="backslashreplace")

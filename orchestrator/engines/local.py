@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from orchestrator.engines.base import PRIVATE, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
+from orchestrator.engines.base import HERE, PRIVATE, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
 from shared_store.layout import Store
@@ -47,6 +47,7 @@ class LocalEngine:
             cpus or float(os.cpu_count() or 1),
             tuple(gpus if gpus is not None else visible_gpus()),
             _memory(),
+            machine=HERE,
         )
         self._children: dict[int, subprocess.Popen[bytes]] = {}
 

@@ -6,9 +6,26 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from orchestrator.engines.base import Engine, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, engine_of
+from orchestrator.engines.base import (
+    Engine,
+    EngineError,
+    Gang,
+    GangStatus,
+    Host,
+    NodeStatus,
+    NotYet,
+    Plan,
+    engine_of,
+)
 
 log = logging.getLogger("muster.engines")
+
+
+class NotServed(NotYet):
+    """This controller was started without the engine, on which something of the gang may run."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, unknown=True)
 
 
 class Several:
@@ -69,19 +86,20 @@ class Several:
         return f"{name} {len(plan.nodes)} {self._engine(name).launch(plan)}"
 
     def observe(self, handle: str) -> GangStatus:
+        """Of a gang whose engine is not served now nothing is known: it counts as running."""
         name, count, rest = handle.split(" ", 2)
-        if name not in self.engines:
-            lost = f"it was started on the engine {name}, which this controller does not have: muster serve --engine {name}"
-            return [NodeStatus(False, "", None, lost)] * int(count)
-        return self.engines[name].observe(rest)
+        try:
+            return self._engine(name).observe(rest)
+        except NotServed as error:
+            return [NodeStatus(True, "", waiting=str(error))] * int(count)
 
     def stop(self, handle: str, grace: float) -> None:
+        """As the engine does it. Raises EngineError where it can't, or is not served now."""
         name, _, rest = handle.split(" ", 2)
-        if name in self.engines:
-            self.engines[name].stop(rest, grace)
+        self._engine(name).stop(rest, grace)
 
     def _engine(self, name: str) -> Engine:
         try:
             return self.engines[name]
         except KeyError:
-            raise EngineError(f"this controller has no engine {name!r}; it has {', '.join(self.engines)}") from None
+            raise NotServed(f"engine {name} is not served now; start muster serve with --engine {name}") from None

@@ -132,7 +132,7 @@ class _Pass:
         self.room.take(seat)
         for head in self.heads:
             if head.spare.binds(end):
-                head.spare.take(seat)
+                head.spare.take(seat, self.room)
         if lane.quota is not None:
             lane.quota.take(seat.pool, seat.placements)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -41,6 +42,7 @@ class Head:
     pools: tuple[str, ...]
     """Those whose hosts it is the head of."""
     hosts: frozenset[str]
+    """Those, and all that are one machine with one of them."""
     seat: Seat
     """Where it could start at ``spare.at``, with its smallest number of nodes."""
     spare: Spare
@@ -71,7 +73,7 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
         room: What is free now; not changed.
         holders: Every gang that holds resources.
     """
-    hosts = frozenset(host for pool in pools for host in room.members[pool])
+    hosts = room.reach(pools)
     ends = sorted(each for each in holders if each.pool in pools or any(p.host in hosts for p in each.placements))
     count = _fewest(job.shape, pools, room, [(each.pool, each.placements) for each in ends])
     at = ends[count - 1].end if count else inf
@@ -83,8 +85,11 @@ def reserve(job: Waiting, pools: tuple[str, ...], room: Room, holders: Iterable[
     seat = _seat(job.shape, pools, then)
     if seat is None:
         return None
-    chosen = {placement.host for placement in seat.placements}
-    left = {name: less(then.hosts[name], [p for p in seat.placements if p.host == name]) for name in chosen}
+    chosen: defaultdict[str, list[Placement]] = defaultdict(list)
+    for placement in seat.placements:
+        for name in room.beside(placement.host):
+            chosen[name].append(placement)
+    left = {name: less(then.hosts[name], taken) for name, taken in chosen.items()}
     spare = Spare(at, seat.pool, left, then.cpus[seat.pool] - sum(placement.cpus for placement in seat.placements))
     awaits = tuple(
         each
@@ -109,7 +114,7 @@ def victims(
         snapshot: The pass.
         ending: Jobs that are being stopped: what they hold counts as coming free.
     """
-    hosts = {host for pool in pools for host in room.members[pool]}
+    hosts = room.reach(pools)
     near = [gang for gang in snapshot.running if gang.pool in pools or any(p.host in hosts for p in gang.placements)]
     coming = room.copy()
     for gang in near:

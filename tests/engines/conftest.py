@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from shared_store import __version__
 from tests.engines.images import PLAIN, SUPERVISED
 from tests.engines.sites import SITES, Site
 from tests.engines.slurm_cluster import SlurmCluster, started
@@ -30,7 +31,7 @@ def docker_client() -> Iterator[Any]:
         scratch = tarfile.TarInfo("tmp")
         scratch.type, scratch.mode = tarfile.DIRTYPE, 0o1777
         tar.addfile(scratch)
-    for name, changes in ((PLAIN, []), (SUPERVISED, ["LABEL muster.version=test"])):
+    for name, changes in ((PLAIN, []), (SUPERVISED, [f"LABEL muster.version={__version__}"])):
         repository, _, tag = name.partition(":")
         client.api.import_image_from_data(empty.getvalue(), repository=repository, tag=tag, changes=changes)
     yield client

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import Any
 import pytest
 
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
+from shared_store import __version__
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
-from tests.conftest import wait_for
+from tests.conftest import REPOSITORY, wait_for
 from tests.engines.images import PATH, PLAIN, SUPERVISED, host_files
 from tests.engines.sites import POLITE, STUBBORN, WAIT
 
@@ -182,6 +184,35 @@ def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: B
     assert [node.exit_code for node in bench.ended(handle, successor)] == [0, 0]
 
 
+def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_printed(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("echo early; sleep 2; echo late", 1))
+    log = bench.store.run("run").log(JOB, 1, 0)
+    early = wait_for(lambda: log.exists() and log.read_text(), 10, "the first line")
+    log.unlink()  # what the first controller still writes is lost with it
+    log.write_text("half a li")  # as a disk that is full leaves it
+    bench.ended(handle, bench.another())
+    lines = log.read_text()
+    assert lines.startswith(early) and bench.log() == ["early", "late"], lines
+
+
+def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> None:
+    log = bench.store.run("run").log(JOB, 1, 0)
+    log.mkdir(parents=True)
+    long = "x" * 40_000  # Docker keeps it in pieces of 16 KiB
+    handle = bench.launch(bench.gang(f"echo {long}; echo done; exit 3", 1))
+
+    def refused() -> bool:
+        try:
+            return not bench.engine.observe(handle)
+        except IsADirectoryError:
+            return True
+
+    wait_for(refused, 20, "the store's error")
+    log.rmdir()
+    [node] = wait_for(lambda: not refused() and bench.ended(handle), 20, "the end")
+    assert node.exit_code == 3 and bench.log() == [long, "done"]
+
+
 def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
     polite = bench.launch(bench.gang(POLITE, 2))
     wait_for(lambda: bench.log().count("ready") == 2, 20, "both are ready")
@@ -218,8 +249,55 @@ def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(ben
             return str(error)
         raise AssertionError("it was launched")
 
-    assert wait_for(refused, 60, "the pull fails").startswith("CannotPullContainerError: Error response from daemon: ")
+    words = wait_for(refused, 60, "the pull fails")
+    assert words.startswith("CannotPullContainerError: Error response from daemon: ")
+    assert words.endswith(" (image muster-test-missing:1)")
     assert bench.left() == (0, 0)
+
+
+def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_starts(bench: Bench) -> None:
+    gang = bench.gang()
+    train = Gang(**{**gang.__dict__, "commands": [["python", "-P", "-m", "worker.train"]] * 2})
+    with pytest.raises(EngineError) as refused:
+        bench.engine.launch(bench.engine.plan(train))
+    assert str(refused.value) == (
+        f"image {PLAIN} has no Muster in it (no label muster.version), which worker.train needs: build it FROM the image of "
+        "containers/Dockerfile"
+    )
+    old = "muster-test-old:1"
+    bench.client.api.import_image_from_data(
+        bytes(1024), repository="muster-test-old", tag="1", changes=["LABEL muster.version=0.0.1"]
+    )
+    try:
+        with pytest.raises(EngineError) as refused:
+            bench.engine.launch(bench.engine.plan(bench.gang(image=old)))
+    finally:
+        bench.client.images.remove(old)
+    assert str(refused.value) == (
+        f"image {old} has Muster 0.0.1, the controller {__version__}: build it anew with the controller's version"
+    )
+    assert bench.left() == (0, 0)
+
+
+def test_images_that_are_built_here_say_the_controller_s_version() -> None:
+    said = (REPOSITORY / "containers" / "Dockerfile").read_text()
+    assert f"muster.version={__version__} " in said and f"image.version={__version__} " in said
+
+
+@pytest.mark.parametrize(
+    ("url", "name", "here"),
+    [
+        ("http+docker://localhost", "in-another-container", True),
+        ("http://127.0.0.1:2375", "elsewhere", True),
+        ("http://gpu-1:2375", "gpu-1", False),
+        ("http+docker://ssh", "gpu-1", False),
+        ("http+docker://ssh", socket.gethostname(), True),
+    ],
+)
+def test_a_docker_engine_of_this_machine_is_known_as_such(url: str, name: str, here: bool) -> None:
+    from orchestrator.engines.docker import _is_here
+
+    assert _is_here(url, name) is here
 
 
 def test_a_command_that_is_not_in_the_image_fails_and_leaves_nothing(bench: Bench) -> None:

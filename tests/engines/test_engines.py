@@ -28,8 +28,9 @@ def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
         "serve", "--port", "0", "--engine", "docker", home=tmp_path, DOCKER_HOST="unix:///nowhere.sock"
     )
     assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
-    assert refused.stderr.startswith("muster: no Docker Engine answers (")
-    assert refused.stderr.endswith("start it (systemctl start docker), or set DOCKER_HOST\n")
+    assert refused.stderr == (
+        "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
+    )
 
 
 def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import socket
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.conftest import Serving
+from tests.conftest import Serving, wait_for
 from tests.engines.images import PLAIN, host_files
+from tests.engines.sites import POLITE
 from tests.engines.test_docker_faults import plain
 
 SCRIPT = "echo on $(hostname)"
@@ -23,6 +26,63 @@ def lines(served: Serving, *arguments: str) -> list[str]:
     done = served.muster(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
+
+
+@pytest.mark.usefixtures("docker_client")
+def test_the_cores_of_one_machine_are_handed_out_once(tmp_path: Path) -> None:
+    served = Serving(tmp_path, "--engine", "local", "--engine", "docker", "--cpus", "1")
+    try:
+        first = served.gang("import time; time.sleep(300)", cpus="0.95")
+        served.wait(first, "RUNNING")
+        second = plain(served, PLAIN, SCRIPT, "docker", **host_files())  # wants a tenth of a core
+        reason = wait_for(lambda: "needs" in (r := served.detail(second)["statusReason"]) and r, 20, "a reason")
+        assert "; 0.05 CPUs, 0 GPUs, " in reason and reason.endswith(f" free until job test ({first[:8]}) ends"), reason
+        served.client.batch("TerminateJob", jobId=first, reason="enough")
+        assert served.wait(second)["status"] == "SUCCEEDED", served.detail(second)
+        assert served.detail(second)["attempts"][0]["startedAt"] >= served.detail(first)["stoppedAt"]
+    finally:
+        served.close()
+
+
+def test_a_gang_outlives_a_controller_that_does_not_serve_its_engine(docker_client: Any, tmp_path: Path) -> None:
+    both = ("--engine", "local", "--engine", "docker")
+    served = Serving(tmp_path, *both)
+
+    def again(*options: str) -> None:
+        served.client.close()
+        served.kill()
+        served.options = options
+        served.start()
+
+    def says(reason: str) -> bool:
+        found = served.detail(job)
+        return (found["status"], found["statusReason"]) == ("RUNNING", reason)
+
+    def containers() -> list[Any]:
+        mine: list[Any] = docker_client.containers.list(filters={"label": f"muster.gang={job}/1/1"})
+        return mine
+
+    try:
+        job = plain(served, PLAIN, POLITE, "docker", **host_files())
+        address = served.wait(job, "RUNNING")["attempts"][0]["nodes"][0]["address"]
+        again("--engine", "local")
+        away = "engine docker is not served now; start muster serve with --engine docker"
+        wait_for(lambda: says(away), 20, "the reason")
+        again(*both)
+        wait_for(lambda: says("attempt 1 runs on 1 node"), 20, "it is seen again")
+        again("--engine", "local")
+        wait_for(lambda: says(away), 20, "the reason")
+        served.client.batch("TerminateJob", jobId=job, reason="enough")
+        time.sleep(3)  # it is tried again every two seconds
+        assert says(away) and len(containers()) == 1
+        assert served.detail(job)["attempts"][0]["nodes"][0]["address"] == address
+        again(*both)
+        done = served.wait(job)
+        assert (done["status"], done["statusReason"]) == ("FAILED", "enough") and not containers()
+    finally:
+        served.close()
+        for container in containers():
+            container.remove(force=True)
 
 
 @pytest.mark.usefixtures("docker_client")

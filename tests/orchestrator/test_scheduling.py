@@ -331,6 +331,31 @@ def test_an_elastic_gang_shrinks_to_what_the_pool_may_use() -> None:
     assert started(decide(snapshot([host(cpus=16)], waiting, pools=[pool(max_cpus=5)]))) == "ant:a+a"
 
 
+def test_one_machine_that_two_engines_have_is_not_given_out_twice() -> None:
+    one = Host("localhost", 4, ("0",), 8192, machine="localhost")
+    two = Host("docker/here", 4, ("0",), 8192, machine="localhost")
+    queues = [queue("local", pools=("local",)), queue("docker", pools=("docker",))]
+    pools = [Pool(name, True, None, None, name) for name in ("local", "docker")]
+    for cpus, gpus in (1, ("0",)), (3, ()):
+        shape = gang(node(cpus, len(gpus)))
+        both = [job("a", shape, queue="docker"), job("b", shape, queue="local")]
+        decisions = decide(snapshot([one, two], both, queues=queues, pools=pools))
+        assert started(decisions) == "a:docker/here" and "free" in reason(decisions, "b")
+        held = [running("a", Placement("docker/here", gpus, cpus, 100), pool="docker")]
+        decisions = decide(snapshot([one, two], both[1:], held, queues=queues, pools=pools))
+        assert started(decisions) == "" and "until job a (a-012345) ends" in reason(decisions, "b")
+    # what a head of one engine waits for is kept by the other too, but for what it leaves
+    held = [running("a", on("localhost", 2), pool="local", timeout=200)]
+    waiting = line(
+        job("head", gang(node(3)), queue="docker"), job("late", queue="local"), job("b", gang(node(1)), queue="local")
+    )
+    decisions = decide(snapshot([one, two], waiting, held, queues=queues, pools=pools))
+    assert started(decisions) == "late:localhost" and "behind job head" in reason(decisions, "b")
+    # and a compute environment of every engine has it once
+    everywhere = decide(snapshot([one, two], [job("both", gang(node(3), node(3)))]))
+    assert started(everywhere) == "" and "all hosts together have 4 CPUs, 1 GPU" in reason(everywhere, "both")
+
+
 def test_pools_that_share_a_host_do_not_give_it_out_twice() -> None:
     pools = [pool("p", ("a",)), pool("q", ("a", "b"))]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]

@@ -1,0 +1,101 @@
+"""Logs of containers without a supervisor: copied into the run's while they are written."""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+
+import requests
+from docker.models.containers import Container
+from urllib3.exceptions import HTTPError
+
+from shared_store.logs import format_line
+
+_TIME = re.compile(rb"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z) ")
+_AGAIN = 1.0
+"""Seconds from a copy that failed to the next."""
+_ENDING = 1.0
+"""Seconds that a container may still count as running after its log has ended."""
+
+log = logging.getLogger("muster.engines")
+
+
+class LogCopy:
+    """Appends what a container prints to a log until it ends, in a thread. What is there already is not copied twice."""
+
+    def __init__(self, container: Container, path: Path, before: LogCopy | None) -> None:
+        """``before``: the copy that failed, and that this one goes on from."""
+        self.trouble: Exception | None = None
+        """Why it ended before its container: a store that is full, a Docker Engine that went away."""
+        self._container, self._path, self._ended = container, path, 0.0
+        self._known = str(before.trouble) if before is not None else ""
+        self._thread = threading.Thread(target=self._run, name=f"log {container.name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_due_again(self) -> bool:
+        """It failed, and may be made anew: what it could not copy is still there."""
+        return self.trouble is not None and time.monotonic() - self._ended > _AGAIN
+
+    def wait(self, seconds: float) -> None:
+        self._thread.join(seconds)
+
+    def _run(self) -> None:
+        try:
+            _copy(self._container, self._path)
+            self._check_ended()
+        except Exception as error:
+            if isinstance(error, struct.error):  # half a frame's head
+                error = requests.ConnectionError(f"the log of container {self._container.name} was cut off")
+            self._ended, self.trouble = time.monotonic(), error
+            # of an engine that went away its observer speaks
+            if not isinstance(error, requests.RequestException | HTTPError) and self._known != str(error):
+                log.warning("log of container %s: not copied now (%s); trying again", self._container.name, error)
+
+    def _check_ended(self) -> None:
+        """Raises requests.ConnectionError where the log ended before its container: the engine went away in between."""
+        deadline = time.monotonic() + _ENDING
+        while True:
+            self._container.reload()
+            if self._container.status not in ("running", "paused", "restarting"):
+                return
+            if time.monotonic() > deadline:
+                raise requests.ConnectionError(f"the log of container {self._container.name} was cut off")
+            time.sleep(0.05)
+
+
+def _copy(container: Container, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "ab+") as file:
+        file.seek(0)
+        there = file.read()
+        copied = there.count(b"\n")
+        file.truncate(there.rfind(b"\n") + 1)  # half a line, where the disk was full
+        for number, (at, line) in enumerate(_lines(container)):
+            if number >= copied:
+                file.write(format_line(at, 0, "o", line).encode(errors="backslashreplace"))
+                file.flush()
+
+
+def _lines(container: Container) -> Iterator[tuple[float, str]]:
+    """Every line and when it was printed [Unix s], which Docker remembers: a line is never dated anew."""
+    rest, at = b"", 0.0
+    for chunk in container.logs(stream=True, follow=True, timestamps=True):
+        # one write of the container, or 16 KiB of a longer one, each with its time
+        if found := _TIME.match(chunk):
+            began, chunk = datetime.fromisoformat(found[1].decode()).timestamp(), chunk[found.end() :]
+        else:
+            began = time.time()
+        at = at if rest else began
+        *whole, rest = (rest + chunk).split(b"\n")
+        for line in whole:
+            yield at, line.decode(errors="backslashreplace")
+            at = began
+    if rest:
+        yield at, rest.decode(errors="backslashreplace")
