@@ -17,4 +17,5 @@ print(
     f"rank {rank} of {world} on node {os.environ['NODE_RANK']}: sum = {value.item():.0f}, expected {world * (world + 1) // 2}"
 )
 assert value.item() == world * (world + 1) // 2
+dist.barrier()  # who leaves first closes connections that another may still read
 dist.destroy_process_group()
