@@ -10,7 +10,7 @@ import pytest
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import Serving, wait_for
-from tests.engines.sites import kill_supervisor, processes
+from tests.engines.sites import SITES, kill_supervisor, processes
 from tests.engines.training import same_bits, submit
 
 pytestmark = pytest.mark.cluster
@@ -42,3 +42,21 @@ def test_a_run_that_goes_from_engine_to_engine_ends_with_the_bits_of_one_that_st
     finally:
         serving.close()
     same_bits(tmp_path / "store", "far", "straight")
+
+
+def test_a_training_on_aws_that_loses_a_node_ends_with_the_bits_of_one_that_does_not(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """On its own volume, which the controller does not see: so it is no stage of the run above."""
+    with SITES["aws-batch"](tmp_path, request) as site:
+        job = submit(site.serving, "lost", "aws-batch", STAGE)
+        run = Store(site.volume).run("lost")
+        wait_for(lambda: len(read_metrics(run)) >= 5, 120, "some iterations")
+        kill_supervisor(job, 1)
+        done = site.serving.wait(job, timeout=180)
+        assert done["status"] == "SUCCEEDED", (done["statusReason"], site.serving.log(job)[-20:])
+        assert [attempt["number"] for attempt in done["attempts"]] == [1, 2]
+        assert any("resumed from checkpoint" in line for line in site.serving.log(job, attempt=2))
+        straight = submit(site.serving, "straight", "aws-batch", STAGE)
+        assert site.serving.wait(straight, timeout=180)["status"] == "SUCCEEDED"
+    same_bits(site.volume, "lost", "straight")
