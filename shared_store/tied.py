@@ -25,15 +25,23 @@ def tied(command: Sequence[str], ignoring: Sequence[int] = ()) -> list[str]:
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, *command]
 
 
-def main(parent: str, ignored: str, *command: str) -> None:
-    """Become ``command``; 127 and one line on standard error where that is not possible."""
+def follow(parent: int) -> None:
+    """Have this process, and what it becomes by exec, killed by the kernel when its parent, ``parent``, dies.
+
+    The parent may read its stacks, also under Yama's ptrace_scope 1.
+    """
     import ctypes  # what starts commands with this module need not pay for it
 
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    libc.prctl(_PR_SET_PTRACER, int(parent), 0, 0, 0)  # its stacks may be read by us, also under Yama's ptrace_scope 1
-    if os.getppid() != int(parent):  # it died before the kernel was told
+    libc.prctl(_PR_SET_PTRACER, parent, 0, 0, 0)
+    if os.getppid() != parent:  # it died before the kernel was told
         os._exit(1)
+
+
+def main(parent: str, ignored: str, *command: str) -> None:
+    """Become ``command``; 127 and one line on standard error where that is not possible."""
+    follow(int(parent))
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):  # Python and others change these
         signal.signal(number, signal.SIG_DFL)
     for each in filter(None, ignored.split(",")):

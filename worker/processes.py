@@ -1,4 +1,4 @@
-"""What a node does to processes: tie its own life to its parent's, adopt orphans, end everything it ever started.
+"""What a node does to processes: adopt orphans, end everything it ever started.
 
 Linux only: it uses ``prctl(2)`` and ``/proc``. Imports no torch.
 """
@@ -10,17 +10,8 @@ import os
 import signal
 from pathlib import Path
 
-_PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
 _libc = ctypes.CDLL(None, use_errno=True)
-
-
-def follow_parent() -> None:
-    """Have this process, and what it becomes by exec, killed by the kernel when its parent dies."""
-    parent = os.getppid()
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def adopt_orphans() -> None:

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from shared_store.contract import NodeContract
+from shared_store.tied import follow
 from worker.network import address_towards
-from worker.processes import follow_parent
 
 _PORTS, _SLOTS, _EACH = 20000, 600, 20
 """Below the ports that the kernel hands out: 600 jobs in a row each have 20 of their own, so that two on one host do not meet."""
@@ -105,7 +105,7 @@ def start(meeting: Mapping[str, Any]) -> NoReturn:
     devnull = os.open(os.devnull, os.O_RDONLY)
     os.dup2(devnull, 0)
     # the tie holds over exec: where Slurm's process on this host dies, the supervisor dies, and its ranks with it
-    follow_parent()
+    follow(os.getppid())
     os.execve(sys.executable, [sys.executable, "-P", "-m", "worker.supervisor", "--", *command], environment)
 
 
