@@ -137,15 +137,21 @@ class Resources(_Section):
     memory: Memory = Field(default=1024, ge=4, description="memory, such as 4GiB")
 
 
+Counts = Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
+Activation = Literal[
+    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
+]
+
+
 class PPO(_Section):
     """Overrides of the task's own PPO configuration; what is not given stays as the task has it."""
 
     steps: int | None = Field(default=None, ge=1, description="steps per world and iteration")
-    hidden_sizes: list[int] | None = Field(default=None, min_length=1)
-    channels: list[int] | None = Field(default=None, min_length=1, description="of each convolution, for images")
-    kernel_sizes: list[int] | None = Field(default=None, min_length=1, description="of each convolution [px]")
-    strides: list[int] | None = Field(default=None, min_length=1, description="of each convolution [px]")
-    activation: str | None = None
+    hidden_sizes: Counts | None = None
+    channels: Counts | None = Field(default=None, description="of each convolution, for images")
+    kernel_sizes: Counts | None = Field(default=None, description="of each convolution [px]")
+    strides: Counts | None = Field(default=None, description="of each convolution [px]")
+    activation: Activation | None = None
     epochs: int | None = Field(default=None, ge=1)
     minibatches: int | None = Field(default=None, ge=1)
     learning_rate: float | None = Field(default=None, gt=0)

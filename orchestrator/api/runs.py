@@ -120,6 +120,7 @@ def resume(
         environment = {"MUSTER_RUN": run.name}
         if spec.train:
             if chosen:
+                _check_rate(run, before, spec, assignments)
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
@@ -159,6 +160,13 @@ def last_metrics(run: Run) -> dict[str, Any] | None:
     return history[-1] if history else None
 
 
+NETWORK = (
+    *("hidden_sizes", "activation", "normalize_observations", "init_std"),
+    *("channels", "kernel_sizes", "strides"),
+)
+"""Keys of ``train.ppo`` that a checkpoint's network holds, so that no resumed run can change them; the worker has the same list."""
+
+
 def _check_changes(run: Run, before: Spec, after: Spec) -> None:
     """A run is one history: what its state depends on can't change under it."""
     if before.train is None or after.train is None:
@@ -171,14 +179,26 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
             raise ClientError(
                 f"run {run.name}: train.{key} is {old!r} and can't become {new!r}; start a new run for that"
             )
-    for key in ("hidden_sizes", "activation", "normalize_observations"):
+    for key in NETWORK:
         old, new = getattr(before.train.ppo, key), getattr(after.train.ppo, key)
         if old != new:
             was, wanted = ("the task's own" if value is None else repr(value) for value in (old, new))
             raise ClientError(
-                f"run {run.name}: train.ppo.{key} is {was} and can't become {wanted}: it shapes the network; "
-                "start a new run for that"
+                f"run {run.name}: train.ppo.{key} is {was} and can't become {wanted}: it is part of the network "
+                "that the run has; start a new run for that"
             )
+
+
+def _check_rate(run: Run, before: Spec, after: Spec, assignments: Sequence[str]) -> None:
+    """Refuse a learning rate that is set to what it is: an adapted rate goes on from the checkpoint, unless the setting differs."""
+    if before.train is None or after.train is None or after.train.ppo.schedule == "fixed":
+        return
+    given = any(assignment.partition("=")[0] == "train.ppo.learning_rate" for assignment in assignments)
+    if given and before.train.ppo.learning_rate == after.train.ppo.learning_rate:
+        raise ClientError(
+            f"run {run.name}: train.ppo.learning_rate is {after.train.ppo.learning_rate!r} already, so that the run would go on with "
+            "the rate that its checkpoint has adapted; set another value, or train.ppo.schedule=fixed"
+        )
 
 
 def _choose(run: Run, iteration: int | None) -> Checkpoint | None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import ast
+import dataclasses
 import json
+import math
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import yaml
@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
-from orchestrator.spec import PPO, Spec, SpecError, known_tasks, override, validate
+from orchestrator.spec import Spec, SpecError, known_tasks, override, validate
 from orchestrator.specfile import load, read
+from worker.tasks.config import PPOConfig
 
 REPOSITORY = Path(__file__).parents[2]
 SHIPPED = sorted((REPOSITORY / "job_specs").glob("*.yaml"))
@@ -349,16 +350,24 @@ def test_lines_are_known_for_every_key(tmp_path: Path) -> None:
 # -- agreement with the worker ----------------------------------------------------------------------------------------
 
 
-def test_the_ppo_section_has_the_fields_of_the_worker_s_configuration() -> None:
-    module = ast.parse((REPOSITORY / "worker" / "tasks" / "config.py").read_text())  # importing it takes seconds
-    [theirs] = [each for each in module.body if isinstance(each, ast.ClassDef) and each.name == "PPOConfig"]
-    fields = {
-        each.target.id: ast.unparse(each.annotation)
-        for each in theirs.body
-        if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name)
-    }
-    assert list(PPO.model_fields) == list(fields)
-    for name, field in PPO.model_fields.items():
-        [kind] = [each for each in get_args(field.annotation) if each is not type(None)]
-        ours = {"list[int]": "tuple[int, ...]"}.get(str(kind), getattr(kind, "__name__", str(kind)))
-        assert ("str" if ours == "Literal" else ours) == fields[name], name
+PROBES = [0, 1, 2, -1, 0.0, 0.5, 1.0, 1.5, -0.5, math.nan, math.inf, True, False, "", "fixed", "linear", "elu", "ELU"]
+PROBES += [[], [8], [8, 0], [8, 1.5], [8, True], [8, 4, 2], ["8"], {}, "0.001"]
+
+
+@pytest.mark.parametrize("name", [item.name for item in dataclasses.fields(PPOConfig)])
+def test_the_worker_accepts_of_each_setting_of_ppo_what_the_job_file_accepts(name: str) -> None:
+    for value in PROBES:
+        section = {"task": "Ant", "worlds": 1, "iterations": 1, "ppo": {name: value}}
+        try:
+            validate({"name": "job", "train": section}, "job.yaml")
+            written = True
+        except SpecError:
+            written = False
+        try:
+            PPOConfig(**{name: value})
+            made = True
+        except ValueError as error:
+            assert "\n" not in str(error)
+            # the job file can't know how many convolutions the task has
+            made = str(error).startswith("channels, kernel_sizes and strides")
+        assert written == made, value

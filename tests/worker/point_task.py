@@ -10,25 +10,16 @@ from dataclasses import dataclass, field
 
 import torch
 
+from worker.tasks.config import PPOConfig
+
 
 @dataclass(frozen=True)
-class PointPPO:
+class PointPPO(PPOConfig):
     steps: int = 8
     hidden_sizes: tuple[int, ...] = (16, 16)
-    activation: str = "elu"
     epochs: int = 2
     minibatches: int = 2
-    learning_rate: float = 1.0e-3
-    schedule: str = "adaptive"
-    desired_kl: float = 0.01
-    gamma: float = 0.99
-    lam: float = 0.95
-    clip: float = 0.2
     entropy_coef: float = 0.001
-    value_loss_coef: float = 1.0
-    max_grad_norm: float = 1.0
-    init_std: float = 1.0
-    normalize_observations: bool = True
 
 
 @dataclass(frozen=True)

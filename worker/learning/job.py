@@ -111,7 +111,8 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
     Raises UserError for a key that does not exist or a value of another type, naming both.
     """
-    config = task.config_type()
+    with user_errors(f"task {task.__name__}: its own configuration"):
+        config = task.config_type()
     ppo = _override(config.ppo, section.get("ppo") or {}, "ppo")
     return _override(dataclasses.replace(config, ppo=ppo), section.get("config") or {}, "config")
 

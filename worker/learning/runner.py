@@ -162,9 +162,10 @@ class Runner:
         there = f"{self.ppo.share.total} worlds on {ranks}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
-        size = self.resumed.size / 1e6
+        size, rate = self.resumed.size / 1e6, self.state.set_rate
         return (
             f"resumed from checkpoint {self.resumed.name}: {there} ({size:.2f} MB in {self.state.load_seconds:.3f} s)"
+            + (f"; learning rate set to {rate:g}" if rate is not None else "")
         )
 
     def _tell_saved(self, lines: list[str]) -> None:
@@ -201,6 +202,7 @@ class Runner:
         collected, mishaps = extra[:ranks], extra[ranks : 2 * ranks]
         totals, signals = extra[2 * ranks : -len(SIGNALS)], extra[-len(SIGNALS) :]
         progress.iteration += 1
+        self.state.learning_rate = rate
         self.iterated += 1
         if not all(map(math.isfinite, values)):
             worst = ", ".join(f"{name} {value:g}" for name, value in zip(LOSSES, values, strict=True))

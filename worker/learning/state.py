@@ -64,6 +64,10 @@ class TrainingState:
         """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
         self.load_seconds = 0.0
         """How long it took to read and take over the checkpoint that was loaded [s]; its digests not counted."""
+        self.learning_rate: float | None = None
+        """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
+        self.set_rate: float | None = None
+        """The learning rate that this job sets in place of the checkpoint's; None where the checkpoint's stays."""
 
     def save(self) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
@@ -107,6 +111,7 @@ class TrainingState:
             "reward": self.progress.reward,
             "episode_length": self.progress.episode_length,
             "env_steps": self.progress.env_steps,
+            "learning_rate": self.learning_rate,
             "seconds": self.seconds,
         }
 
@@ -162,17 +167,35 @@ class TrainingState:
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and networks: {error}"
             ) from error
+        self.set_rate = self._rate_to_set(checkpoint)
+        if self.set_rate is not None:
+            self.ppo.learning_rate = self.set_rate
+        self.learning_rate = self.ppo.learning_rate
         self.seconds = float(checkpoint.manifest.get("seconds", 0.0))
         self._load_worlds(checkpoint)
         self.saver.committed, self.ordered_at = checkpoint.name, checkpoint.iteration
         self.load_seconds = time.perf_counter() - started
 
+    def _rate_to_set(self, checkpoint: Checkpoint) -> float | None:
+        """The learning rate of this job's configuration, where it replaces the one that ``checkpoint`` arrived at.
+
+        A fixed rate always does. An adapted one does where the job sets another than the job before it did: otherwise the run
+        would not go on as if it had never stopped.
+        """
+        config = self.task.config.ppo
+        if config.schedule == "fixed":
+            return float(config.learning_rate)
+        there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
+        for path in (("ppo", "learning_rate"), ("train", "ppo", "learning_rate")):
+            if "ppo" in there and _at(there, path) != _at(here, path):
+                return float(config.learning_rate)
+        return None
+
     def _check_fit(self, checkpoint: Checkpoint) -> None:
         """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        shape = (*_SHAPE, *_CONVOLUTIONS) if len(self.task.observation_shape) > 1 else _SHAPE
-        keys = [("task",), *(("train", key) for key in ("seed", "config")), *(("ppo", key) for key in shape)]
-        for path in keys:
+        learnt = [("ppo", key) for key in NETWORK if key in there.get("ppo", {})]
+        for path in [("task",), *(("train", key) for key in ("seed", "config")), *learnt]:
             old, new = _at(there, path), _at(here, path)
             if old != new:
                 raise UserError(
@@ -197,14 +220,14 @@ class TrainingState:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
 
 
-_SHAPE, _CONVOLUTIONS = (
-    ("hidden_sizes", "activation", "normalize_observations"),
-    ("channels", "kernel_sizes", "strides"),
+NETWORK = (
+    *("hidden_sizes", "activation", "normalize_observations", "init_std"),
+    *("channels", "kernel_sizes", "strides"),
 )
-"""Settings of PPO that shape the network, and those that do where observations are images."""
+"""Settings of PPO that make the network: a checkpoint holds what became of them, so that a resumed run can't change them."""
 
 
 def _at(facts: Any, path: tuple[str, ...]) -> Any:
     for key in path:
         facts = facts.get(key) if isinstance(facts, dict) else None
-    return facts or None  # no overrides are none, whether they are said or not
+    return None if facts == {} else facts  # overrides that are empty and overrides that are missing are the same

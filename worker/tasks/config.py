@@ -10,10 +10,20 @@ from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
+ACTIVATIONS = (
+    *("elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"),
+)
+"""Names of activations that rsl-rl's networks know."""
+SCHEDULES = ("adaptive", "fixed")
+
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Proximal policy optimisation for one task."""
+    """Proximal policy optimisation for one task.
+
+    Raises:
+        ValueError: A value has the wrong type or is out of range; the message names the field.
+    """
 
     steps: int = 32
     """Control steps of every world in one iteration."""
@@ -26,7 +36,7 @@ class PPOConfig:
     strides: tuple[int, ...] = (4, 2, 1)
     """Their strides [px]."""
     activation: str = "elu"
-    """Activation between layers, by torch's lower-case name (``"elu"``, ``"relu"``, ``"tanh"``)."""
+    """Activation between layers, one of :data:`ACTIVATIONS`."""
     epochs: int = 5
     """Passes over the collected batch in one iteration."""
     minibatches: int = 4
@@ -55,9 +65,37 @@ class PPOConfig:
     """Whether observations are normalised by their running mean and variance; images never are."""
 
     def __post_init__(self) -> None:
-        lengths = {len(self.channels), len(self.kernel_sizes), len(self.strides)}
-        if len(lengths) > 1 or not self.channels:
+        for name in ("steps", "epochs", "minibatches"):
+            if not _is_count(value := getattr(self, name)):
+                raise ValueError(f"{name}: expected a whole number of at least 1, got {value!r}")
+        for name in ("hidden_sizes", "channels", "kernel_sizes", "strides"):
+            value = getattr(self, name)
+            if not isinstance(value, list | tuple) or not value or not all(map(_is_count, value)):
+                shown = list(value) if isinstance(value, tuple) else value
+                raise ValueError(f"{name}: expected a list of whole numbers of at least 1, got {shown!r}")
+            object.__setattr__(self, name, tuple(value))
+        if len({len(self.channels), len(self.kernel_sizes), len(self.strides)}) > 1:
             raise ValueError("channels, kernel_sizes and strides: give one number of each for every convolution")
+        for name, known in (("activation", ACTIVATIONS), ("schedule", SCHEDULES)):
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"{name}: expected one of {', '.join(known)}; got {value!r}")
+        for name, least, most, words in _PPO_NUMBERS:
+            value = getattr(self, name)
+            if not _is_finite(value) or not least <= value <= most:
+                raise ValueError(f"{name}: expected a number {words}, got {value!r}")
+            object.__setattr__(self, name, float(value))
+        if not isinstance(self.normalize_observations, bool):
+            raise ValueError(f"normalize_observations: expected true or false, got {self.normalize_observations!r}")
+
+
+_LEAST = math.nextafter(0.0, 1.0)
+_PPO_NUMBERS = (
+    *((name, _LEAST, math.inf, "above 0") for name in ("learning_rate", "desired_kl", "clip", "max_grad_norm")),
+    ("init_std", _LEAST, math.inf, "above 0"),
+    *((name, 0.0, 1.0, "from 0 to 1") for name in ("gamma", "lam")),
+    *((name, 0.0, math.inf, "of 0 or more") for name in ("entropy_coef", "value_loss_coef")),
+)
+"""Numbers of :class:`PPOConfig`: name, least, greatest, and the range in words."""
 
 
 _SCALARS = ("push_interval", "push_velocity", "observation_noise")
@@ -123,6 +161,10 @@ class Randomization:
             )
         if bool(self.push_interval) != bool(self.push_velocity):
             raise ValueError("push_interval and push_velocity: give both, or none")
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def _is_finite(value: object) -> bool:
