@@ -7,6 +7,7 @@ job model. It is carried whole in the definition's environment, so that a run ca
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from orchestrator.excerpts import excerpt, shown
 from shared_store.layout import NAME
 
 KINDS = ("train", "evaluate", "export", "command")
@@ -21,6 +23,10 @@ KINDS = ("train", "evaluate", "export", "command")
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+LONGEST_CHANGES = 24 << 10
+"""Characters of all ``--set`` assignments together: as many as a job definition has."""
 
 
 class SpecError(Exception):
@@ -75,21 +81,34 @@ def _task_name(value: str) -> str:
         return value
     nearest = difflib.get_close_matches(value, known, 1, cutoff=0.4)
     hint = f"; did you mean {nearest[0]}?" if nearest else ""
-    raise ValueError(f"no task is called {value!r}{hint} (known: {', '.join(known)}; your own: module:Class)")
+    raise ValueError(f"no task is called {shown(value)}{hint} (known: {', '.join(known)}; your own: module:Class)")
 
 
 def _environment(value: dict[str, str]) -> dict[str, str]:
     for name, text in value.items():
         if name.startswith(("AWS_BATCH", "MUSTER_")):
-            raise ValueError(f"{name} is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster")
+            raise ValueError(
+                f"{excerpt(name, 60)} is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+            )
         if not name or "=" in name or "\0" in name + text:
-            raise ValueError(f"{name!r} can't be set: a name has no '=', and neither name nor value a zero byte")
+            raise ValueError(f"{shown(name)} can't be set: a name has no '=', and neither name nor value a zero byte")
     return value
 
 
 def _argument(value: str) -> str:
     if "\0" in value:
         raise ValueError("expected a text without a zero byte")
+    return value
+
+
+def _finite(value: dict[str, Any]) -> dict[str, Any]:
+    """The spec travels as JSON, which has no infinity."""
+    left: list[object] = [value]
+    while left:
+        each = left.pop()
+        if isinstance(each, float) and not math.isfinite(each):
+            raise ValueError(f"expected finite numbers, found {each}")
+        left += each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
     return value
 
 
@@ -175,7 +194,9 @@ class Train(_Section):
     iterations: int = Field(ge=1)
     seed: int = Field(default=1, ge=0, lt=2**31)
     ppo: PPO = Field(default_factory=PPO)
-    config: dict[str, Any] = Field(default_factory=dict, description="overrides of the task's own configuration")
+    config: Annotated[dict[str, Any], AfterValidator(_finite)] = Field(
+        default_factory=dict, description="overrides of the task's own configuration"
+    )
 
 
 class Evaluate(_Section):
@@ -289,23 +310,30 @@ def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[st
     """The document with ``key.path=value`` assignments applied (values are read as YAML). Raises SpecError."""
     import copy
 
-    import yaml
+    from orchestrator import strict_yaml  # PyYAML takes a while to import, and most commands need none
 
+    size = sum(map(len, assignments))
+    if size > LONGEST_CHANGES:
+        raise SpecError(f"--set: {size} characters of changes; at most {LONGEST_CHANGES}")
     result = copy.deepcopy(dict(document))
     for assignment in assignments:
         key, sign, text = assignment.partition("=")
+        named = f"--set {excerpt(assignment, 100)}"
         if not sign or not all(key.split(".")):
-            raise SpecError(f"--set {assignment}: expected KEY=VALUE, such as train.iterations=600")
+            raise SpecError(f"{named}: expected KEY=VALUE, such as train.iterations=600")
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise SpecError(f"--set {assignment}: the value is not valid YAML") from None
+            value, _ = strict_yaml.load(text)
+        except strict_yaml.YamlError as error:
+            where = f"line {error.line or 1}, {'.'.join(filter(None, (excerpt(key, 60), error.key)))}"
+            raise SpecError(f"{named}: the value is not valid YAML ({where}): {error}") from None
         *parents, last = key.split(".")
+        if len(parents) > strict_yaml.DEEPEST:
+            raise SpecError(f"{named}: the key has {len(parents) + 1} levels; at most {strict_yaml.DEEPEST}")
         section: Any = result
         for parent in parents:
             section = section.setdefault(parent, {})
             if not isinstance(section, dict):
-                raise SpecError(f"--set {assignment}: {parent} is not a section")
+                raise SpecError(f"{named}: {excerpt(parent, 60)} is not a section")
         section[last] = value
     return result
 
@@ -350,16 +378,16 @@ def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
         return "is required"
     if kind == "value_error":
         text = str(problem["ctx"]["error"])
-        return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {_shown(found)}"
+        return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {shown(found)}"
     if kind == "literal_error":
-        return f"expected {problem['ctx']['expected']}, found {_shown(found)}"
+        return f"expected {problem['ctx']['expected']}, found {shown(found)}"
     if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
         written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
-        return f"expected a number, found a text ({found!r}); in YAML it is written {written}"
+        return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
     if kind in _EXPECTED:
         return f"{_EXPECTED[kind]}, found {_kind_of(found)}"
     message = str(problem["msg"])
-    return f"{message.replace('Input should be', 'expected a value', 1)}, found {_shown(found)}"
+    return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
 
 
 def _keys_at(path: tuple[str | int, ...]) -> list[str]:
@@ -389,10 +417,5 @@ def _kind_of(value: object) -> str:
         int: "a whole number",
         float: "a number",
     }
-    shown = f" ({_shown(value)})" if isinstance(value, str | int | float) else ""
-    return "nothing" if value is None else names.get(type(value), type(value).__name__) + shown
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "…"
+    what = f" ({shown(value)})" if isinstance(value, str | int | float) else ""
+    return "nothing" if value is None else names.get(type(value), type(value).__name__) + what

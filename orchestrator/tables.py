@@ -9,8 +9,9 @@ import time
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, Index, String
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
+from orchestrator.excerpts import LONGEST_REASON, excerpt
 from orchestrator.jobs import Status, check_transition
 
 
@@ -142,6 +143,10 @@ class Job(Base):
         foreign_keys="Dependency.job_id", order_by="Dependency.on_id", cascade="all, delete-orphan"
     )
 
+    @validates("status_reason", "stop_reason")
+    def _bounded(self, _key: str, reason: str | None) -> str | None:
+        return None if reason is None else excerpt(reason, LONGEST_REASON)
+
     @property
     def open_attempt(self) -> Attempt | None:
         """The attempt whose gang exists or may exist."""
@@ -160,7 +165,7 @@ class Job(Base):
         if status.is_terminal:
             self.stopped_at = now()
         if reason is not None:
-            self.status_reason = reason[:1024]
+            self.status_reason = reason
 
 
 class Dependency(Base):
@@ -203,6 +208,10 @@ class Attempt(Base):
     nodes: Mapped[list[dict[str, Any]]]
     """By index: index, host, gpus, and, as they become known, address, exitCode, reason, error, and whether the bus met it."""
     job: Mapped[Job] = relationship(back_populates="attempts")
+
+    @validates("status_reason")
+    def _bounded(self, _key: str, reason: str | None) -> str | None:
+        return None if reason is None else excerpt(reason, LONGEST_REASON)
 
 
 class ShareUsage(Base):

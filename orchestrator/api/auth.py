@@ -27,6 +27,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import Body, RateLimit
+from orchestrator.excerpts import LONGEST_ERROR, excerpt
 from orchestrator.keys import Key, KeyStore
 
 SKEW = 15 * 60
@@ -392,8 +393,11 @@ def _with_request_id(send: Send) -> Send:
     return sending
 
 
-def error_response(message: str, status: int, kind: str = "ClientException") -> JSONResponse:
-    """An error that botocore maps to its class (by header and body) and that a person can read."""
-    text = message.encode(errors="backslashreplace").decode()  # it may repeat half of a character that was sent
+def error_response(
+    message: str, status: int, kind: str = "ClientException", media_type: str | None = None
+) -> JSONResponse:
+    """An error that botocore maps to its class (by header and body) and that a person can read; its text is bounded here."""
+    # it may repeat half of a character that was sent
+    text = excerpt(message, LONGEST_ERROR).encode(errors="backslashreplace").decode()
     content: dict[str, Any] = {"__type": kind, "message": text}
-    return JSONResponse(content, status, {"x-amzn-errortype": kind})
+    return JSONResponse(content, status, {"x-amzn-errortype": kind}, media_type=media_type)

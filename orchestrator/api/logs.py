@@ -24,6 +24,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from orchestrator.api import log_filter
 from orchestrator.api.arns import ACCOUNT, REGION
+from orchestrator.api.auth import error_response
 from orchestrator.api.errors import ClientError
 from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
@@ -62,8 +63,7 @@ class LogsError(Exception):
         self.kind, self.status = kind, status
 
     def response(self) -> JSONResponse:
-        content = {"__type": self.kind, "message": str(self)}
-        return JSONResponse(content, self.status, {"x-amzn-errortype": self.kind}, media_type=_JSON)
+        return error_response(str(self), self.status, self.kind, _JSON)
 
 
 def invalid(message: str) -> LogsError:

@@ -10,6 +10,7 @@ from typing import Any
 
 from orchestrator.api.errors import ClientError
 from orchestrator.definition import GangNeeds, gang_needs, target_nodes
+from orchestrator.excerpts import shown
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
@@ -159,7 +160,7 @@ def check_container(container: Mapping[str, Any], where: str) -> None:
     for mount in container.get("mountPoints") or []:
         if mount.get("sourceVolume") not in volumes:
             raise ClientError(
-                f"{where}: mountPoints names volume {mount.get('sourceVolume')!r}, which volumes does not have"
+                f"{where}: mountPoints names volume {shown(mount.get('sourceVolume'))}, which volumes does not have"
             )
 
 

@@ -13,6 +13,7 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.excerpts import shown
 from orchestrator.jobs import Status
 from orchestrator.pools import queue_engines
 from orchestrator.scheduling import never_fits
@@ -114,8 +115,6 @@ def resume(
             spec = validate(override(document, [*assignments, *resized]), f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
-        except (ValueError, AttributeError, RecursionError):  # PyYAML's, for what only looks like a date or a number
-            raise ClientError(f"run {run.name}: the value of a change is not valid YAML") from None
         _check_changes(run, before, spec)
         environment = {"MUSTER_RUN": run.name}
         if spec.train:
@@ -177,12 +176,12 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         old, new = getattr(before.train, key), getattr(after.train, key)
         if old != new:
             raise ClientError(
-                f"run {run.name}: train.{key} is {old!r} and can't become {new!r}; start a new run for that"
+                f"run {run.name}: train.{key} is {shown(old)} and can't become {shown(new)}; start a new run for that"
             )
     for key in NETWORK:
         old, new = getattr(before.train.ppo, key), getattr(after.train.ppo, key)
         if old != new:
-            was, wanted = ("the task's own" if value is None else repr(value) for value in (old, new))
+            was, wanted = ("the task's own" if value is None else shown(value) for value in (old, new))
             raise ClientError(
                 f"run {run.name}: train.ppo.{key} is {was} and can't become {wanted}: it is part of the network "
                 "that the run has; start a new run for that"

@@ -186,7 +186,7 @@ NOT_YAML = {
         "'tag:yaml.org,2002:python/object/apply:os.getcwd'"
     ),
     "name: \x01\n": "job.yaml: not valid YAML: unacceptable character #x0001: special characters are not allowed",
-    "a: &x {b: *x}\n": "job.yaml: not valid YAML: maximum recursion depth exceeded",
+    "a: &x {b: *x}\n": "job.yaml:1: not valid YAML: an alias stands inside of what it stands for",
     b"name: \xff\n": "job.yaml: not a text file (UTF-8)",
 }
 
@@ -265,7 +265,24 @@ def test_overriding_leaves_the_document_as_it_was() -> None:
         ("=3", "--set =3: expected KEY=VALUE, such as train.iterations=600"),
         ("train..x=3", "--set train..x=3: expected KEY=VALUE, such as train.iterations=600"),
         ("name.x=1", "--set name.x=1: name is not a section"),
-        ("nodes=[", "--set nodes=[: the value is not valid YAML"),
+        (
+            "nodes=[",
+            "--set nodes=[: the value is not valid YAML (line 1, nodes): "
+            "expected the node content, but found '<stream end>'",
+        ),
+        (
+            "train.config={a: &a 1}",
+            "--set train.config={a: &a 1}: the value is not valid YAML (line 1, train.config.a): "
+            "anchors and aliases (&a) are not accepted here; write the value out",
+        ),
+        (
+            "train.config={a: .inf}",
+            "job.yaml:2: train.config: expected finite numbers, found inf",
+        ),
+        (
+            f"{'a.' * 60}a=1",
+            f"--set {('a.' * 60)[:75]} … (47 more characters): the key has 61 levels; at most 50",
+        ),
         ("train.ppo.clp=0.3", "job.yaml:2: train.ppo.clp: unknown key; did you mean clip?"),
     ],
 )
@@ -371,3 +388,36 @@ def test_the_worker_accepts_of_each_setting_of_ppo_what_the_job_file_accepts(nam
             # the job file can't know how many convolutions the task has
             made = str(error).startswith("channels, kernel_sizes and strides")
         assert written == made, value
+
+
+def bomb(levels: int) -> str:
+    """Entries of a mapping in which each key stands for eight times the one before."""
+    entries = ["a0: &a0 [x, x, x, x, x, x, x, x]"]
+    entries += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, levels)]
+    return ", ".join(entries)
+
+
+def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> None:
+    train = "{task: Cartpole, worlds: 4, iterations: 2, config: {first: &c {size: 3}, second: {<<: *c}}}"
+    (tmp_path / "job.yaml").write_text(f"name: a\ntrain: {train}\n")
+    loaded = load(str(tmp_path / "job.yaml")).train
+    assert loaded is not None and loaded.config == {"first": {"size": 3}, "second": {"size": 3}}
+    said = problem(tmp_path, f"name: a\n{TRAIN}\nenvironment: {{{bomb(7)}}}\n")
+    assert said == "job.yaml:3: not valid YAML: more than 10000 values with the aliases written out"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (f"{{{bomb(9)}}}", "train.config.a0): anchors and aliases (&a0) are not accepted here; write the value out"),
+        ("[" * 5000, "nested deeper than 50 levels"),
+        (f"[{'1,' * 11_000}1]", "more than 10000 values"),
+        (f"0x{'f' * 20_000}", "a number of more than 64 bits"),
+        ("!!binary /w==", "binary is not a kind of value that JSON has"),
+        (f"'{'x' * 30_000}'", "30015 characters of changes; at most 24576"),
+    ],
+)
+def test_a_change_beyond_a_limit_is_refused_in_one_short_line_that_names_it(value: str, said: str) -> None:
+    with pytest.raises(SpecError) as refused:
+        override({}, [f"train.config={value}"])
+    assert said in str(refused.value) and len(str(refused.value)) < 400 and "\n" not in str(refused.value)

@@ -1,0 +1,27 @@
+"""Bounded text for messages: whatever a request, a file or a program says, an error about it stays short."""
+
+from __future__ import annotations
+
+import reprlib
+
+LONGEST_REASON = 1024
+"""Characters of a status reason."""
+LONGEST_ERROR = 2000
+"""Characters of the text of an error answer."""
+_LEFT_OUT = " … ({} more characters)"
+
+
+def excerpt(text: str, most: int) -> str:
+    """``text`` in at most ``most`` characters; where it is longer, its beginning and how many characters were left out."""
+    if len(text) <= most:
+        return text
+    kept = max(0, most - len(_LEFT_OUT.format(len(text))))
+    return text[:kept] + _LEFT_OUT.format(len(text) - kept)
+
+
+def shown(value: object, most: int = 60) -> str:
+    """``repr(value)`` in about ``most`` characters, at a cost that does not grow with the value."""
+    brief = reprlib.Repr()
+    brief.maxlevel, brief.maxstring, brief.maxother, brief.maxlong = 3, most, most, most
+    text = repr(value[:most]) if isinstance(value, str) else brief.repr(value)
+    return text if len(text) <= most else text[: most - 3] + "…"
