@@ -11,6 +11,7 @@ import hashlib
 import math
 import os
 import re
+import stat
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,8 +24,10 @@ from shared_store.files import read_json, remove_tree, sync_directory, sync_file
 from shared_store.layout import Run
 
 FORMAT = 1
-_NAME = re.compile(r"(\d{8})-e(\d+)")
-_MAKING = re.compile(r"\.(\d{8})-e(\d+)\.tmp")
+_NAME = re.compile(r"([0-9]{8})-e([0-9]{1,18})")
+_MAKING = re.compile(r"\.([0-9]{8})-e([0-9]{1,18})\.tmp")
+_FILE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
+"""What a file of a checkpoint may be called: never a path that leads elsewhere."""
 
 
 class DamagedCheckpoint(Exception):
@@ -57,7 +60,13 @@ class Checkpoint:
         if manifest is None or not isinstance(manifest.get("files"), dict):
             raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json is missing or empty")
         for name, entry in manifest["files"].items():
-            if not isinstance(entry, dict) or not {"size", "sha256"} <= entry.keys():
+            if not _FILE.fullmatch(name):
+                raise DamagedCheckpoint(
+                    f"checkpoint {self.name}: manifest.json names {name[:60]!r}, which is no file of it"
+                )
+            if not isinstance(entry, dict) or not (
+                _is_size(entry.get("size")) and isinstance(entry.get("sha256"), str)
+            ):
                 raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no size and digest of {name}")
         if not isinstance(manifest.get("format"), int):
             raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no format")
@@ -65,22 +74,27 @@ class Checkpoint:
             raise NewerFormat(
                 f"checkpoint {self.name}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
             )
+        for key in ("created", "reward", "worlds", "world_size"):
+            if isinstance(manifest.get(key), str | list | dict):
+                raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json: {key} is not a number")
         return manifest
 
     @property
     def size(self) -> int:
         """Bytes of all the files that the manifest lists."""
-        return sum(int(entry["size"]) for entry in self.manifest["files"].values())
+        return sum(entry["size"] for entry in self.manifest["files"].values())
 
     def verify(self) -> None:
         """Raises DamagedCheckpoint, naming the first file that is missing, truncated or altered."""
         for name, entry in sorted(self.manifest["files"].items()):
             path = self.path / name
             try:
-                size = path.stat().st_size
-                if size != entry["size"]:
+                found = path.lstat()
+                if not stat.S_ISREG(found.st_mode):
+                    raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is not a regular file")
+                if found.st_size != entry["size"]:
                     raise DamagedCheckpoint(
-                        f"checkpoint {self.name}: {name} has {size} bytes, {entry['size']} were written"
+                        f"checkpoint {self.name}: {name} has {found.st_size} bytes, {entry['size']} were written"
                     )
                 if _digest(path) != entry["sha256"]:
                     raise DamagedCheckpoint(
@@ -100,7 +114,7 @@ def list_checkpoints(run: Run) -> list[Checkpoint]:
     """
     try:
         entries = os.listdir(run.checkpoints)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
     matches = filter(None, map(_NAME.fullmatch, entries))
     found = [Checkpoint(run.checkpoints / match[0], int(match[1]), int(match[2])) for match in matches]
@@ -258,6 +272,10 @@ def _reward(checkpoint: Checkpoint) -> float | None:
     except DamagedCheckpoint:
         return None
     return float(reward) if isinstance(reward, int | float) and math.isfinite(reward) else None
+
+
+def _is_size(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def _digest(path: Path) -> str:

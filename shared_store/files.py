@@ -6,13 +6,25 @@ closed (the close is where NFS reports a full disk), is renamed, and the directo
 
 from __future__ import annotations
 
+import errno
 import json
+import math
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+LARGEST_JSON = 16 << 20
+"""Bytes of a JSON file; what is larger was not written by Muster."""
+DEEPEST_JSON = 100
+"""Levels of lists and objects in a JSON file."""
+
+
+class DamagedFile(ValueError):
+    """A file of the store can't be used; the message is one line: which file, and what is wrong with it."""
 
 
 def sync_file(path: Path) -> None:
@@ -54,15 +66,68 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode())
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """The JSON object in ``path``; None where the file is not there. Raises ValueError where it is not a JSON object."""
+def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
+    """The JSON object in ``path``; None where there is no such file.
+
+    Any job may have written the file: it must be a regular one of at most ``largest`` bytes, nested at most
+    :data:`DEEPEST_JSON` levels, with text and numbers that JSON can repeat. NaN and Infinity are read as None.
+
+    Raises:
+        DamagedFile: It is none of that.
+        OSError: The volume can't be read.
+    """
     try:
-        value = json.loads(path.read_bytes())
-    except FileNotFoundError:
+        data = _read_regular(path, largest)
+    except (FileNotFoundError, NotADirectoryError):
         return None
+    try:
+        value = json.loads(data, parse_constant=lambda _: None)
+        _check_plain(value, data)
+    except RecursionError:
+        raise DamagedFile(f"{path}: nested too deep") from None
+    except ValueError as error:
+        raise DamagedFile(f"{path}: not JSON ({error})") from None
     if not isinstance(value, dict):
-        raise ValueError(f"{path}: not a JSON object")
+        raise DamagedFile(f"{path}: not a JSON object")
     return value
+
+
+def _read_regular(path: Path, largest: int) -> bytes:
+    """The content of a file. A link could lead out of the store, and a pipe would never end."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise DamagedFile(f"{path}: not a regular file") from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise DamagedFile(f"{path}: not a regular file")
+    with open(descriptor, "rb") as file:
+        data = file.read(largest + 1)
+    if len(data) > largest:
+        raise DamagedFile(f"{path}: more than {largest} bytes")
+    return data
+
+
+def _check_plain(value: object, data: bytes) -> None:
+    """Raise ValueError for what can be read, but not written again as JSON."""
+    level = [value]
+    for _ in range(DEEPEST_JSON):
+        if any(isinstance(each, float) and not math.isfinite(each) for each in level):
+            raise ValueError("a number is too large")
+        level = [
+            inner
+            for each in level
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            break
+    else:
+        raise ValueError(f"nested deeper than {DEEPEST_JSON} levels")
+    if b"\\u" in data:  # JSON can name half of a character
+        json.dumps(value, ensure_ascii=False).encode()
 
 
 def remove_tree(path: Path) -> None:

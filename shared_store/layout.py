@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from shared_store.files import read_json, write_json
+from shared_store.files import DamagedFile, read_json, write_json
 
 FORMAT = 1
 """Version of the layout; a store with a newer one is refused."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 """What a run may be called: it becomes a directory name."""
+
+LARGEST_DESCRIPTION = 128 << 10
+"""Bytes of ``run.json`` and of an evaluation: what the API shows of a run."""
 
 
 class StoreError(Exception):
@@ -61,8 +65,17 @@ class Run:
         return self.path / "outcomes" / job / str(attempt) / f"node-{node}.json"
 
     def description(self) -> dict[str, Any] | None:
-        """The content of ``run.json`` (spec, code versions, creation time); None where the run does not exist."""
-        return read_json(self.path / "run.json")
+        """The content of ``run.json`` (spec, code versions, creation time); None where the run does not exist.
+
+        Raises DamagedFile where it is no such description, OSError where the volume can't be read.
+        """
+        path = self.path / "run.json"
+        found = read_json(path, LARGEST_DESCRIPTION)
+        if found is not None and not isinstance(found.get("spec"), dict | None):
+            raise DamagedFile(f"{path}: spec is not a mapping")
+        if found is not None and not isinstance(found.get("created"), int | float | None):
+            raise DamagedFile(f"{path}: created is not a number")
+        return found
 
     def create(self, description: dict[str, Any]) -> None:
         """Write ``run.json`` once; a run that exists keeps the one it has."""
@@ -111,10 +124,11 @@ class Store:
             raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
         return Run(self.path / "runs" / name)
 
-    def runs(self) -> list[Run]:
-        """Every run that exists, by name."""
+    def runs(self, after: str = "", most: int | None = None) -> list[Run]:
+        """The runs that exist, by name: those behind ``after``, at most so many."""
         try:
-            names = sorted(entry.name for entry in os.scandir(self.path / "runs") if NAME.fullmatch(entry.name))
+            entries = sorted(entry.name for entry in os.scandir(self.path / "runs") if entry.name > after)
         except FileNotFoundError:
             return []
-        return [run for run in map(self.run, names) if (run.path / "run.json").exists()]
+        named = (self.run(name) for name in entries if NAME.fullmatch(name))
+        return list(islice((run for run in named if os.path.lexists(run.path / "run.json")), most))

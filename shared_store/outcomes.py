@@ -5,12 +5,15 @@ A controller that was down when a gang ended reads here what the engine can't te
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from shared_store.files import read_json, write_json
 from shared_store.layout import Run
 
+LONGEST_TEXT = 16 << 10
+"""Characters that are read of a reason, a message or a traceback."""
+_NUMBER = int | float
 EX_TEMPFAIL = 75
 """Exit code for "checkpointed and left on request: start me again, and don't count it as a failure" (sysexits.h)."""
 
@@ -57,6 +60,19 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
 
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
-    """The outcome of which ``asdict`` made this. Raises TypeError where it is damaged."""
+    """The outcome of which ``asdict`` made this, its texts bounded. Raises TypeError where it is damaged."""
     error = FirstError(**value["error"]) if value.get("error") else None
-    return Outcome(**{**value, "error": error})
+    outcome = Outcome(**{**value, "error": error})
+    _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
+    if error is not None:
+        _check(error, rank=int, message=str, traceback=str, time=_NUMBER)
+        message, traceback = error.message[:LONGEST_TEXT], error.traceback[:LONGEST_TEXT]
+        outcome = replace(outcome, error=replace(error, message=message, traceback=traceback))
+    return replace(outcome, reason=outcome.reason[:LONGEST_TEXT])
+
+
+def _check(value: object, **kinds: Any) -> None:
+    for name, kind in kinds.items():
+        found = getattr(value, name)
+        if not isinstance(found, kind) or (isinstance(found, int) and abs(found) >= 2**63):
+            raise TypeError(f"{name} is of the wrong type or too large")

@@ -20,6 +20,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import RateLimit
 from orchestrator.controller import Controller
 from shared_store import __version__
+from shared_store.files import DamagedFile
 
 log = logging.getLogger("muster.api")
 
@@ -37,6 +38,7 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _refused_by_database)
+    app.add_exception_handler(DamagedFile, _damaged_file)
     app.add_exception_handler(Exception, _server_error)
 
     @app.get("/healthz")
@@ -109,6 +111,11 @@ async def _refused_by_database(request: Request, error: Exception) -> JSONRespon
     """A zero byte, say, which PostgreSQL can't store nor look for."""
     assert isinstance(error, DataError)
     return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
+
+
+async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
+    """What lies on the volume was written by jobs, and may be anything: that is no error of the server."""
+    return error_response(f"the store holds a damaged file: {error}", 409)
 
 
 async def _server_error(request: Request, error: Exception) -> JSONResponse:

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
-from fastapi import APIRouter, Header, Request
+from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import select
@@ -40,6 +40,7 @@ router = APIRouter(prefix="/api")
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 """Makes a submission safe to repeat after a lost answer."""
 
+RUNS_A_PAGE = 100
 _POLL = 0.05
 """Seconds between two looks at a log that is followed."""
 _HEARTBEAT = 5.0
@@ -251,11 +252,19 @@ def _command(controller: Controller, job: str, attempt: int, node: int, name: st
 
 
 @router.get("/runs")
-def list_runs(request: Request) -> list[dict[str, Any]]:
-    """Every run of the store."""
+def list_runs(
+    request: Request,
+    response: Response,
+    after: str = Query(default="", max_length=128, description="name of the last run of the page before"),
+    most: int = Query(default=RUNS_A_PAGE, ge=1, le=RUNS_A_PAGE, alias="max"),
+) -> list[dict[str, Any]]:
+    """The runs of the store by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
     controller = _controller(request)
     with controller.database.session() as session:
-        return [runs.describe_run(controller, session, run) for run in controller.store.runs()]
+        found = runs.list_runs(controller, session, after, most)
+    if len(found) == most:
+        response.headers["Link"] = f'</api/runs?max={most}&after={found[-1]["run"]}>; rel="next"'
+    return found
 
 
 @router.get("/runs/{name}")

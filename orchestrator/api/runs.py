@@ -13,25 +13,39 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
-from orchestrator.excerpts import shown
+from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.pools import queue_engines
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
 from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
-from shared_store.files import read_json
-from shared_store.layout import Run
+from shared_store.files import DamagedFile, read_json
+from shared_store.layout import LARGEST_DESCRIPTION, Run
 from shared_store.metrics import read_metrics
 
 CONFLICT = 409
 """The request is well formed, but the state of things refuses it."""
 
 
+def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
+    """The first ``most`` runs behind the name ``after``; one that can't be read has a ``problem`` instead of its facts."""
+    found = []
+    for run in controller.store.runs(after, most):
+        try:
+            found.append(describe_run(controller, session, run))
+        except (DamagedFile, OSError) as error:
+            problem = excerpt(" ".join(str(error).split()), LONGEST_REASON)
+            found.append({"run": run.name, "path": str(run.path), "problem": problem})
+    return found
+
+
 def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:
-    """Facts of a run: its jobs, its newest checkpoint, and where its results lie."""
+    """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     description = run.description() or {}
-    jobs = session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at)).all()
+    jobs = session.execute(
+        select(Job.id, Job.name, Job.status).where(Job.run == run.name).order_by(Job.created_at)
+    ).all()
     checkpoints = list_checkpoints(run)
     evaluation = _newest_evaluation(run, checkpoints)
     plot = run.metrics / "reward.png"
@@ -283,8 +297,8 @@ def _newest_job(session: Session, run: Run) -> Job | None:
 def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:
     for checkpoint in reversed(checkpoints):
         try:
-            if evaluation := read_json(run.evaluations / f"{checkpoint.name}.json"):
+            if evaluation := read_json(run.evaluations / f"{checkpoint.name}.json", LARGEST_DESCRIPTION):
                 return evaluation
-        except ValueError:
+        except (DamagedFile, OSError):
             continue
     return None

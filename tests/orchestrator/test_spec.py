@@ -281,7 +281,7 @@ def test_overriding_leaves_the_document_as_it_was() -> None:
         ),
         (
             f"{'a.' * 60}a=1",
-            f"--set {('a.' * 60)[:75]} … (47 more characters): the key has 61 levels; at most 50",
+            f"--set {('a.' * 60)[:76]} … (47 more characters): the key has 61 levels; at most 50",
         ),
         ("train.ppo.clp=0.3", "job.yaml:2: train.ppo.clp: unknown key; did you mean clip?"),
     ],

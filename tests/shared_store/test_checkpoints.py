@@ -206,6 +206,12 @@ def flip_a_bit(path: Path) -> None:
     (path / "rank-1.pt").write_bytes(content)
 
 
+def replace_by_pipe(path: Path) -> None:
+    edit_manifest(path, files={"rank-0.pt": {"size": 0, "sha256": "0"}})
+    (path / "rank-0.pt").unlink()
+    os.mkfifo(path / "rank-0.pt")
+
+
 def replace_by_directory(path: Path) -> None:
     (path / "manifest.json").unlink()
     (path / "manifest.json").mkdir()
@@ -222,6 +228,27 @@ DAMAGES = {
     "no manifest": (lambda path: (path / "manifest.json").unlink(), "manifest.json is missing or empty"),
     "an empty manifest": (lambda path: os.truncate(path / "manifest.json", 0), "manifest.json can't be read"),
     "half a manifest": (lambda path: os.truncate(path / "manifest.json", 40), "manifest.json can't be read"),
+    "a manifest that leads elsewhere": (
+        lambda path: edit_manifest(path, files={"../../etc/passwd": {"size": 1, "sha256": "0"}}),
+        "manifest.json names '../../etc/passwd', which is no file of it",
+    ),
+    "a manifest with a zero byte in a name": (
+        lambda path: edit_manifest(path, files={"a\0b": {"size": 1, "sha256": "0"}}),
+        r"manifest.json names 'a\x00b', which is no file of it",
+    ),
+    "a manifest with a size that is a text": (
+        lambda path: edit_manifest(path, files={"rank-0.pt": {"size": "x", "sha256": "0"}}),
+        "manifest.json has no size and digest of rank-0.pt",
+    ),
+    "a manifest with a reward that is a list": (
+        lambda path: edit_manifest(path, reward=[1]),
+        "manifest.json: reward is not a number",
+    ),
+    "a manifest nested deep": (
+        lambda path: (path / "manifest.json").write_text('{"files": ' + "[" * 5000 + "]" * 5000 + "}"),
+        "manifest.json can't be read",
+    ),
+    "a file that is a pipe": (replace_by_pipe, "rank-0.pt is not a regular file"),
     "a manifest that is a directory": (replace_by_directory, "manifest.json can't be read"),
     "a manifest without files": (lambda path: edit_manifest(path, files=None), "manifest.json is missing or empty"),
     "a manifest with half an entry": (

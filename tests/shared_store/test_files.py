@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.files import read_json, remove_tree, sync_directory, sync_file, write_atomic, write_json
+from shared_store.files import DamagedFile, read_json, remove_tree, sync_directory, sync_file, write_atomic, write_json
 from tests.shared_store.crashes import killed_at_every_step
 
 OLD, NEW = b"old content\n", b"new content, which is longer\n" * 5000
@@ -110,11 +110,34 @@ def test_json_that_is_not_there_is_none(tmp_path: Path) -> None:
     assert read_json(tmp_path / "value.json") is None
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'"text"', b"\xff\xfe\x00"])
-def test_json_that_is_not_an_object_is_refused(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"", b"{", b"[1]", b'"text"', b"\xff\xfe\x00", b"\0" * 100, b'{"a": ' * 5000 + b"1" + b"}" * 5000),
+        *(b'{"a":' * 101 + b"1" + b"}" * 101, b'{"a": 1e999}', b'{"a": "\\ud800"}', b'{"a": ' + b"9" * 5000 + b"}"),
+        b'{"a": "%s"}' % (b"x" * 1000),
+    ],
+)
+def test_json_that_is_not_a_plain_object_within_the_limits_is_damaged(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "value.json").write_bytes(content)
-    with pytest.raises(ValueError):
-        read_json(tmp_path / "value.json")
+    with pytest.raises(DamagedFile, match=r"^[^\n]+$"):
+        read_json(tmp_path / "value.json", largest=1000 if len(content) < 2000 else 100_000)
+
+
+def test_json_that_is_no_regular_file_is_damaged_and_never_waited_for(tmp_path: Path) -> None:
+    write_json(tmp_path / "other.json", {})
+    (tmp_path / "directory").mkdir()
+    (tmp_path / "link").symlink_to("other.json")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("directory", "link", "pipe"):
+        with pytest.raises(DamagedFile, match="not a regular file"):
+            read_json(tmp_path / name)
+    assert read_json(tmp_path / "other.json" / "below a file") is None
+
+
+def test_numbers_that_json_lacks_are_read_as_none(tmp_path: Path) -> None:
+    (tmp_path / "value.json").write_text('{"reward": NaN, "worst": -Infinity}')
+    assert read_json(tmp_path / "value.json") == {"reward": None, "worst": None}
 
 
 def test_syncing_what_is_not_there_is_an_error(tmp_path: Path) -> None:

@@ -1,0 +1,136 @@
+"""What lies on the volume was written by jobs and may be anything: no file of it breaks a list, an answer or the server."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from orchestrator.server import Server
+from shared_store.files import write_json
+
+SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
+DAMAGED: dict[str, bytes] = {
+    "zeros": b"\0" * 4096,
+    "empty": b"",
+    "cut": b'{"run": "cut", "sp',
+    "list": b"[]",
+    "deep": b'{"spec": ' * 5000 + b"1" + b"}" * 5000,
+    "latin": b'{"run": "\xe4"}',
+    "text": b'{"spec": "train"}',
+    "large": b'{"spec": {"a": "%s"}}' % (b"x" * 1_000_000),
+    "half": b'{"spec": {"name": "\\ud800"}}',
+    "huge": b'{"created": 1e999}',
+}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    server = Server(tmp_path_factory.mktemp("home"), cpus=1)
+    server.start()
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def http(server: Server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def runs(server: Server) -> Path:
+    """A store with a good run at either end of the list and damaged ones between."""
+    runs = server.store.path / "runs"
+    for name in ("a-good", "z-good"):
+        write_json(runs / name / "run.json", {"run": name, "created": 1, "spec": SPEC})
+    for name, content in DAMAGED.items():
+        (runs / f"d-{name}").mkdir()
+        (runs / f"d-{name}" / "run.json").write_bytes(content)
+    (runs / "d-directory" / "run.json").mkdir(parents=True)
+    (runs / "d-pipe").mkdir()
+    os.mkfifo(runs / "d-pipe" / "run.json")
+    (runs / "d-link").mkdir()
+    (runs / "d-link" / "run.json").symlink_to(runs / "a-good" / "run.json")
+    return runs
+
+
+def refused(answer: httpx.Response) -> str:
+    """The one line of a refusal that is the client's or the run's fault."""
+    assert 400 <= answer.status_code < 500, answer.text[:300]
+    message: str = answer.json()["message"]
+    assert "\n" not in message and len(message) <= 2000
+    return message
+
+
+def test_a_list_of_runs_shows_those_that_are_damaged_with_their_problem(http: httpx.Client, runs: Path) -> None:
+    shown = {each["run"]: each.get("problem") for each in http.get("/api/runs").json()}
+    assert len(shown) == len(DAMAGED) + 5 and shown["a-good"] is shown["z-good"] is None
+    assert all("run.json" in problem for name, problem in shown.items() if name.startswith("d-"))
+
+
+@pytest.mark.parametrize("name", [*DAMAGED, "directory", "pipe", "link"])
+def test_the_pages_of_a_damaged_run_are_refused_in_one_line(http: httpx.Client, runs: Path, name: str) -> None:
+    for path in ("", "/checkpoints", "/metrics"):
+        assert "damaged file" in refused(http.get(f"/api/runs/d-{name}{path}"))
+    assert "damaged file" in refused(http.post(f"/api/runs/d-{name}/resume", json={}))
+
+
+MANIFESTS: dict[str, Any] = {
+    "00000001-e1": {"files": {"a": {"size": "x", "sha256": "0"}}, "format": 1},
+    "00000002-e1": {"files": {"a": {"size": None, "sha256": "0"}}, "format": 1},
+    "00000003-e1": {"files": {"../../../../etc/passwd": {"size": 1, "sha256": "0"}}, "format": 1},
+    "00000004-e1": {"files": {"a\0b": {"size": 1, "sha256": "0"}}, "format": 1},
+    "00000005-e1": {"files": {}, "format": 1, "reward": {"a": "b"}},
+    "00000006-e1": {"files": {}, "format": 1, "created": "x" * 100_000},
+}
+
+
+def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, runs: Path) -> None:
+    run = runs / "checkpointed"
+    write_json(run / "run.json", {"run": "checkpointed", "spec": SPEC})
+    for name, manifest in MANIFESTS.items():
+        write_json(run / "checkpoints" / name / "manifest.json", manifest)
+    deep = run / "checkpoints" / "00000007-e1" / "manifest.json"
+    deep.parent.mkdir()
+    deep.write_text('{"files": ' + "[" * 5000 + "]" * 5000 + "}")
+    write_json(run / "evaluations" / "00000007-e1.json", {"return": 1.0})
+    (run / "evaluations" / "00000007-e1.json").write_text("[" * 5000)
+    for query in ("", "?verify=true"):
+        listed = http.get(f"/api/runs/checkpointed/checkpoints{query}")
+        assert listed.status_code == 200 and len(listed.json()) == 7 and len(listed.text) < 10_000
+        assert all("manifest.json" in each["problem"] for each in listed.json())
+    assert http.get("/api/runs/checkpointed").json()["evaluation"] is None
+
+
+def test_no_change_of_a_run_and_no_spec_in_the_store_makes_an_answer_long(
+    server: Server, http: httpx.Client, runs: Path
+) -> None:
+    bomb = ", ".join(
+        ["a0: &a0 [x, x, x, x, x, x, x, x]"] + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
+    )
+    started = time.monotonic()
+    said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
+    assert "anchors and aliases (&a0) are not accepted here" in said and len(said) < 400
+    spec = {**SPEC, "train": {**SPEC["train"], "config": {"text": "x" * 100_000}}}  # type: ignore[dict-item]
+    write_json(runs / "crafted" / "run.json", {"run": "crafted", "spec": spec})
+    said = refused(http.post("/api/runs/crafted/resume", json={"set": ["train.config={text: y}"]}))
+    assert "train.config is" in said and len(said) < 400
+    assert "at most 24576" in refused(http.post("/api/runs/a-good/resume", json={"set": ["name=" + "x" * 30_000]}))
+    assert time.monotonic() - started < 30, "a hang"
+
+
+def test_runs_come_in_pages_that_together_hold_each_run_once(http: httpx.Client, runs: Path) -> None:
+    seen, address = [], "/api/runs?max=4"
+    while address:
+        page = http.get(address)
+        assert len(page.json()) <= 4
+        seen += [each["run"] for each in page.json()]
+        address = page.links["next"]["url"] if "next" in page.links else ""
+    assert seen == sorted(path.name for path in runs.iterdir())
+    assert "max" in refused(http.get("/api/runs?max=100000"))
