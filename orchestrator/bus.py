@@ -1,4 +1,8 @@
-"""The bus's router, inside the controller: who is there, how far they are, and commands to them.
+"""The bus's router, inside the controller: which nodes are present, their progress, and commands to them.
+
+Every node may connect; access rules in the router let a node publish below node keys and answer commands, and nothing else: it
+can neither send a command nor read a message. What a node says counts only with the proof of its attempt's credential, and
+commands carry that proof to the node (:mod:`shared_store.bus`).
 
 The bus is never a truth. A token that vanishes makes the controller look at the engine at once, instead of at the next interval;
 a message that is lost costs nothing. With the bus off everything works from the store and the engine, slower.
@@ -6,6 +10,7 @@ a message that is lost costs nothing. With the bus off everything works from the
 
 from __future__ import annotations
 
+import hmac
 import json
 import logging
 import os
@@ -17,12 +22,54 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from shared_store.files import read_json, write_json
+from shared_store.bus import LARGEST_MESSAGE, LARGEST_PROGRESS, Credential, Node, node_of, prefix, presence_key
+from shared_store.files import read_json, write_atomic, write_json
 
 log = logging.getLogger("muster.bus")
 
-Node = tuple[str, int, int]
-"""Job, attempt and index of a node."""
+_ACCESS = {
+    "enabled": True,
+    "default_permission": "deny",
+    "rules": [
+        {
+            "id": "nodes-report",
+            "permission": "allow",
+            "flows": ["ingress"],
+            "messages": ["put"],
+            "key_exprs": ["muster/*/*/*/progress"],
+        },
+        {
+            "id": "nodes-are-present",
+            "permission": "allow",
+            "flows": ["ingress"],
+            "messages": ["liveliness_token"],
+            "key_exprs": ["muster/*/*/*/alive/*"],
+        },
+        {
+            "id": "nodes-answer",
+            "permission": "allow",
+            "flows": ["ingress"],
+            "messages": ["declare_queryable", "reply"],
+            "key_exprs": ["muster/*/*/*/command/*"],
+        },
+        {
+            "id": "controller-commands",
+            "permission": "allow",
+            "flows": ["egress"],
+            "messages": ["query"],
+            "key_exprs": ["muster/*/*/*/command/*"],
+        },
+    ],
+    "subjects": [{"id": "nodes"}],
+    "policies": [
+        {
+            "rules": ["nodes-report", "nodes-are-present", "nodes-answer", "controller-commands"],
+            "subjects": ["nodes"],
+        }
+    ],
+}
+"""What may pass between the router and a node. Zenoh reads rules and users once, when the router starts, so that they can't name
+attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
 
 
 class BusError(Exception):
@@ -32,7 +79,7 @@ class BusError(Exception):
 class Bus:
     """A Zenoh router with a password, on loopback and where nodes on other machines (or in containers) see this one.
 
-    Its port and password stay the same for a home directory.
+    Its port and master key stay the same for a home directory.
 
     They must: nodes that outlive a controller look for its successor where they found it.
     """
@@ -43,6 +90,8 @@ class Bus:
         """Called (on the network's thread) when a node came or went."""
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
+        self._expected: set[tuple[str, int]] = set()
+        """The open attempts; what is said of others is dropped."""
         self._gone: dict[Node, float | None] = {}
         """Since when (monotonic [s]) each node that was ever here is gone; None while it is here."""
         self._progress: dict[Node, dict[str, Any]] = {}
@@ -50,38 +99,45 @@ class Bus:
         """When (monotonic [s]) this router took its predecessor's place; None where nodes can't know that it is here."""
         self._session: Any = None
         self._declared: list[Any] = []
+        self._master = ""
         self.endpoint: str | None = None
-        self.token: str | None = None
 
     def open(self) -> None:
         """Start the router. Where that fails the bus is off, which is logged, and nothing else is different."""
         if os.environ.get("MUSTER_BUS_OFF"):
             return
-        kept = read_json(self._home / "bus.json") or {}
-        token = str(kept.get("token") or secrets.token_urlsafe(24))
-        for port in (int(kept.get("port") or 0), _free_port()):
-            if port and self._try(port, token):
-                self.endpoint, self.token = f"tcp/127.0.0.1:{port}", token
+        try:
+            kept = read_json(self._home / "bus.json") or {}
+        except ValueError:
+            log.warning(
+                "%s is damaged: the bus starts anew, and nodes that run now can't find it", self._home / "bus.json"
+            )
+            kept = {}
+        self._master = str(kept.get("key") or secrets.token_hex(32))
+        for port in (kept.get("port"), _free_port()):
+            if isinstance(port, int) and self._try(port):
+                self.endpoint = f"tcp/127.0.0.1:{port}"
                 self._opened = time.monotonic() if port == kept.get("port") else None
-                write_json(self._home / "bus.json", {"port": port, "token": token})
-                (self._home / "bus.json").chmod(0o600)
+                write_json(self._home / "bus.json", {"port": port, "key": self._master}, mode=0o600)
                 return
         log.warning("the bus is off: no router could be started; jobs run, commands to them do not")
 
-    def _try(self, port: int, token: str) -> bool:
+    def _try(self, port: int) -> bool:
         import zenoh
 
         zenoh.init_log_from_env_or("off")
         users = self._home / "bus-users"
-        users.touch(mode=0o600)
-        users.write_text(f"muster:{token}\n")
+        write_atomic(users, f"muster:{self._credential('', 0).password}\n".encode(), mode=0o600)
         config = zenoh.Config()
         settings = {
             "mode": "router",
             "listen/endpoints": [f"tcp/{address}:{port}" for address in ("127.0.0.1", *self._addresses)],
             "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
             "transport/shared_memory/enabled": False,
+            "transport/link/rx/max_message_size": LARGEST_MESSAGE,
             "transport/auth/usrpwd/dictionary_file": str(users),
+            "access_control": _ACCESS,
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
@@ -93,7 +149,7 @@ class Bus:
         direct = zenoh.handlers.Callback  # they run on the network's thread, and only note what came
         self._declared = [
             self._session.liveliness().declare_subscriber(
-                "muster/*/*/*/alive", direct(self._presence, indirect=False), history=True
+                "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
             ),
             self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
         ]
@@ -104,6 +160,15 @@ class Bus:
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    def expect(self, job: str, attempt: int) -> None:
+        """Listen to the attempt's nodes from now on, until :meth:`forget`."""
+        with self._lock:
+            self._expected.add((job, attempt))
+
+    def token(self, job: str, attempt: int) -> str | None:
+        """``MUSTER_BUS_TOKEN`` of the attempt's nodes; None with the bus off."""
+        return str(self._credential(job, attempt)) if self.endpoint else None
 
     def met(self, job: str, attempt: int, node: int) -> bool:
         """Whether the node is here, or was."""
@@ -120,13 +185,14 @@ class Bus:
         return None if since is None else time.monotonic() - since
 
     def progress(self, job: str, attempt: int, node: int) -> dict[str, Any] | None:
-        """The newest progress that a node told of."""
+        """The newest progress that a node reported."""
         with self._lock:
             return self._progress.get((job, attempt, node))
 
     def forget(self, job: str, attempt: int) -> None:
-        """The attempt is over."""
+        """The attempt is closed."""
         with self._lock:
+            self._expected.discard((job, attempt))
             for table in (self._gone, self._progress):
                 for node in [node for node in table if node[:2] == (job, attempt)]:
                     del table[node]
@@ -135,31 +201,73 @@ class Bus:
         """Send a command to a node's supervisor and wait for its answer. Raises BusError."""
         if self._session is None:
             raise BusError("the bus is off; start the controller again to send commands")
-        key = f"muster/{job}/{attempt}/{node}/command/{name}"
-        for reply in self._session.get(key, timeout=seconds):
-            if reply.ok is not None:
-                return str(json.loads(reply.ok.payload.to_string())["text"])
+        import zenoh
+
+        credential, number = self._credential(job, attempt), secrets.token_hex(16)
+        key = f"{prefix(job, attempt, node)}/command/{name}"
+        request = {"id": number, "proof": credential.prove("command", key, number)}
+        # all that declare this key are asked, and all answers read: one that another job forged must not hide the node's
+        replies = self._session.get(
+            key,
+            payload=json.dumps(request),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=seconds,
+        )
+        for reply in replies:
+            answer = _message(reply.ok.payload.to_bytes()) if reply.ok is not None else {}
+            text = answer.get("text")
+            if isinstance(text, str) and credential.proves(answer.get("proof"), "answer", key, number, text):
+                return text
         raise BusError(f"node {node} did not answer within {seconds:g} s; is it still starting, frozen or cut off?")
 
+    def _credential(self, job: str, attempt: int) -> Credential:
+        return Credential.derive(self._master, job, attempt)
+
     def _presence(self, sample: Any) -> None:
-        node = _node_of(str(sample.key_expr))
+        key = str(sample.key_expr)
+        node = self._sender(key)
+        if node is None or not hmac.compare_digest(
+            key.encode(), presence_key(self._credential(*node[:2]), *node).encode()
+        ):
+            return
         here = str(sample.kind).endswith("PUT")
         with self._lock:
+            if node[:2] not in self._expected:
+                return
             self._gone[node] = None if here else time.monotonic()
         self.changed()
 
     def _note(self, sample: Any) -> None:
-        try:
-            progress = json.loads(sample.payload.to_string())
-        except ValueError:
+        key = str(sample.key_expr)
+        node = self._sender(key)
+        if node is None or sample.attachment is None:
             return
+        payload, proof = sample.payload.to_bytes(), sample.attachment.to_bytes()
+        text = payload[: LARGEST_PROGRESS + 1].decode(errors="replace")
+        if len(payload) > LARGEST_PROGRESS or not self._credential(*node[:2]).proves(
+            proof.decode(errors="replace"), "progress", key, text
+        ):
+            return
+        progress = _message(payload)
         with self._lock:
-            self._progress[_node_of(str(sample.key_expr))] = progress
+            if progress and node[:2] in self._expected:
+                self._progress[node] = progress
+
+    def _sender(self, key: str) -> Node | None:
+        """The node whose key this is, if its attempt is open."""
+        node = node_of(key)
+        with self._lock:
+            return node if node is not None and node[:2] in self._expected else None
 
 
-def _node_of(key: str) -> Node:
-    _, job, attempt, node, _ = key.split("/")
-    return job, int(attempt), int(node)
+def _message(payload: bytes) -> dict[str, Any]:
+    """The JSON object in a message; empty where there is none."""
+    try:
+        value = json.loads(payload)
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
 
 
 def _free_port() -> int:

@@ -72,6 +72,8 @@ class Controller:
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
         with database.session() as session:
             self.roster.load(session)
+            for job, attempt in open_attempts(session, self.roster.active()):
+                bus.expect(job.id, attempt.number)  # before the router is there for their nodes
 
     def start(self) -> None:
         self._thread.start()

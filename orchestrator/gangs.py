@@ -100,6 +100,7 @@ class Gangs:
 
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         needs = gang_needs(job.node_properties)
+        self.bus.expect(job.id, attempt.number)
         try:
             attempt.handle = self.engine.launch(self.engine.plan(self.gang(session, job, attempt, needs)))
         except NotYet as wait:
@@ -135,7 +136,7 @@ class Gangs:
             containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,
-            bus_token=self.bus.token,
+            bus_token=self.bus.token(job.id, attempt.number),
             title=job.name,
             timeout=job.timeout,
             priority=job.priority,
@@ -269,7 +270,6 @@ class Gangs:
             if error is None:
                 self._finished.pop(key, None)
                 self._denied.pop(key, None)
-                self.bus.forget(*key)
                 return True
             if not isinstance(error, EngineError):
                 raise error
@@ -285,6 +285,7 @@ class Gangs:
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
     ) -> None:
         """The gang is gone: close its attempt and decide what becomes of the job."""
+        self.bus.forget(job.id, attempt.number)
         ended, ending = now(), verdict.ending
         attempt.ending, attempt.status_reason, attempt.exit_code = ending, verdict.reason, verdict.exit_code
         attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended

@@ -9,6 +9,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+BUS_VARIABLES = ("MUSTER_BUS", "MUSTER_BUS_TOKEN")
+"""For the node's supervisor only: the job's own program does not get them."""
+
 
 class ContractError(Exception):
     """A variable of the node contract is missing or malformed; the message names it."""
@@ -50,7 +53,9 @@ class NodeContract:
     address: str | None = None
     """The node's own address, where the engine gives it one."""
     bus: str | None = None
+    """Endpoint of the controller's bus router."""
     bus_token: str | None = None
+    """The attempt's :class:`~shared_store.bus.Credential`, as text."""
 
     @property
     def node_rank(self) -> int:

@@ -45,12 +45,15 @@ def sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Replace ``path`` with ``data``, whole or not at all. Raises OSError; a failed write leaves no file behind."""
+def write_atomic(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Replace ``path`` with ``data``, whole or not at all. Raises OSError; a failed write leaves no file behind.
+
+    ``mode``: permissions, less the umask, from the first instant; 0o600 for what others must not read.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     hidden = path.parent / f".{path.name}.{uuid.uuid4().hex[:8]}.tmp"
     try:
-        with open(hidden, "wb") as file:
+        with open(hidden, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -61,9 +64,9 @@ def write_atomic(path: Path, data: bytes) -> None:
     sync_directory(path.parent)
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
+def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> None:
     """:func:`write_atomic` for a JSON document."""
-    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode())
+    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode(), mode)
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:

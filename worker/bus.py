@@ -12,6 +12,7 @@ import queue
 import time
 from typing import TYPE_CHECKING, Any
 
+from shared_store.bus import LARGEST_PROGRESS, Credential, prefix, presence_key
 from shared_store.contract import NodeContract
 
 if TYPE_CHECKING:
@@ -24,16 +25,17 @@ _PROGRESS_SECONDS = 1.0
 
 
 class Command:
-    """A command that waits for its answer: ``checkpoint`` or ``stacks``."""
+    """A command from the controller that waits for its answer: ``checkpoint``, ``stacks`` or ``stop``."""
 
-    def __init__(self, query: Any) -> None:
-        self._query = query
-        self.name = str(query.key_expr).rpartition("/")[2]
+    def __init__(self, query: Any, credential: Credential, key: str, number: str) -> None:
+        self._query, self._credential, self._key, self._number = query, credential, key, number
+        self.name = key.rpartition("/")[2]
 
     def reply(self, text: str) -> None:
         """Answer, once."""
+        proof = self._credential.prove("answer", self._key, self._number, text)
         try:
-            self._query.reply(self._query.key_expr, json.dumps({"text": text}))
+            self._query.reply(self._key, json.dumps({"text": text, "proof": proof}))
         except Exception:  # the asker or the router is gone: nobody waits any more
             pass
         finally:
@@ -47,7 +49,11 @@ class NodeBus:
         """``wakeup``: descriptor that is written to when a command arrives."""
         self.contract, self._wakeup = contract, wakeup
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self._prefix = f"muster/{contract.job}/{contract.attempt}/{contract.node_index}"
+        self._node = contract.job, contract.attempt, contract.node_index
+        self._prefix = prefix(*self._node)
+        self._credential = Credential.parse(contract.bus_token or "")
+        self._heard: set[str] = set()
+        """Ids of the commands that came: a repeated one is not carried out again."""
         self._session: zenoh.Session | None = None
         self._declared: list[Any] = []
         self._next_try = self._next_progress = 0.0
@@ -66,7 +72,10 @@ class NodeBus:
 
             # DROP: a reader that is slow must cost a message, not our time
             drop = zenoh.CongestionControl.DROP
-            self._session.put(f"{self._prefix}/progress", json.dumps(progress), congestion_control=drop)
+            key, text = f"{self._prefix}/progress", json.dumps(progress)
+            if len(text) <= LARGEST_PROGRESS:
+                proof = self._credential.prove("progress", key, text)
+                self._session.put(key, text, attachment=proof, congestion_control=drop)
 
     def close(self) -> None:
         """Leave the bus; the token is withdrawn."""
@@ -89,7 +98,7 @@ class NodeBus:
             "transport/shared_memory/enabled": False,
             "transport/link/tx/lease": LEASE_MILLISECONDS,
             "transport/auth/usrpwd/user": "muster",
-            "transport/auth/usrpwd/password": self.contract.bus_token or "",
+            "transport/auth/usrpwd/password": self._credential.password,
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
@@ -101,12 +110,24 @@ class NodeBus:
         handler = zenoh.handlers.Callback(self._receive, indirect=False)
         self._declared = [
             session.declare_queryable(f"{self._prefix}/command/*", handler),
-            session.liveliness().declare_token(f"{self._prefix}/alive"),
+            session.liveliness().declare_token(presence_key(self._credential, *self._node)),
         ]
         self._session = session
 
     def _receive(self, query: Any) -> None:
-        self.commands.put(Command(query))
+        """Take a command that the controller has proved to be its own; drop any other."""
+        key = str(query.key_expr)
+        try:
+            request = json.loads(query.payload.to_bytes())
+            number, proof = request["id"], request["proof"]
+        except (AttributeError, ValueError, KeyError, TypeError, RecursionError):
+            number, proof = "", None
+        known = not isinstance(number, str) or number in self._heard
+        if known or not self._credential.proves(proof, "command", key, number):
+            query.drop()
+            return
+        self._heard.add(number)
+        self.commands.put(Command(query, self._credential, key, number))
         try:
             os.write(self._wakeup, b"c")
         except OSError:

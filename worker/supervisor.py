@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from shared_store.contract import ContractError, NodeContract
+from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.logs import format_line
@@ -125,8 +125,9 @@ class Supervisor:
             shared |= {"NCCL_SOCKET_IFNAME": interface, "GLOO_SOCKET_IFNAME": interface}
         for local in range(contract.ranks_per_node):
             rank = Rank(contract, local, scratch / f"error-{local}.json")
-            # what the user set in the job's environment stands
-            env = {**shared, **os.environ, **rank.environment()}
+            # what the user set in the job's environment stands; the bus is the supervisor's alone
+            given = {name: value for name, value in os.environ.items() if name not in BUS_VARIABLES}
+            env = {**shared, **given, **rank.environment()}
             rank.start(self.command, env)
             self.ranks.append(rank)
             for stream in ("o", "e"):

@@ -104,7 +104,7 @@ class Gang:
     """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
     bus: str | None = None
     bus_token: str | None = None
-    """Where the controller's bus router listens, and its password."""
+    """Where the controller's bus router listens, and the attempt's credential for it."""
     title: str = ""
     """What the user calls the job."""
     timeout: int | None = None

@@ -35,20 +35,25 @@ bus.tend(None)
 def bus(tmp_path: Path) -> Iterator[Bus]:
     bus = Bus(tmp_path)
     bus.open()
+    bus.expect("j", 1)
     yield bus
     bus.close()
 
 
 def start_node(bus: Bus, then: str, index: int = 0) -> subprocess.Popen[bytes]:
     """A process with a node's session that goes on with ``then``."""
-    script = NODE.format(index=index, endpoint=bus.endpoint, token=bus.token) + then
+    script = NODE.format(index=index, endpoint=bus.endpoint, token=bus.token("j", 1)) + then
     process = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY)
     wait_for(lambda: ("j", 1, index) in bus._gone, 20, "the node's token")
     return process
 
 
 def contract(bus: Bus, index: int = 0) -> NodeContract:
-    return NodeContract("j", 1, index, 2, 0, "127.0.0.1", 1, "r", "/", 1, 1, bus=bus.endpoint, bus_token=bus.token)
+    return node_contract(bus.endpoint, bus.token("j", 1), index)
+
+
+def node_contract(endpoint: str | None, token: str | None, index: int = 0, job: str = "j") -> NodeContract:
+    return NodeContract(job, 1, index, 2, 0, "127.0.0.1", 1, "r", "/", 1, 1, bus=endpoint, bus_token=token)
 
 
 def test_a_killed_node_is_noticed_in_less_than_a_second(bus: Bus) -> None:
@@ -104,14 +109,12 @@ def test_a_command_to_a_node_that_does_not_answer_ends_in_time_and_says_so(bus: 
 
 def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path) -> None:
     """With blocking congestion control a slow reader stops the writer for seconds; ours drops."""
-    script = f"import sys, time; from pathlib import Path; from orchestrator.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token, flush=True); time.sleep(60)"
+    script = f"import sys, time; from pathlib import Path; from orchestrator.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token('j', 1), flush=True); time.sleep(60)"
     router = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
     assert router.stdout is not None
     endpoint, token = router.stdout.readline().split()
     _, write = os.pipe2(os.O_NONBLOCK)
-    far = Bus(tmp_path / "unused")
-    far.endpoint, far.token = endpoint, token
-    node = NodeBus(contract(far), write)
+    node = NodeBus(node_contract(endpoint, token), write)
     node.tend(None)
     router.send_signal(signal.SIGSTOP)
     longest, progress = 0.0, {"iteration": 1, "fill": "x" * 10_000}
@@ -136,18 +139,17 @@ def test_the_router_listens_on_loopback_only_and_wants_the_password(bus: Bus) ->
             if state == "0A" and int(address.rpartition(":")[2], 16) == port:
                 listening.append(address.rpartition(":")[0])
     assert listening == ["0100007F"]
-    stranger = Bus(Path("/nowhere"))
-    stranger.endpoint, stranger.token = bus.endpoint, "wrong"
-    node = NodeBus(contract(stranger), 1)
+    node = NodeBus(node_contract(bus.endpoint, "wrong"), 1)
     node.tend(None)
     assert node._session is None
-    assert (bus._home / "bus.json").stat().st_mode & 0o077 == 0
+    assert [(bus._home / name).stat().st_mode & 0o777 for name in ("bus.json", "bus-users")] == [0o600, 0o600]
 
 
 def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_path: Path) -> None:
     other = Bus(tmp_path / "other")
     other._home.mkdir()
     other.open()
+    other.expect("j", 1)
     node = start_node(bus, "time.sleep(60)")
     time.sleep(1.0)
     assert other._gone == {} and other.endpoint != bus.endpoint
@@ -227,9 +229,9 @@ def test_without_the_bus_jobs_run_and_commands_say_why_they_can_not(
     monkeypatch.setenv("MUSTER_BUS_OFF", "1")
     server = Serving(tmp_path / "home")
     try:
-        job = server.gang("import os, time; print('bus' if os.environ.get('MUSTER_BUS') else 'no bus'); time.sleep(20)")
+        job = server.gang("import os, time; print('up'); time.sleep(20)")
         server.wait(job, "RUNNING")
-        wait_for(lambda: server.log(job) == ["no bus"], what="the rank's line")
+        wait_for(lambda: server.log(job) == ["up"], what="the rank's line")
         refused = server.muster("checkpoint", job)
         assert refused.returncode == 1 and "the bus is off" in refused.stderr and "Traceback" not in refused.stderr
         assert server.muster("stop", job).returncode == 0

@@ -86,6 +86,26 @@ def test_a_file_is_created_in_directories_that_do_not_exist_yet(tmp_path: Path) 
     assert (tmp_path / "a" / "b" / "file").read_bytes() == OLD
 
 
+def test_a_private_file_is_private_from_the_first_instant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes = []
+    replace = os.replace
+
+    def look(source: Path, target: Path) -> None:
+        modes.append(os.stat(source).st_mode & 0o777)
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", look)
+    write_json(tmp_path / "secret.json", {"key": 1}, mode=0o600)
+    write_json(tmp_path / "plain.json", {"key": 1})
+    assert modes == [0o600, 0o666 & ~_umask()]
+    assert (tmp_path / "secret.json").stat().st_mode & 0o777 == 0o600
+
+
+def _umask() -> int:
+    os.umask(value := os.umask(0o022))
+    return value
+
+
 def test_a_tree_killed_while_it_is_removed_is_whole_or_out_of_sight(tmp_path: Path) -> None:
     tree = tmp_path / "prepared" / "tree"
     tree.mkdir(parents=True)

@@ -1,0 +1,80 @@
+"""The bus's protocol, as both ends speak it: the keys, and the credential that proves who sent a message.
+
+A node's presence, progress and commands lie below ``muster/<job>/<attempt>/<node>``. Every node may connect to the router, so a
+key proves nothing: each attempt has a secret of its own, and each message carries a proof made with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from dataclasses import dataclass
+
+LARGEST_MESSAGE = 4 * 2**20
+"""Bytes; the router refuses larger messages."""
+LARGEST_PROGRESS = 65536
+"""Bytes of JSON; the controller drops a larger report."""
+
+Node = tuple[str, int, int]
+"""Job, attempt and index of a node."""
+
+
+@dataclass(frozen=True)
+class Credential:
+    """What an attempt's nodes authenticate with; its text is ``MUSTER_BUS_TOKEN``."""
+
+    password: str
+    """Of the router: the same for all nodes; lets them connect, and no more."""
+    secret: str
+    """Of the attempt: known to its nodes and to the controller only."""
+
+    @classmethod
+    def derive(cls, master: str, job: str, attempt: int) -> Credential:
+        """The credential of an attempt, from the controller's master key; nothing has to be stored."""
+        password, secret = _mac(master, "router"), _mac(master, "attempt", job, str(attempt))
+        return cls(password, secret)
+
+    @classmethod
+    def parse(cls, token: str) -> Credential:
+        """The credential in a ``MUSTER_BUS_TOKEN``; one that no router accepts where the text is malformed."""
+        password, _, secret = token.partition(".")
+        return cls(password, secret)
+
+    def __str__(self) -> str:
+        return f"{self.password}.{self.secret}"
+
+    def __repr__(self) -> str:
+        return "Credential(…)"
+
+    def prove(self, *parts: str) -> str:
+        """The proof that whoever has the secret says ``parts``."""
+        return _mac(self.secret, *parts)
+
+    def proves(self, proof: object, *parts: str) -> bool:
+        """Whether ``proof`` is :meth:`prove` of ``parts``."""
+        return isinstance(proof, str) and hmac.compare_digest(proof.encode(), self.prove(*parts).encode())
+
+
+def prefix(job: str, attempt: int, node: int) -> str:
+    """Where the keys of a node begin."""
+    return f"muster/{job}/{attempt}/{node}"
+
+
+def presence_key(credential: Credential, job: str, attempt: int, node: int) -> str:
+    """The node's liveliness token. It carries no content, so its proof is part of the key, which only the controller can see."""
+    key = f"{prefix(job, attempt, node)}/alive"
+    return f"{key}/{credential.prove('presence', key)}"
+
+
+def node_of(key: str) -> Node | None:
+    """The node that a key speaks of; None where it is no node's key."""
+    parts = key.split("/")
+    try:
+        return parts[1], int(parts[2]), int(parts[3])
+    except (IndexError, ValueError):
+        return None
+
+
+def _mac(secret: str, *parts: str) -> str:
+    return hmac.new(secret.encode(), json.dumps(parts).encode(), hashlib.sha256).hexdigest()
