@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -93,6 +95,10 @@ def _gather_overflow(solver_overflow: wp.array(dtype=wp.int32), overflow: wp.arr
     overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)
 
 
+_SET_HERE = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
+"""Options of the solver that are not a task's to choose: neither sensors nor such roots are used, and both cost time in every step."""
+
+
 class Worlds:
     """Identical, independent worlds that step together.
 
@@ -105,6 +111,9 @@ class Worlds:
         fastest: See :class:`WorldArrays`.
         ground: Whether to add one ground plane (z = 0) that all worlds share.
         solver_options: Keyword arguments of ``SolverMuJoCo`` (``njmax`` and ``nconmax`` are per world).
+
+    Raises:
+        ValueError: An option of the solver is unknown or set here, or the robot has actuators that would ignore the controls.
     """
 
     def __init__(
@@ -119,20 +128,14 @@ class Worlds:
         ground: bool = False,
         solver_options: Mapping[str, Any],
     ) -> None:
+        _check_options(solver_options)
         scene = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(scene)
         scene.replicate(template, world_count)
         if ground:
             scene.add_ground_plane()
         self.model = scene.finalize(device=device)
-        self.solver = SolverMuJoCo(
-            self.model,
-            # Neither is used here and both cost time in every step.
-            disable_sensors=True,
-            kinematic_switchable_roots=False,
-            separate_worlds=True,
-            **solver_options,
-        )
+        self.solver = SolverMuJoCo(self.model, **_SET_HERE, **solver_options)
         # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
         options = self.solver.mjw_model.opt
         options.warn_overflow = 0
@@ -143,6 +146,7 @@ class Worlds:
         self.state = self.model.state()
         self._other_state = self.model.state()
         self.control = self.model.control()
+        _check_controls(self.model, self.solver, self.control)
         self.world_count = world_count
         self.timestep = timestep
         self.substeps = substeps
@@ -185,3 +189,48 @@ class Worlds:
     def update_bodies(self) -> None:
         """Recompute body poses from joint coordinates, for who looks at ``state.body_q`` right after a reset."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+
+
+def _check_options(options: Mapping[str, Any]) -> None:
+    known = [name for name in inspect.signature(SolverMuJoCo).parameters if name != "model"]
+    for name in options:
+        if name in _SET_HERE:
+            raise ValueError(f"solver_options: {name} is always {_SET_HERE[name]} here; leave it out")
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
+            raise ValueError(f"solver_options: SolverMuJoCo has no option {name!r}; {hint}")
+
+
+def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.Control) -> None:
+    """Refuse actuators that would ignore ``worlds.controls``: such a robot would hold its pose, whatever a policy does."""
+    controls = getattr(getattr(control, "mujoco", None), "ctrl", None)
+    sources = solver.mjc_actuator_ctrl_source
+    direct = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
+    if controls is None or not controls.size:
+        if sources is None:
+            raise ValueError(
+                "the robot has no actuators, so that no action could move it; give its MJCF file an <actuator> section"
+            )
+        joints = model.joint_target_mode.numpy()[: solver.mj_model.nv].nonzero()[0]
+        raise ValueError(
+            f"nothing would drive the robot: {_joints(model, joints)} follow joint targets, as joints of URDF and USD files do, and a "
+            "task writes the inputs of MuJoCo's actuators alone; describe the robot in MJCF, with an <actuator> section, and add it with "
+            "builder.add_mjcf(file, ctrl_direct=True)"
+        )
+    attributes: Any = model.mujoco
+    count = controls.size // max(1, model.world_count)
+    unread = [column for column in range(count) if attributes.ctrl_source.numpy()[column] != direct]
+    if unread:
+        joints = attributes.actuator_trnid.numpy()[unread, 0]
+        raise ValueError(
+            f"the <position> and <velocity> actuators of {_joints(model, joints)} would ignore a task's controls, since they follow joint "
+            "targets; add the robot with builder.add_mjcf(file, ctrl_direct=True), and their controls are their targets"
+        )
+
+
+def _joints(model: newton.Model, dofs: Any) -> str:
+    """The names of the joints that have these degrees of freedom."""
+    starts = model.joint_qd_start.numpy()
+    names = [model.joint_label[int(starts.searchsorted(dof, side="right")) - 1].rpartition("/")[2] for dof in dofs]
+    return f"joint{'s' if len(names) != 1 else ''} {', '.join(names)}"

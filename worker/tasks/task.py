@@ -42,7 +42,7 @@ class Task:
         device: ``"cpu"`` or ``"cuda:<n>"``.
 
     Raises:
-        ValueError: An argument or a field of the configuration is out of range.
+        ValueError: An argument or a field of the configuration is out of range, or the robot can't be driven.
 
     Attributes:
         world_count: Number of worlds.
@@ -123,16 +123,19 @@ class Task:
         template = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(template)
         self.build(template)
-        self.worlds = Worlds(
-            template,
-            world_count,
-            self.device,
-            timestep=1.0 / (config.control_hz * config.substeps),
-            substeps=config.substeps,
-            fastest=config.fastest,
-            ground=self.ground,
-            solver_options=self.solver_options,
-        )
+        try:
+            self.worlds = Worlds(
+                template,
+                world_count,
+                self.device,
+                timestep=1.0 / (config.control_hz * config.substeps),
+                substeps=config.substeps,
+                fastest=config.fastest,
+                ground=self.ground,
+                solver_options=self.solver_options,
+            )
+        except ValueError as error:
+            raise ValueError(f"task {type(self).__name__}: {error}") from error
         self._allocate()
         self._parameters = self.parameters_type()
         for item in fields(config):
