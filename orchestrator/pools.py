@@ -20,8 +20,9 @@ def ensure_pools(session: Session, engines: Sequence[str]) -> None:
     """A compute environment for each of ``engines``, and a queue of its name for each but the first, which has ``default``."""
     for name, queue in own_queues(engines).items():
         if (environment := session.get(ComputeEnvironment, name)) is None:
-            environment = ComputeEnvironment(name=name, document={"type": "UNMANAGED"}, tags={})
+            environment = ComputeEnvironment(name=name, document={}, tags={})
             session.add(environment)
+        environment.document = {**environment.document, "type": "MANAGED"}
         if environment.tags.get(ENGINE_TAG) != name:
             environment.tags = {**environment.tags, ENGINE_TAG: name}
         if queue != "default" and session.get(JobQueue, queue) is None:
@@ -29,6 +30,11 @@ def ensure_pools(session: Session, engines: Sequence[str]) -> None:
     default = session.get(JobQueue, "default")
     if default is not None and len(default.environments) == 1 and default.environments[0] in ENGINES:
         default.environments = [engines[0]]
+
+
+def is_built_in(environment: ComputeEnvironment) -> bool:
+    """Whether this is the compute environment that an engine has without anybody creating one."""
+    return environment.name in ENGINES and environment.tags.get(ENGINE_TAG) == environment.name
 
 
 def own_queues(engines: Sequence[str]) -> dict[str, str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from orchestrator.api.errors import ClientError
+
 REGION, ACCOUNT = "us-east-1", "000000000000"
 PREFIX = f"arn:aws:batch:{REGION}:{ACCOUNT}:"
 
@@ -28,21 +30,29 @@ def policy_arn(name: str) -> str:
     return f"{PREFIX}scheduling-policy/{name}"
 
 
-def plain_name(reference: str) -> str:
-    """The name in an ARN of any region and account; a plain name as it is."""
-    return reference.rpartition("/")[2]
+def plain_name(reference: str, kind: str) -> str:
+    """The name in an ARN of this controller's ``kind`` (``job``, ``job-queue`` …); what is no ARN, as it is. Raises ClientError."""
+    if not reference.startswith("arn:"):
+        return reference
+    found, name = split_arn(reference)
+    if found != kind:
+        raise ClientError(f"{reference[:300]} is the ARN of a {found[:100]}, not of a {kind}")
+    return name
 
 
 def split_reference(reference: str) -> tuple[str, int | None]:
-    """Job id and node index of ``id``, ``arn``, ``id#N`` or ``arn#N``; an array's child ``id:N`` is an id of its own."""
-    base, sign, node = plain_name(reference).partition("#")
+    """Job id and node index of ``id``, ``arn``, ``id#N`` or ``arn#N``; an array's child ``id:N`` is an id of its own.
+
+    Raises ClientError for an ARN of something else.
+    """
+    base, sign, node = plain_name(reference, "job").partition("#")
     # longer than any index: not a number to look up, and Python refuses to read thousands of digits
     return (base, int(node)) if sign and re.fullmatch(r"[0-9]{1,6}", node) else (base, None if not sign else -1)
 
 
 def split_arn(arn: str) -> tuple[str, str]:
-    """Kind (``job-queue``, ``job`` …) and name of one of our ARNs. Raises ValueError."""
-    match = re.fullmatch(r"arn:aws[a-z-]*:batch:[a-z0-9-]*:[0-9]*:([a-z-]+)/(.+)", arn)
-    if not match:
-        raise ValueError(f"{arn!r} is not an ARN of AWS Batch, such as {queue_arn('default')}")
-    return match[1], match[2]
+    """Kind (``job-queue``, ``job`` …) and name of one of our ARNs. Raises ClientError for any other."""
+    kind, slash, name = arn.removeprefix(PREFIX).partition("/")
+    if not arn.startswith(PREFIX) or not slash or not kind or not name:
+        raise ClientError(f"{arn[:300]!r} is not an ARN of this controller; its ARNs look like {queue_arn('default')}")
+    return kind, name

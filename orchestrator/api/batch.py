@@ -29,6 +29,8 @@ OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
     "ListJobs": jobs.list_jobs,
     "TerminateJob": jobs.terminate_job,
     "CancelJob": jobs.cancel_job,
+    "TerminateJobs": jobs.terminate_jobs,
+    "CancelJobs": jobs.cancel_jobs,
     "CreateJobQueue": queues.create_job_queue,
     "DescribeJobQueues": queues.describe_job_queues,
     "UpdateJobQueue": queues.update_job_queue,

@@ -26,7 +26,7 @@ class Context:
 
     def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
-        queue = self.session.get(JobQueue, plain_name(reference))
+        queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
             there = (
                 ", ".join(self.session.scalars(select(JobQueue.name).order_by(JobQueue.name).limit(5))) or "none yet"
@@ -36,7 +36,7 @@ class Context:
 
     def definition(self, reference: str) -> JobDefinition:
         """The active definition of this name (its newest revision), ``name:revision`` or ARN. Raises ClientError."""
-        name, _, revision = plain_name(reference).partition(":")
+        name, _, revision = plain_name(reference, "job-definition").partition(":")
         query = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.status == "ACTIVE")
         if revision:
             if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
@@ -49,7 +49,7 @@ class Context:
 
     def definition_of(self, job: Job) -> JobDefinition:
         """The definition of a job, active or not."""
-        name, _, revision = plain_name(job.definition).partition(":")
+        name, _, revision = plain_name(job.definition, "job-definition").partition(":")
         return self.session.get_one(JobDefinition, (name, int(revision)))
 
     def reason(self, job: Job) -> str | None:

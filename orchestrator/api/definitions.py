@@ -51,7 +51,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
         raise ClientError("DescribeJobDefinitions takes at most 100 job definitions")
     query = select(JobDefinition).order_by(JobDefinition.name, JobDefinition.revision.desc())
     if listed:
-        wanted = [plain_name(each).partition(":") for each in listed]
+        wanted = [plain_name(each, "job-definition").partition(":") for each in listed]
         found = [
             each
             for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in wanted])))
@@ -60,7 +60,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
         ]
         return {"jobDefinitions": [_describe(each) for each in found]}
     if name := request.get("jobDefinitionName"):
-        query = query.where(JobDefinition.name == plain_name(name).partition(":")[0])
+        query = query.where(JobDefinition.name == plain_name(name, "job-definition").partition(":")[0])
     if status := request.get("status"):
         query = query.where(JobDefinition.status == status)
     found_page, token = page(
@@ -71,7 +71,7 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
 
 def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeregisterJobDefinition: INACTIVE; jobs that were submitted with it go on."""
-    name, _, revision = plain_name(request["jobDefinition"]).partition(":")
+    name, _, revision = plain_name(request["jobDefinition"], "job-definition").partition(":")
     if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
         raise ClientError(
             f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"

@@ -10,13 +10,15 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import rules
-from orchestrator.api.arns import environment_arn, plain_name, policy_arn
+from orchestrator.api.arns import ACCOUNT, REGION, environment_arn, plain_name, policy_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
+from orchestrator.pools import is_built_in
 from orchestrator.tables import ComputeEnvironment, JobQueue, SchedulingPolicy
 
 _MOST_ENVIRONMENTS = 50
+_SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
 
 
 def create_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -47,9 +49,9 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
     """DescribeComputeEnvironments, by names or ARNs, or all."""
     query = select(ComputeEnvironment).order_by(ComputeEnvironment.name)
     if named := request.get("computeEnvironments"):
-        query = query.where(ComputeEnvironment.name.in_([plain_name(each) for each in named]))
+        query = query.where(ComputeEnvironment.name.in_([plain_name(each, "compute-environment") for each in named]))
     rows, token = page(context.session, query, request, page_size(request, 100), (ComputeEnvironment.name,), (False,))
-    return {"computeEnvironments": [_describe(environment) for environment in rows], **token}
+    return {"computeEnvironments": [_describe(context, environment) for environment in rows], **token}
 
 
 def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -71,7 +73,7 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
-    environment = context.session.get(ComputeEnvironment, plain_name(request["computeEnvironment"]))
+    environment = context.session.get(ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment"))
     if environment is None:
         return {}
     if environment.state != "DISABLED":
@@ -106,7 +108,7 @@ def describe_scheduling_policies(context: Context, request: dict[str, Any]) -> d
     """DescribeSchedulingPolicies by ARNs; unknown ones are passed over."""
     if len(request["arns"]) > 100:
         raise ClientError("DescribeSchedulingPolicies takes at most 100 ARNs")
-    found = [context.session.get(SchedulingPolicy, plain_name(arn)) for arn in request["arns"]]
+    found = [context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy")) for arn in request["arns"]]
     return {
         "schedulingPolicies": [
             {"name": each.name, "arn": policy_arn(each.name), "fairsharePolicy": each.fairshare, "tags": each.tags}
@@ -145,14 +147,14 @@ def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
 
 
 def _environment(context: Context, reference: str) -> ComputeEnvironment:
-    environment = context.session.get(ComputeEnvironment, plain_name(reference))
+    environment = context.session.get(ComputeEnvironment, plain_name(reference, "compute-environment"))
     if environment is None:
         raise ClientError(f"Compute environment {reference[:300]} does not exist")
     return environment
 
 
 def _policy(context: Context, arn: str) -> SchedulingPolicy:
-    policy = context.session.get(SchedulingPolicy, plain_name(arn))
+    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
     if policy is None:
         raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
     return policy
@@ -203,11 +205,12 @@ def _matches(pattern: str, name: str) -> bool:
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 
-def _describe(environment: ComputeEnvironment) -> dict[str, Any]:
-    return {
+def _describe(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
+    identifier = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}"))
+    document: dict[str, Any] = {
         "containerOrchestrationType": "ECS",
-        "uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}")),
-        "ecsClusterArn": f"arn:aws:ecs:us-east-1:000000000000:cluster/{environment.name}",
+        "uuid": identifier,
+        "ecsClusterArn": f"arn:aws:ecs:{REGION}:{ACCOUNT}:cluster/AWSBatch-{environment.name}-{identifier}",
         **environment.document,
         "computeEnvironmentName": environment.name,
         "computeEnvironmentArn": environment_arn(environment.name),
@@ -215,4 +218,29 @@ def _describe(environment: ComputeEnvironment) -> dict[str, Any]:
         "status": "VALID",
         "statusReason": "ComputeEnvironment Healthy",
         "tags": environment.tags,
+    }
+    if document["type"] == "MANAGED":
+        document.setdefault("serviceRole", f"arn:aws:iam::{ACCOUNT}:role{_SERVICE_ROLE}")
+        document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
+    if is_built_in(environment):
+        document["computeResources"] = {**_own_resources(context, environment), **document.get("computeResources", {})}
+    return document
+
+
+def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
+    """``computeResources`` of a built-in environment: the hosts that its engine has now."""
+    engine = context.controller.engine
+    served = [environment.name] if environment.name in engine.names else []
+    cpus = int(sum(host.cpus for host in engine.capacity(served)))
+    return {
+        "type": "EC2",
+        "allocationStrategy": "BEST_FIT_PROGRESSIVE",
+        "minvCpus": 0 if engine.is_elastic(served) else cpus,
+        "maxvCpus": cpus,
+        "desiredvCpus": cpus,
+        "instanceTypes": ["optimal"],
+        "subnets": [],
+        "securityGroupIds": [],
+        "instanceRole": f"arn:aws:iam::{ACCOUNT}:instance-profile/muster",
+        "tags": {},
     }

@@ -1,8 +1,8 @@
-"""DescribeJobs, ListJobs, TerminateJob, CancelJob."""
+"""DescribeJobs, ListJobs, TerminateJob(s), CancelJob(s)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import func, select
@@ -18,6 +18,8 @@ from orchestrator.jobs import Status
 from orchestrator.tables import Job
 
 _LONGEST_REASON = 1024
+_MOST_ENDED = 50
+"""Jobs that TerminateJobs and CancelJobs take."""
 _BEFORE_NAME = len(definition_arn("", 1)) - 1
 """Where the name begins in a definition's ARN, from 1."""
 _EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
@@ -43,7 +45,10 @@ def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """ListJobs by queue (RUNNING where no status is given; all statuses with a filter), of an array, or of a gang."""
+    """ListJobs of a queue, of an array's children, or of a gang's nodes.
+
+    Without a status only RUNNING ones are listed. A filter applies to a queue only, and lists jobs in all states.
+    """
     given = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
     if len(given) != 1:
         raise ClientError("ListJobs: give exactly one of jobQueue, arrayJobId, multiNodeJobId")
@@ -53,9 +58,8 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         return _list_nodes(context, request)
     if array := request.get("arrayJobId"):
         job_id, _ = split_reference(array)
-        query = select(Job).where(Job.parent == job_id).order_by(Job.array_index, Job.id)
-        if status := request.get("jobStatus"):
-            query = query.where(Job.status == status)
+        status = request.get("jobStatus", Status.RUNNING)
+        query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
         query = query.options(selectinload(Job.attempts))
         rows, token = page(
             context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
@@ -76,8 +80,8 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     if job is None or job.kind != "multinode":
         return {"jobSummaryList": []}
     summaries = [summarize(job, context.reason(job), node) for node in range(int(job.node_properties["numNodes"]))]
-    wanted = request.get("jobStatus")
-    summaries = [summary for summary in summaries if not wanted or summary["status"] == wanted]
+    wanted = request.get("jobStatus", Status.RUNNING)
+    summaries = [summary for summary in summaries if summary["status"] == wanted]
     token = request.get("nextToken")
     start = decode(token, [int])[0] if token else 0
     if start < 0:
@@ -129,31 +133,80 @@ def _by_definition(value: str) -> Any:
 
 
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; one that does not run yet is cancelled; one that is over stays so."""
-    for job in _targets(context, request, "TerminateJob"):
-        if not job.is_over and job.stop_reason is None:
-            job.stop_reason = request["reason"]
+    """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; a job that does not run yet is cancelled; one that is over stays so."""
+    _check_reason(request, "TerminateJob")
+    _terminate(_targets(context, request["jobId"], "TerminateJob"), request["reason"])
     return {}
 
 
 def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
-    for job in _targets(context, request, "CancelJob"):
-        if job.status in _EARLY and job.stop_reason is None:
-            job.stop_reason, job.cancelled = request["reason"], True
+    _check_reason(request, "CancelJob")
+    _cancel(_targets(context, request["jobId"], "CancelJob"), request["reason"])
     return {}
 
 
-def _targets(context: Context, request: Mapping[str, Any], operation: str) -> Sequence[Job]:
-    """The job; an array's children too."""
+def terminate_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """TerminateJobs: TerminateJob for up to 50 jobs, each with its own result."""
+    return _each(context, request, "TerminateJobs", _terminate)
+
+
+def cancel_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CancelJobs: CancelJob for up to 50 jobs, each with its own result."""
+    return _each(context, request, "CancelJobs", _cancel)
+
+
+def _each(
+    context: Context, request: Mapping[str, Any], operation: str, end: Callable[[Sequence[Job], str], None]
+) -> dict[str, Any]:
+    """What became of each job; as on AWS, one that does not exist counts as ended."""
+    _check_reason(request, operation)
+    if not 1 <= len(request["jobs"]) <= _MOST_ENDED:
+        raise ClientError(f"{operation} takes 1 to {_MOST_ENDED} jobs, not {len(request['jobs'])}")
+    successful: list[str] = []
+    errors: list[dict[str, str]] = []
+    for reference in request["jobs"]:
+        try:
+            end(_targets(context, reference, operation), request["reason"])
+        except UnknownJob:
+            pass
+        except ClientError as error:
+            code = "AccessDenied" if error.status == 403 else "ValidationException"
+            errors.append({"job": reference, "code": code, "message": str(error)})
+            continue
+        successful.append(reference)
+    return {"successful": successful, "errors": errors}
+
+
+def _terminate(jobs: Sequence[Job], reason: str) -> None:
+    for job in jobs:
+        if not job.is_over and job.stop_reason is None:
+            job.stop_reason = reason
+
+
+def _cancel(jobs: Sequence[Job], reason: str) -> None:
+    for job in jobs:
+        if job.status in _EARLY and job.stop_reason is None:
+            job.stop_reason, job.cancelled = reason, True
+
+
+class UnknownJob(ClientError):
+    """There is no job of this id."""
+
+
+def _check_reason(request: Mapping[str, Any], operation: str) -> None:
     if len(request["reason"]) > _LONGEST_REASON:
         raise ClientError(f"{operation}: the reason is longer than {_LONGEST_REASON} characters")
-    job_id, node = split_reference(request["jobId"])
+
+
+def _targets(context: Context, reference: str, operation: str) -> Sequence[Job]:
+    """The job; an array's children too. Raises ClientError, UnknownJob."""
+    job_id, node = split_reference(reference)
     if node is not None:
         raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
     job = context.session.get(Job, job_id)
     if job is None:
-        raise ClientError(f"Job {request['jobId'][:300]} does not exist")
+        raise UnknownJob(f"Job {reference[:300]} does not exist")
     auth.current_identity.get().check_queue(job.queue)
     if job.kind != "array":
         return [job]

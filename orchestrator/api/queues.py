@@ -47,7 +47,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
     """DescribeJobQueues, by names or ARNs, or all."""
     query = select(JobQueue).order_by(JobQueue.name)
     if named := request.get("jobQueues"):
-        query = query.where(JobQueue.name.in_([plain_name(each) for each in named]))
+        query = query.where(JobQueue.name.in_([plain_name(each, "job-queue") for each in named]))
     rows, token = page(context.session, query, request, page_size(request, 100), (JobQueue.name,), (False,))
     return {"jobQueues": [_describe(queue) for queue in rows], **token}
 
@@ -69,7 +69,7 @@ def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteJobQueue of a queue that is DISABLED: its jobs are ended, and with the last one it is gone."""
-    queue = context.session.get(JobQueue, plain_name(request["jobQueue"]))
+    queue = context.session.get(JobQueue, plain_name(request["jobQueue"], "job-queue"))
     if queue is None or queue.deleting:
         return {}
     auth.current_identity.get().check_queue(queue.name)
@@ -134,7 +134,7 @@ def _check_kind(request: Mapping[str, Any]) -> None:
 def _environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
     if len(order) > _MOST_ENVIRONMENTS:
         raise ClientError(f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_ENVIRONMENTS}")
-    names = [plain_name(each["computeEnvironment"]) for each in sorted(order, key=lambda each: each["order"])]
+    names = [plain_name(each["computeEnvironment"], "compute-environment") for each in sorted(order, key=lambda each: each["order"])]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every environment and every order once")
     for name in names:
@@ -159,7 +159,7 @@ def _limits(limits: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _policy(context: Context, arn: str) -> str:
-    policy = context.session.get(SchedulingPolicy, plain_name(arn))
+    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
     if policy is None:
         raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
     return policy.name

@@ -53,10 +53,7 @@ def _changeable(context: Context, arn: str, operation: str) -> Any:
 
 def _resource(context: Context, arn: str) -> Any:
     """The row that an ARN names; the nodes of a job and the children of an array have no tags of their own, as on AWS."""
-    try:
-        kind, name = split_arn(arn)
-    except ValueError as error:
-        raise ClientError(str(error)[:400]) from None
+    kind, name = split_arn(arn)
     found: Any
     if kind == "job-definition":
         name, _, revision = name.partition(":")
