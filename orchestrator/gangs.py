@@ -22,7 +22,7 @@ from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet, engine_of
 from orchestrator.engines.several import Several
-from orchestrator.jobs import Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.pools import engine_options
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
@@ -156,6 +156,8 @@ class Gangs:
             job.status_reason = status[main].waiting
         elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
+            if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
+                array.started_at = job.started_at
             job.move(Status.RUNNING, runs)
         elif attempt.ending is None and job.status_reason != runs:
             job.status_reason = runs  # it can be seen again
@@ -229,10 +231,11 @@ class Gangs:
         ends: list[NodeEnd | None] = []
         records = []
         for record, node in zip(attempt.nodes, status, strict=True):
-            end = None
+            end, stopped = None, now()
             if not node.running:
                 outcome = read_outcome(run, job.id, attempt.number, record["index"])
                 if outcome:
+                    stopped = min(stopped, int(outcome.ended * 1000))
                     message = outcome.error.message if outcome.error else None
                     # a supervisor sees that its rank was killed; only the engine knows for what
                     starved = outcome.signal == "SIGKILL" and node.detail.startswith("OutOfMemoryError")
@@ -248,6 +251,11 @@ class Gangs:
                     end = NodeEnd(code or 137, detail, now() / 1000, lost=not node.detail)
             ends.append(end)
             seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
+            if end and "stoppedAt" not in record:
+                seen["stoppedAt"] = stopped
+                if attempt.ending is None:  # by itself: nobody has ended the gang
+                    gone = f"Host EC2 (instance {record['host']}) terminated."
+                    seen["statusReason"] = gone if end.lost else AWS_EXITED
             if self.bus.met(job.id, attempt.number, record["index"]):
                 seen["met"] = True  # the next controller must miss it, too, if it does not come back
             if node.gpus:

@@ -206,7 +206,8 @@ class Attempt(Base):
     """Those since the last checkpoint, for an attempt that did not end well: their work was lost."""
     wasted_cpu_seconds: Mapped[float] = mapped_column(default=0.0)
     nodes: Mapped[list[dict[str, Any]]]
-    """By index: index, host, gpus, and, as they become known, address, exitCode, reason, error, and whether the bus met it."""
+    """By index: index, host, gpus, and, as they become known, address, exitCode, reason, error, stoppedAt [ms], of a node that ended
+    by itself statusReason, and whether the bus met it."""
     job: Mapped[Job] = relationship(back_populates="attempts")
 
     @validates("status_reason")

@@ -9,9 +9,12 @@ from sqlalchemy import func, select
 from orchestrator.api import auth, rules
 from orchestrator.api.arns import definition_arn, plain_name
 from orchestrator.api.context import Context
+from orchestrator.api.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
 from orchestrator.tables import JobDefinition
+
+_PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 
 
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
@@ -21,18 +24,15 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     rules.check_tries(request)
     rules.check_tags(request.get("tags") or {})
     rules.check_priority("schedulingPriority", request.get("schedulingPriority"))
-    if "FARGATE" in (request.get("platformCapabilities") or []):
-        raise ClientError(f"job definition {name}: platformCapabilities FARGATE is not supported; use EC2")
-    wanted = {"multinode": "nodeProperties", "container": "containerProperties"}.get(kind)
+    if others := set(request.get("platformCapabilities") or []) - {"EC2"}:
+        raise ClientError(f"job definition {name}: platformCapabilities {min(others)[:50]} is not supported; use EC2")
+    wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
     if wanted is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
-    others = {"nodeProperties", "containerProperties", "eksProperties", "ecsProperties"} - {wanted}
-    if not request.get(wanted) or any(request.get(key) for key in others):
-        raise ClientError(f"job definition {name}: type {kind} needs {wanted}, and only that")
-    if kind == "multinode":
-        rules.check_nodes(request["nodeProperties"])
-    else:
-        rules.check_container(request["containerProperties"], "containerProperties")
+    given = [key for key in (*_PROPERTIES, "eksProperties") if request.get(key)]
+    if len(given) != 1 or given[0] not in wanted:
+        raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
+    rules.check_nodes(rules.node_properties(request), kind)
     _check_owner(context, name, "RegisterJobDefinition")
     newest = context.session.scalar(select(func.max(JobDefinition.revision)).where(JobDefinition.name == name))
     revision = (newest or 0) + 1
@@ -93,12 +93,22 @@ def _check_owner(context: Context, name: str, operation: str) -> None:
 
 def _describe(definition: JobDefinition) -> dict[str, Any]:
     document = definition.document
-    return {
+    shown = {
         "containerOrchestrationType": "ECS",
         "platformCapabilities": ["EC2"],
+        "parameters": {},
         **document,
         "jobDefinitionArn": definition_arn(definition.name, definition.revision),
         "revision": definition.revision,
         "status": definition.status,
         "tags": definition.tags,
     }
+    if document.get("retryStrategy"):
+        shown["retryStrategy"] = retry_strategy(document["retryStrategy"])
+    if document.get("containerProperties"):
+        shown["containerProperties"] = with_defaults(document["containerProperties"])
+    if document.get("ecsProperties"):
+        shown["ecsProperties"] = ecs_with_defaults(document["ecsProperties"])
+    if document.get("nodeProperties"):
+        shown["nodeProperties"] = node_ranges(document["nodeProperties"])
+    return shown

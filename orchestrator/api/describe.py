@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.api.arns import environment_arn, job_arn, queue_arn
+from orchestrator.api.ecs import to_ecs
 from orchestrator.definition import target_nodes
 from orchestrator.jobs import Status, main_container
 from orchestrator.tables import Attempt, Job, JobDefinition
+
+_LISTS = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
 
 
 def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: str | None) -> dict[str, Any]:
@@ -24,13 +27,14 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
     detail: dict[str, Any] = {
         **_common(job, reason),
         "jobQueue": queue_arn(job.queue),
-        "retryStrategy": {"attempts": job.attempts_allowed, "evaluateOnExit": job.evaluate_on_exit},
+        "retryStrategy": retry_strategy({"attempts": job.attempts_allowed, "evaluateOnExit": job.evaluate_on_exit}),
         "timeout": {"attemptDurationSeconds": job.timeout} if job.timeout else None,
         "parameters": job.parameters,
         "dependsOn": [_dependency(each.on_id, each.kind) for each in job.dependencies],
         "tags": job.tags,
         "propagateTags": bool(job.request.get("propagateTags", document.get("propagateTags", False))),
         "platformCapabilities": document.get("platformCapabilities", ["EC2"]),
+        "eksAttempts": [],
         "shareIdentifier": job.share,
         "schedulingPriority": job.priority if job.share else None,
         "isCancelled": job.cancelled,
@@ -39,15 +43,85 @@ def describe_job(job: Job, definition: JobDefinition, node: int | None, reason: 
     index = int(job.node_properties["mainNode"]) if node is None else node
     detail["attempts"] = [_attempt(job, attempt, index) for attempt in job.attempts if attempt.stopped_at]
     last = job.attempts[-1] if job.attempts else None
-    if job.kind != "multinode":
-        detail["container"] = {**_container_of(job, 0), **(_container(job, last, 0) if last else {})}
-    elif node is None:
-        detail["nodeProperties"] = job.node_properties
-    else:
+    if node is not None:
         detail |= _node_identity(job, node)
+        detail |= _end_of_node(job, node)
         detail["nodeDetails"] = {"nodeIndex": node, "isMainNode": node == job.node_properties["mainNode"]}
-        detail["container"] = {**_container_of(job, node), **(_container(job, last, node) if last else {})}
+    if job.kind == "multinode" and node is None:
+        detail["nodeProperties"] = node_ranges(job.node_properties)
+    else:
+        entry = _range_of(job, node or 0)
+        shown = {**with_defaults(entry["container"]), **(_container(job, last, node or 0) if last else {})}
+        if "ecs" in entry:
+            detail["container"], detail["ecsProperties"] = {}, _in_ecs(shown, entry["ecs"])
+        else:
+            detail["container"] = shown
     return {key: value for key, value in detail.items() if value is not None}
+
+
+def _end_of_node(job: Job, node: int) -> dict[str, Any]:
+    """What a node that has ended has of its own while the others still run: when and how it ended, and its attempt."""
+    last = job.attempts[-1] if job.attempts else None
+    record = main_container(last.nodes, node) if last else {}
+    if last is None or job.status == Status.RUNNABLE or "exitCode" not in record:
+        return {}
+    attempts = [_attempt(job, attempt, node) for attempt in job.attempts]
+    return {**_own_end(job, node), "attempts": attempts}
+
+
+def _own_end(job: Job, node: int) -> dict[str, Any]:
+    """When and how a node ended by itself; nothing for one that runs, or was ended with its gang."""
+    last = job.attempts[-1] if job.attempts else None
+    if last is None or job.status == Status.RUNNABLE or "statusReason" not in main_container(last.nodes, node):
+        return {}
+    attempt = _attempt(job, last, node)
+    return {key: attempt[key] for key in ("stoppedAt", "statusReason")}
+
+
+def _in_ecs(container: Mapping[str, Any], name: str) -> dict[str, Any]:
+    task = {key: container[key] for key in ("containerInstanceArn", "taskArn") if key in container}
+    return to_ecs(container, name, task)
+
+
+def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
+    """``retryStrategy`` as AWS shows it; ``action`` is taken in any case, and shown in that of the model."""
+    conditions = given.get("evaluateOnExit") or []
+    return {**given, "evaluateOnExit": [{**each, "action": each["action"].upper()} for each in conditions]}
+
+
+def with_defaults(container: Mapping[str, Any]) -> dict[str, Any]:
+    """``containerProperties`` with the empty lists that AWS shows for what was left out."""
+    return {**{name: [] for name in _LISTS}, **container}
+
+
+def node_ranges(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """``nodeProperties`` as AWS shows them: each range as it was defined, by ``container`` or by ``ecsProperties``."""
+    return {**properties, "nodeRangeProperties": [_range(entry) for entry in properties["nodeRangeProperties"]]}
+
+
+def ecs_with_defaults(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """``ecsProperties`` with the empty lists of what was left out."""
+    in_task = [name for name in _LISTS if name != "volumes"]
+    tasks = [
+        {
+            "volumes": [],
+            **task,
+            "containers": [{**{name: [] for name in in_task}, **each} for each in task["containers"]],
+        }
+        for task in properties["taskProperties"]
+    ]
+    return {"taskProperties": tasks}
+
+
+def _range(entry: Mapping[str, Any]) -> dict[str, Any]:
+    rest = {key: value for key, value in entry.items() if key != "ecs"}
+    if "ecsProperties" in entry:
+        return {**rest, "ecsProperties": ecs_with_defaults(entry["ecsProperties"])}
+    container = with_defaults(entry["container"])
+    if "ecs" in entry:  # of a job, which keeps all in one form
+        del rest["container"]
+        return {**rest, "ecsProperties": to_ecs(container, entry["ecs"], {})}
+    return {**rest, "container": container}
 
 
 def array_properties(job: Job, counts: Mapping[str, int]) -> dict[str, Any] | None:
@@ -69,6 +143,7 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
         if node is not None:
             summary |= _node_identity(job, node)
             summary["nodeProperties"] |= {"nodeIndex": node, "isMainNode": node == main}
+        summary |= _own_end(job, node) if node is not None else {}
     elif job.array_size is not None:
         summary["arrayProperties"] = {"size": job.array_size}
         if job.array_index is not None:
@@ -79,6 +154,8 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
         summary["container"] = {"exitCode": record["exitCode"], "reason": str(record.get("reason") or "")[:255]}
     if job.share:
         summary["shareIdentifier"] = job.share
+    if job.stop_reason is not None:  # AWS shows only the one that is true
+        summary["isCancelled" if job.cancelled else "isTerminated"] = True
     return {key: value for key, value in summary.items() if value is not None}
 
 
@@ -120,11 +197,14 @@ def _dependency(on: str, kind: str | None) -> dict[str, str]:
 
 
 def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
+    record, container, entry = main_container(attempt.nodes, node), _container(job, attempt, node), _range_of(job, node)
+    stopped = record.get("stoppedAt") or attempt.stopped_at
     detail = {
-        "container": _container(job, attempt, node),
+        "container": {} if "ecs" in entry else container,
+        "taskProperties": _in_ecs(container, entry["ecs"])["taskProperties"] if "ecs" in entry else None,
         "startedAt": attempt.started_at,
-        "stoppedAt": attempt.stopped_at,
-        "statusReason": attempt.status_reason,
+        "stoppedAt": stopped and max(stopped, attempt.started_at or stopped),  # clocks of hosts differ
+        "statusReason": record.get("statusReason") or attempt.status_reason,
     }
     return {key: value for key, value in detail.items() if value is not None}
 
@@ -142,9 +222,9 @@ def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
     return {key: value for key, value in detail.items() if value is not None}
 
 
-def _container_of(job: Job, node: int) -> dict[str, Any]:
+def _range_of(job: Job, node: int) -> Mapping[str, Any]:
+    """The node range, innermost, that says what a node is."""
     count = job.node_properties["numNodes"]
     ranges = [e for e in job.node_properties["nodeRangeProperties"] if node in target_nodes(e["targetNodes"], count)]
-    innermost = min(ranges, key=lambda entry: len(target_nodes(entry["targetNodes"], count)))
-    defaults: dict[str, Any] = {"volumes": [], "environment": [], "mountPoints": [], "ulimits": []}
-    return {**defaults, **innermost["container"]}
+    innermost: Mapping[str, Any] = min(ranges, key=lambda entry: len(target_nodes(entry["targetNodes"], count)))
+    return innermost

@@ -30,15 +30,14 @@ def from_ecs(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
     return {**same, **{ours: task[theirs] for theirs, ours in _OF_TASK.items() if theirs in task}}
 
 
-def override_from_ecs(override: Mapping[str, Any], properties: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The ``containerOverrides`` that mean the same as ``ecsPropertiesOverride``; ``properties``: those of the definition."""
+def override_from_ecs(override: Mapping[str, Any], there: str, where: str) -> dict[str, Any]:
+    """The ``containerOverrides`` that mean the same as ``ecsPropertiesOverride`` of a container called ``there``. Raises ClientError."""
     if not override.get("taskProperties"):
         return {}
     containers = _only(override["taskProperties"], "task", where).get("containers")
     if not containers:
         return {}
     changes = dict(_only(containers, "container", where))
-    there = container_name(properties)
     if (name := changes.pop("name", None)) is not None and name != there:
         raise ClientError(f"{where}: there is no container {name[:100]!r}; the definition's is called {there!r}")
     return changes

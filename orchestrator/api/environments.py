@@ -73,7 +73,9 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
-    environment = context.session.get(ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment"))
+    environment = context.session.get(
+        ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment")
+    )
     if environment is None:
         return {}
     if environment.state != "DISABLED":

@@ -102,7 +102,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     definition = validate("RegisterJobDefinition", body.definition)
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    needs = rules.check_nodes(definition["nodeProperties"], complete=True)
+    needs = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
     with controller.database.session() as session:
         hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]))
         queue = session.get(JobQueue, body.queue)

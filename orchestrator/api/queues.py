@@ -134,7 +134,10 @@ def _check_kind(request: Mapping[str, Any]) -> None:
 def _environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
     if len(order) > _MOST_ENVIRONMENTS:
         raise ClientError(f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_ENVIRONMENTS}")
-    names = [plain_name(each["computeEnvironment"], "compute-environment") for each in sorted(order, key=lambda each: each["order"])]
+    names = [
+        plain_name(each["computeEnvironment"], "compute-environment")
+        for each in sorted(order, key=lambda each: each["order"])
+    ]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every environment and every order once")
     for name in names:

@@ -8,7 +8,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from orchestrator.api.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.errors import ClientError
+from orchestrator.api.members import check_consumables, check_members
 from orchestrator.definition import GangNeeds, gang_needs, target_nodes
 from orchestrator.excerpts import shown
 
@@ -74,8 +76,11 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> GangNeeds:
-    """``nodeProperties`` of a definition or, ``complete``, of a job, with the submission's overrides applied; what they ask for."""
+def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = False) -> GangNeeds:
+    """What a definition of type ``kind`` or, ``complete``, a job asks for, whose overrides are applied. Raises ClientError.
+
+    ``properties``: as :func:`node_properties` gives them.
+    """
     count, main, ranges = properties["numNodes"], properties["mainNode"], properties["nodeRangeProperties"]
     if not 1 <= count <= _MOST_NODES:
         raise ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
@@ -85,13 +90,10 @@ def check_nodes(properties: Mapping[str, Any], *, complete: bool = False) -> Gan
         raise ClientError(f"{len(ranges)} node ranges; a multi-node parallel job has 1 to {_MOST_RANGES}")
     for entry in ranges:
         target = entry["targetNodes"]
-        if entry.get("container") is None:
-            raise ClientError(f"node range {target[:20]}: only container properties are supported")
-        check_container(entry["container"], f"node range {target[:20]}")
+        where = f"node range {target[:20]}" if kind == "multinode" else "the container"
+        check_container(entry["container"], where)
         if complete and not entry["container"].get("command"):
-            raise ClientError(
-                f"node range {target[:20]}: has no command; give one in the definition or in the overrides"
-            )
+            raise ClientError(f"{where}: has no command; give one in the definition or in the overrides")
         _check_target(target, count)
     try:
         needs = gang_needs(properties)
@@ -134,7 +136,10 @@ def _check_target(target: str, count: int) -> None:
 
 
 def check_container(container: Mapping[str, Any], where: str) -> None:
-    """``containerProperties``: an image or a command, environment, resources."""
+    """``containerProperties``: image, environment, resources, volumes, and nothing that would have no effect."""
+    if not container.get("image"):
+        raise ClientError(f"Error executing request, Exception : {where}: Container image is not provided.")
+    check_members(container, where)
     for pair in container.get("environment") or []:
         name = pair.get("name")
         if not name:
@@ -153,6 +158,12 @@ def check_container(container: Mapping[str, Any], where: str) -> None:
         raise ClientError(f"{where}: resourceRequirements names {max(kinds, key=kinds.count)} twice")
     for entry in resources:
         _check_resource(entry, where)
+    for kind, older, name in (("VCPU", "vcpus", "vCPU"), ("MEMORY", "memory", "Memory")):
+        if kind not in kinds and container.get(older) is None:  # the first words are AWS's own
+            raise ClientError(
+                f"Error executing request, Exception : {name} is not provided. Give {where} a resourceRequirements entry "
+                f"of type {kind}"
+            )
     for key, least, most in (("vcpus", 1, 10**7), ("memory", 4, 10**12)):  # the most that resourceRequirements can say
         if container.get(key) is not None and not least <= container[key] < most:
             raise ClientError(f"{where}: {key} is {str(container[key])[:30]}; it must be {least} to {most - 1}")
@@ -176,10 +187,29 @@ def _check_resource(entry: Mapping[str, str], where: str) -> None:
         raise ClientError(f"{where}: resourceRequirements {kind} is {value[:50]!r}; it must be {least}")
 
 
-def single_node(container: Mapping[str, Any]) -> dict[str, Any]:
-    """A single-node job as the gang of one node that it is here."""
-    entry = {"targetNodes": "0:0", "container": dict(container)}
-    return {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [entry]}
+def node_properties(document: Mapping[str, Any]) -> dict[str, Any]:
+    """What a definition runs as ``nodeProperties`` whose ranges have a ``container`` each, and ``ecs``, its name, where it came as
+    ``ecsProperties``. A single-node job is the gang of one node that it is here. Raises ClientError."""
+    check_consumables(document, "the job definition")
+    if document["type"] == "multinode":
+        nodes = document["nodeProperties"]
+        return {**nodes, "nodeRangeProperties": [_in_container(entry) for entry in nodes["nodeRangeProperties"]]}
+    entry = {"targetNodes": "0:0", "container": document.get("containerProperties")}
+    entry["ecsProperties"] = document.get("ecsProperties")
+    return {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [_in_container(entry)]}
+
+
+def _in_container(entry: Mapping[str, Any]) -> dict[str, Any]:
+    where = f"node range {entry['targetNodes'][:20]}"
+    given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
+    if given not in (["container"], ["ecsProperties"]):
+        raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
+    check_consumables(entry, where)
+    rest = {key: value for key, value in entry.items() if key not in ("container", "ecsProperties")}
+    if given == ["container"]:
+        return {**rest, "container": dict(entry["container"])}
+    ecs = entry["ecsProperties"]
+    return {**rest, "container": from_ecs(ecs, where), "ecs": container_name(ecs)}
 
 
 def substitute(properties: Mapping[str, Any], parameters: Mapping[str, str]) -> dict[str, Any]:
@@ -201,6 +231,8 @@ def override_container(container: dict[str, Any], changes: Mapping[str, Any]) ->
     """``containerOverrides`` on a container: environment merges by name, the command replaces, resources replace by type."""
     if changes.get("command"):
         container["command"] = list(changes["command"])
+    if changes.get("instanceType"):
+        container["instanceType"] = changes["instanceType"]
     for key, name in (("environment", "name"), ("resourceRequirements", "type")):
         merged = {pair.get(name): pair for pair in [*(container.get(key) or []), *(changes.get(key) or [])]}
         container[key] = list(merged.values())
@@ -231,5 +263,23 @@ def override_nodes(properties: Mapping[str, Any], overrides: Mapping[str, Any]) 
                 "NodeOverride targets should match job definition. "
                 f"Non matching targets - {override['targetNodes'][:50]}"
             )
-        override_container(ranges[override["targetNodes"]]["container"], override.get("containerOverrides") or {})
+        override_range(ranges[override["targetNodes"]], override)
+        if override.get("instanceTypes"):
+            ranges[override["targetNodes"]]["instanceTypes"] = list(override["instanceTypes"])
     return result
+
+
+def override_range(entry: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """``containerOverrides`` or ``ecsPropertiesOverride`` on a node range, whichever the definition has. Raises ClientError."""
+    where = f"node range {entry['targetNodes'][:20]}"
+    check_consumables(changes, where)
+    right, wrong = ("ecsPropertiesOverride", "containerOverrides")
+    if "ecs" not in entry:
+        right, wrong = wrong, right
+    for key in (wrong, "eksPropertiesOverride"):
+        if changes.get(key):
+            raise ClientError(f"{where}: {key} does not fit the job definition; use {right}")
+    override = changes.get(right) or {}
+    if "ecs" in entry:
+        override = override_from_ecs(override, entry["ecs"], where)
+    override_container(entry["container"], override)

@@ -13,6 +13,7 @@ from orchestrator.api import auth, rules
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
 from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
+from orchestrator.api.members import check_consumables
 from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
 from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, now
@@ -92,7 +93,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
-    needs = rules.check_nodes(properties, complete=True)
+    needs = rules.check_nodes(properties, document["type"], complete=True)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     job_id = str(uuid.uuid4())
@@ -123,20 +124,18 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
 
 def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:
     """What the job runs, as node properties, with the overrides that fit its type."""
-    for key in ("ecsPropertiesOverride", "eksPropertiesOverride", "consumableResourcePropertiesOverride"):
-        if request.get(key):
-            raise ClientError(f"{key} is not supported; use containerOverrides or nodeOverrides")
+    properties = rules.node_properties(document)
     if document["type"] == "multinode":
-        if request.get("containerOverrides"):
-            raise ClientError("containerOverrides is not for a multi-node parallel job; use nodeOverrides")
+        check_consumables(request, "the job")
+        for key in ("containerOverrides", "ecsPropertiesOverride", "eksPropertiesOverride"):
+            if request.get(key):
+                raise ClientError(f"{key} is not for a multi-node parallel job; use nodeOverrides")
         if request.get("arrayProperties"):
             raise ClientError("arrayProperties is not for a multi-node parallel job; submit the jobs one by one")
-        return rules.override_nodes(document["nodeProperties"], request.get("nodeOverrides") or {})
+        return rules.override_nodes(properties, request.get("nodeOverrides") or {})
     if request.get("nodeOverrides"):
         raise ClientError("nodeOverrides is for multi-node parallel jobs; use containerOverrides")
-    properties = rules.single_node(document["containerProperties"])
-    properties["nodeRangeProperties"][0]["container"] = dict(properties["nodeRangeProperties"][0]["container"])
-    rules.override_container(properties["nodeRangeProperties"][0]["container"], request.get("containerOverrides") or {})
+    rules.override_range(properties["nodeRangeProperties"][0], request)
     return properties
 
 

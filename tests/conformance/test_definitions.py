@@ -119,7 +119,13 @@ def test_a_definition_comes_back_as_it_was_registered(batch: Batch) -> None:
     }
     answer = batch.api.register_job_definition(jobDefinitionName="def-whole", **wanted)
     [found] = batch.api.describe_job_definitions(jobDefinitions=[answer["jobDefinitionArn"]])["jobDefinitions"]
-    assert {key: found[key] for key in wanted} == wanted
+    ranges = found["nodeProperties"]["nodeRangeProperties"]
+    empty = dict.fromkeys(
+        ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes"), []
+    )
+    for given in wanted["nodeProperties"]["nodeRangeProperties"]:  # what AWS adds: an empty list for what was left out
+        given["container"] = {**empty, **given["container"]}
+    assert len(ranges) == 2 and {key: found[key] for key in wanted} == wanted
     assert (found["jobDefinitionArn"], found["revision"], found["status"]) == (answer["jobDefinitionArn"], 1, "ACTIVE")
     assert found["containerOrchestrationType"] == "ECS"
 
@@ -193,7 +199,7 @@ RETRIES = [{"onExitCode": str(code), "action": "RETRY"} for code in range(6)]
             "volume 'x'",
         ),
         ({"containerProperties": container("true", {})}, "type multinode needs nodeProperties, and only that"),
-        ({"type": "container"}, "type container needs containerProperties, and only that"),
+        ({"type": "container"}, "type container needs containerProperties or ecsProperties, and only that"),
         ({"tags": {f"key-{i}": "" for i in range(51)}}, "at most 50"),
         ({"jobDefinitionName": "x" * 129}, "128"),
         ({"jobDefinitionName": "a b"}, "jobDefinitionName 'a b'"),
@@ -314,7 +320,9 @@ def test_the_aws_command_registers_describes_and_reads_errors(batch: Batch, park
     registered = aws(url, "batch", "register-job-definition", "--cli-input-json", f"file://{tmp_path}/definition.json")
     assert registered["revision"] == 1
     shown = aws(*(url, "batch", "describe-job-definitions", "--job-definition-name", "def-typed", "--status", "ACTIVE"))
-    assert shown["jobDefinitions"][0]["nodeProperties"] == request["nodeProperties"]
+    [entry] = shown["jobDefinitions"][0]["nodeProperties"]["nodeRangeProperties"]
+    given = request["nodeProperties"]["nodeRangeProperties"][0]["container"]  # type: ignore[index]
+    assert {key: entry["container"][key] for key in given} == given
     said = aws(
         *(url, "batch", "submit-job", "--job-name", "def-typed", "--job-queue", parked),
         *("--job-definition", "def-typed:2"),

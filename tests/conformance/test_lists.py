@@ -14,7 +14,7 @@ from tests.conftest import Serving, wait_for
 
 HERE = {
     *("RegisterJobDefinition", "DescribeJobDefinitions", "DeregisterJobDefinition"),
-    *("SubmitJob", "DescribeJobs", "ListJobs", "TerminateJob", "CancelJob"),
+    *("SubmitJob", "DescribeJobs", "ListJobs", "TerminateJob", "CancelJob", "TerminateJobs", "CancelJobs"),
     *("CreateJobQueue", "DescribeJobQueues", "UpdateJobQueue", "DeleteJobQueue", "GetJobQueueSnapshot"),
     *("CreateComputeEnvironment", "DescribeComputeEnvironments"),
     *("UpdateComputeEnvironment", "DeleteComputeEnvironment"),
@@ -22,7 +22,7 @@ HERE = {
     *("UpdateSchedulingPolicy", "DeleteSchedulingPolicy"),
     *("TagResource", "UntagResource", "ListTagsForResource"),
 }
-"""What issue 4 lists; of the others the reference says that they can be refused."""
+"""What is carried out; the others are refused."""
 
 
 @pytest.fixture(scope="module")

@@ -153,15 +153,22 @@ def test_a_parent_has_no_container_and_its_nodes_have_one(batch: Batch) -> None:
         batch.api.describe_jobs(jobs=[job] * 101)
 
 
-def test_nodes_are_listed_with_their_index(batch: Batch) -> None:
-    job = batch.submit(batch.multinode("mnp-listed", "true", 3))
+def test_nodes_are_listed_with_their_index(batch: Batch, tmp_path: Path) -> None:
+    script = f"[ {NODE} != 0 ] || {UNTIL.format('go')}"
+    job = batch.submit(batch.multinode("mnp-listed", script, 3, env={"GATE": str(tmp_path)}))
+    for node in (1, 2):
+        assert batch.wait(f"{job}#{node}")["status"] == "SUCCEEDED"
+    gate(tmp_path, "go")
     batch.wait(job)
-    listed = batch.api.list_jobs(multiNodeJobId=job)["jobSummaryList"]
+    assert batch.api.list_jobs(multiNodeJobId=job)["jobSummaryList"] == [], "without a status: those that run"
+    listed = batch.api.list_jobs(multiNodeJobId=job, jobStatus="SUCCEEDED")["jobSummaryList"]
     assert [each["jobId"] for each in listed] == [f"{job}#{node}" for node in range(3)]
     assert [each["nodeProperties"] for each in listed] == [
         {"isMainNode": node == 0, "numNodes": 3, "nodeIndex": node} for node in range(3)
     ]
-    pages = batch.api.get_paginator("list_jobs").paginate(multiNodeJobId=job, PaginationConfig={"PageSize": 2})
+    pages = batch.api.get_paginator("list_jobs").paginate(
+        multiNodeJobId=job, jobStatus="SUCCEEDED", PaginationConfig={"PageSize": 2}
+    )
     sizes = [[each["nodeProperties"]["nodeIndex"] for each in page["jobSummaryList"]] for page in pages]
     assert sizes == [[0, 1], [2]]
     for query in ({}, {"jobQueue": "default", "multiNodeJobId": job}, {"arrayJobId": job, "multiNodeJobId": job}):
@@ -192,10 +199,13 @@ def test_a_childs_death_changes_nothing(batch: Batch, tmp_path: Path) -> None:
     job = batch.submit(definition, retryStrategy={"attempts": 3})
     for node in (1, 2):
         assert batch.wait(f"{job}#{node}")["container"]["exitCode"] == 1
-    seen = children(batch, job)
-    assert [seen[node]["status"] for node in range(3)] == ["RUNNING", "FAILED", "FAILED"]
-    assert list(children(batch, job, jobStatus="FAILED")) == [1, 2]
-    assert batch.describe(job)["status"] == "RUNNING" and batch.describe(job)["attempts"] == []
+    assert list(children(batch, job)) == [0] and list(children(batch, job, jobStatus="FAILED")) == [1, 2]
+    parent, ended, other = batch.describe(job), batch.describe(f"{job}#1"), batch.describe(f"{job}#0")
+    assert parent["status"] == "RUNNING" and parent["attempts"] == other["attempts"] == [] and "stoppedAt" not in other
+    [attempt] = ended["attempts"]
+    assert (ended["status"], ended["statusReason"]) == ("FAILED", EXITED), "what it has of its own while others run"
+    assert ended["startedAt"] <= ended["stoppedAt"] == attempt["stoppedAt"] and attempt["statusReason"] == EXITED
+    assert attempt["container"]["exitCode"] == 1 and attempt["container"]["logStreamName"]
     running = batch.api.list_jobs(jobQueue="default")["jobSummaryList"]
     assert job in [each["jobId"] for each in running], "without a status: what runs"
     gate(tmp_path, "go")
@@ -221,7 +231,7 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
     batch.reason(job, "ACTION_REQUIRED - CE(s) associated with the job queue are invalid.")
     between = batch.describe(job)
     assert [attempt["container"]["exitCode"] for attempt in between["attempts"]] == [1]
-    assert {each["status"] for each in children(batch, job).values()} == {"RUNNABLE"}, "no node of it runs or has ended"
+    assert list(children(batch, job, jobStatus="RUNNABLE")) == [0, 1], "no node of it runs or has ended"
     batch.api.update_compute_environment(computeEnvironment=queue, state="ENABLED")
     wait_for(lambda: batch.wait(job, "RUNNING") and "attempt 2" in batch.lines(f"{job}#1"), what="the second attempt")
     gate(tmp_path, "done")
@@ -302,6 +312,32 @@ def test_what_has_not_started_is_cancelled_by_either_operation(batch: Batch, que
     batch.api.terminate_job(jobId=other, reason="and this one")
     detail = batch.wait(other)
     assert (detail["status"], detail["statusReason"], detail["attempts"]) == ("FAILED", "and this one", [])
+
+
+def test_many_jobs_are_ended_at_once_each_with_its_own_result(batch: Batch, queue: str, tmp_path: Path) -> None:
+    batch.api.update_compute_environment(computeEnvironment=queue, state="DISABLED")
+    definition = batch.multinode("mnp-bulk", UNTIL.format("go"), 1, env={"GATE": str(tmp_path)})
+    waiting = [batch.submit(definition, queue=queue) for _ in range(3)]
+    running = batch.submit(definition)
+    batch.wait(running, "RUNNING")
+    foreign = "arn:aws:batch:eu-west-1:123456789012:job/6c4a7d0e-0000-4000-8000-000000000000"
+    answer = batch.api.cancel_jobs(jobs=[*waiting[:2], running, "no-such-job", foreign, f"{running}#0"], reason="bulk")
+    assert answer["successful"] == [*waiting[:2], running, "no-such-job"], "AWS counts unknown jobs as done"
+    assert [(each["job"], each["code"]) for each in answer["errors"]] == [
+        (foreign, "ValidationException"),
+        (f"{running}#0", "ValidationException"),
+    ]
+    assert "not an ARN of this controller" in answer["errors"][0]["message"]
+    assert [batch.wait(job)["statusReason"] for job in waiting[:2]] == ["bulk"] * 2
+    assert batch.describe(running)["status"] == "RUNNING" and not batch.describe(running)["isCancelled"]
+    answer = batch.api.terminate_jobs(jobs=[waiting[2], running], reason="all of it")
+    assert answer["successful"] == [waiting[2], running] and answer["errors"] == []
+    for job in (waiting[2], running):
+        detail = batch.wait(job)
+        assert (detail["status"], detail["statusReason"], detail["isTerminated"]) == ("FAILED", "all of it", True)
+    for jobs in ([], [running] * 51):
+        with refused("takes 1 to 50 jobs"):
+            batch.api.terminate_jobs(jobs=jobs, reason="x")
 
 
 @pytest.mark.parametrize("operation", ["cancel_job", "terminate_job"])

@@ -131,6 +131,7 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
     wait_for(lambda: summary(batch, job) == {"RUNNING": 2, "FAILED": 1}, what="two that run and one that failed")
     parent = batch.describe(job)
     assert parent["status"] == "PENDING" and parent["arrayProperties"]["size"] == 3
+    assert parent["startedAt"] == min(batch.describe(f"{job}:{index}")["startedAt"] for index in range(3))
     assert set(parent["arrayProperties"]["statusSummary"]) == {
         *("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
     }
@@ -138,7 +139,9 @@ def test_an_arrays_children_know_their_index_and_decide_its_end(batch: Batch, tm
     parent = batch.wait(job)
     assert parent["status"] == "FAILED" and "1 of 3" in parent["statusReason"]
     assert summary(batch, job) == {"SUCCEEDED": 2, "FAILED": 1}
-    listed = batch.api.list_jobs(arrayJobId=job)["jobSummaryList"]
+    assert batch.api.list_jobs(arrayJobId=job)["jobSummaryList"] == [], "without a status: those that run"
+    over = [batch.api.list_jobs(arrayJobId=job, jobStatus=each)["jobSummaryList"] for each in ("SUCCEEDED", "FAILED")]
+    listed = sorted((each for some in over for each in some), key=lambda each: each["arrayProperties"]["index"])
     assert [each["jobId"] for each in listed] == [f"{job}:{index}" for index in range(3)]
     assert [each["arrayProperties"] for each in listed] == [{"index": index, "size": 3} for index in range(3)]
     assert [each["status"] for each in listed] == ["SUCCEEDED", "FAILED", "SUCCEEDED"]
@@ -290,7 +293,8 @@ def test_the_first_condition_that_matches_decides_whether_to_try_again(batch: Ba
         detail = batch.wait(job)
         codes = [attempt["container"]["exitCode"] for attempt in detail["attempts"]]
         assert (detail["status"], codes) == ("FAILED", [12] * attempts), conditions
-        assert detail["retryStrategy"] == {"attempts": 3, "evaluateOnExit": conditions}
+        shown = [{**each, "action": each["action"].upper()} for each in conditions]
+        assert detail["retryStrategy"] == {"attempts": 3, "evaluateOnExit": shown}, "in the model's case"
 
 
 def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ def test_terminating_ends_a_running_gang_and_keeps_the_reason(batch: Any, shared
         ({"container": {"environment": [{"name": "AWS_BATCH_X", "value": "1"}]}}, "AWS_BATCH are reserved"),
         ({"timeout": {"attemptDurationSeconds": 5}}, "must be at least 60"),
         ({"retryStrategy": {"attempts": 11}}, "must be 1 to 10"),
-        ({"type": "container"}, "type container needs containerProperties, and only that"),
+        ({"type": "container"}, "type container needs containerProperties or ecsProperties, and only that"),
     ],
 )
 def test_bad_definitions_are_client_exceptions(batch: Any, change: dict[str, Any], message: str) -> None:
