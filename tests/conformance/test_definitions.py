@@ -120,9 +120,8 @@ def test_a_definition_comes_back_as_it_was_registered(batch: Batch) -> None:
     answer = batch.api.register_job_definition(jobDefinitionName="def-whole", **wanted)
     [found] = batch.api.describe_job_definitions(jobDefinitions=[answer["jobDefinitionArn"]])["jobDefinitions"]
     ranges = found["nodeProperties"]["nodeRangeProperties"]
-    empty = dict.fromkeys(
-        ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes"), []
-    )
+    lists = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
+    empty: dict[str, list[Any]] = {key: [] for key in lists}
     for given in wanted["nodeProperties"]["nodeRangeProperties"]:  # what AWS adds: an empty list for what was left out
         given["container"] = {**empty, **given["container"]}
     assert len(ranges) == 2 and {key: found[key] for key in wanted} == wanted
