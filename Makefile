@@ -33,11 +33,10 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# the spine, and what training makes of this machine's processor: cpu.md, curves_cpu.md
+# the spine, and what training makes of this machine's processor: cpu.md, curves_cpu.md; a loaded machine is refused
 bench: $(READY)
 	$(BIN)/python -m benchmarks.spine
-	$(BIN)/python -m benchmarks.training
-	$(BIN)/python -m benchmarks.curves
+	$(BIN)/python -m benchmarks.processor
 
 bench-scheduling: $(READY)
 	$(BIN)/python -m benchmarks.scheduling | tee benchmarks/scheduling.md

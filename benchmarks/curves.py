@@ -5,6 +5,7 @@
 Writes ``curves.md``, ``curves.json``, and ``curves.png`` where matplotlib is installed (without a GPU ``curves_cpu.*``, with fewer
 worlds). The clock starts with the first iteration; what is before it (imports, worlds, kernels) stands apart. Each policy is
 evaluated at the end, its mean action from fresh starts; where a task's solver has limits, also in a simulation without them.
+A loaded machine is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``, as for :mod:`benchmarks.training`.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import io
 import json
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner
 from benchmarks.training import CUDA, build, wait
 from worker.learning.evaluation import evaluate
@@ -32,6 +35,9 @@ PLAN = {
 }
 """Worlds and iterations on a GPU."""
 PLAN_CPU = {"Cartpole": (64, 150), "CartpolePixels": (64, 60)}
+STOCK, STOCK_CPU = ["Ant"], ["Cartpole"]
+"""Tasks that rsl-rl's own runner trains, too."""
+NAME = "curves" if CUDA else "curves_cpu"
 REFERENCE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
 """MuJoCo's own defaults for its solver."""
 
@@ -96,31 +102,40 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=list(plan))
     parser.add_argument(
-        "--stock", nargs="*", default=["Ant"] if CUDA else ["Cartpole"], help="tasks that rsl-rl trains, too"
+        "--stock", nargs="*", default=STOCK if CUDA else STOCK_CPU, help="tasks that rsl-rl trains, too"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
     options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    name = "curves" if CUDA else "curves_cpu"
+    for rows in train_all(options.tasks, options.stock, Watch(options.loaded_anyway), options.seed):
+        write(rows, options.out)
+    draw(rows, options.out)
+
+
+def train_all(tasks: list[str], stock: list[str], watch: Watch, seed: int = 0) -> Iterator[list[dict[str, Any]]]:
+    """The rows so far, after each of ``tasks``, and then after each that rsl-rl trains."""
+    plan, rows = PLAN if CUDA else PLAN_CPU, list[dict[str, Any]]()
     with tempfile.TemporaryDirectory() as store:
-        for task, trainer in [(task, train) for task in options.tasks] + [
-            (task, train_stock) for task in options.stock
-        ]:
-            rows.append(trainer(task, *plan.get(task, (64, 60)), Path(store), options.seed))
+        for task, trainer in [(task, train) for task in tasks] + [(task, train_stock) for task in stock]:
+            row = trainer(task, *plan.get(task, (64, 60)), Path(store), seed)
+            rows.append(row | watch.check(f"while {task} was trained"))
             print({key: value for key, value in rows[-1].items() if key != "curve"}, rows[-1]["curve"][-1], flush=True)
-            (options.out / f"{name}.json").write_text(json.dumps(rows))
-            (options.out / f"{name}.md").write_text(table(rows, name))
-    with contextlib.suppress(ImportError):
-        draw(rows, options.out / f"{name}.png")
+            yield rows
 
 
-def table(rows: list[dict[str, Any]], name: str) -> str:
+def write(rows: list[dict[str, Any]], directory: Path) -> None:
+    """The table, and its numbers, into ``directory``."""
+    (directory / f"{NAME}.json").write_text(json.dumps(rows))
+    (directory / f"{NAME}.md").write_text(table(rows))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
         "# Whole trainings",
         "",
-        f"`python -m benchmarks.curves`, each task with its own settings. ![reward against steps]({name}.png)",
+        f"`python -m benchmarks.curves`, each task with its own settings. {told(rows)} ![reward against steps]({NAME}.png)",
         "",
         "| task | by | worlds | steps | time | mean return | of the mean action | under MuJoCo's own solver limits | its length |",
         "|---|---|--:|--:|--:|--:|--:|--:|--:|",
@@ -137,9 +152,12 @@ def table(rows: list[dict[str, Any]], name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Mean return of finished episodes against steps, one panel a task."""
-    import matplotlib
+def draw(rows: list[dict[str, Any]], directory: Path) -> None:
+    """Mean return of finished episodes against steps, one panel a task; nothing where matplotlib is not installed."""
+    try:
+        import matplotlib
+    except ImportError:
+        return
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
@@ -156,7 +174,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         panel.legend()
     panels[0][0].set_ylabel("mean return")
     figure.tight_layout()
-    figure.savefig(path, dpi=100)
+    figure.savefig(directory / f"{NAME}.png", dpi=100)
 
 
 if __name__ == "__main__":

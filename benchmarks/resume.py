@@ -6,6 +6,7 @@ from ``$WARP_CACHE_PATH`` where that is set, else compiled first, which is not m
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -21,6 +22,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.load import Watch, add_option, told
 from benchmarks.spine import MUSTER, REPOSITORY, Bench, seconds
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
@@ -192,7 +194,9 @@ def measure(home: Path) -> tuple[list[tuple[str, str]], list[Restart]]:
 
 
 def main() -> None:
-    before = os.getloadavg()[0]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_option(parser)
+    watch = Watch(parser.parse_args().loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
         rows, restarts = measure(Path(directory))
     machine = f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
@@ -210,7 +214,7 @@ def main() -> None:
     gang = [f"| Ant, 2 nodes × 64 worlds, warm kernels | {head} |", "|---|" + "--:|" * len(restarts)]
     for name, part in parts.items():
         gang.append(f"| {name} | " + " | ".join(f"{getattr(each, part):.2f} s" for each in restarts) + " |")
-    intro = f"`make bench-resume` on {machine}; load average {before:.1f} when it began (shared machine)."
+    intro = f"`make bench-resume` on {machine}. Before it: {told([watch.start])}"
     text = "\n".join(["# Saving and resuming", "", intro, "", *table, "", "SIGKILL of rank 1:", "", *gang, ""])
     (REPOSITORY / "benchmarks" / "resume.md").write_text(text)
     print(text)

@@ -19,6 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.load import Watch, add_option, told
+
 ITERATIONS = 60
 
 
@@ -81,6 +83,7 @@ def main() -> None:
     parser.add_argument("--gpus", nargs="+", type=int, default=_counts())
     parser.add_argument("--where", nargs="+", choices=("inside", "between"), default=["inside", "between"])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
     parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.rank:
@@ -88,11 +91,12 @@ def main() -> None:
 
         ppo.COLLECTIVES_IN_GRAPH = os.environ["MUSTER_BENCH_INSIDE"] == "1"
         rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")
+    watch = Watch(options.loaded_anyway)
     rows = []
     for gpus in options.gpus:
         for inside in [place == "inside" for place in options.where] if gpus > 1 else [True]:
             try:
-                rows.append(launch(gpus, inside, options))
+                rows.append(launch(gpus, inside, options) | watch.check(f"while {gpus} GPUs were measured"))
             except (subprocess.SubprocessError, OSError) as error:
                 rows.append({"gpus": gpus, "inside": inside, "error": str(error)[:300]})
             print(rows[-1], flush=True)
@@ -108,7 +112,7 @@ def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# {options.task} on several {torch.cuda.get_device_name()}",
         "",
-        f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU.",
+        f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU. {told(rows)}",
         "",
         "| GPUs | collectives | training | efficiency | iteration | collect | learn | slowest rank |",
         "|--:|---|--:|--:|--:|--:|--:|--:|",

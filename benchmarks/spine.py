@@ -5,6 +5,7 @@ Everything is measured through the real command and controller, on a fresh home 
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -17,6 +18,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from benchmarks.load import Watch, add_option, told
 from orchestrator.client import Client
 
 REPOSITORY = Path(__file__).parent.parent
@@ -127,11 +129,16 @@ def measure(home: Path) -> list[tuple[str, str]]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_option(parser)
+    watch = Watch(parser.parse_args().loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
         rows = measure(Path(directory))
     machine = f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
     table = ["| what | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
-    text = "\n".join(["# The spine", "", f"`make bench` on {machine}; one run, shared machine.", "", *table, ""])
+    text = "\n".join(
+        ["# The spine", "", f"`make bench` on {machine}; one run. Before it: {told([watch.start])}", "", *table, ""]
+    )
     (REPOSITORY / "benchmarks" / "spine.md").write_text(text)
     print(text)
 

@@ -4,6 +4,8 @@
 
 On a CUDA device it writes ``gpu.md`` and ``gpu.json``, else, with fewer worlds, ``cpu.md`` and ``cpu.json``. Every rate is in policy
 steps of all worlds together per second, the median of three stretches after everything was captured; the cold start stands apart.
+A loaded machine is refused: :mod:`benchmarks.load`. Without a GPU use ``make bench``: it makes this table and that of whole trainings
+in one run, and refuses tables that contradict one another.
 """
 
 from __future__ import annotations
@@ -16,12 +18,13 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner, stock_seconds
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
@@ -151,21 +154,34 @@ def main() -> None:
     parser.add_argument("--sweep", nargs="*", default=[], help=f"tasks to measure with {SWEEP} worlds, too")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     parser.add_argument("--no-stock", action="store_true")
+    add_option(parser)
     options = parser.parse_args()
     plan = [
         (task, worlds, not options.no_stock) for task in options.tasks for worlds in options.worlds or defaults[task]
     ]
     plan += [(task, worlds, False) for task in options.sweep for worlds in SWEEP]
+    for rows in measure_all(plan, Watch(options.loaded_anyway)):
+        write(rows, options.out)
+
+
+def measure_all(plan: list[tuple[str, int, bool]], watch: Watch) -> Iterator[list[dict[str, Any]]]:
+    """The rows so far, after each task, number of worlds and whether to train with stock rsl-rl of ``plan``."""
     rows: list[dict[str, Any]] = []
-    name = "gpu" if CUDA else "cpu"
     with tempfile.TemporaryDirectory() as store:
         for task, worlds, stock in plan:
-            rows.append(measure(task, worlds, Path(store), stock=stock, profile=worlds in (4096, 1024)))
+            row = measure(task, worlds, Path(store), stock=stock, profile=worlds in (4096, 1024))
+            rows.append(row | watch.check(f"while {task} with {worlds} worlds was measured"))
             print(rows[-1], flush=True)
-            (options.out / f"{name}.json").write_text(json.dumps(rows, indent=1))
-            (options.out / f"{name}.md").write_text(table(rows))
+            yield rows
             if CUDA:
                 torch.cuda.empty_cache()
+
+
+def write(rows: list[dict[str, Any]], directory: Path) -> None:
+    """The table, and its numbers, into ``directory``."""
+    name = "gpu" if CUDA else "cpu"
+    (directory / f"{name}.json").write_text(json.dumps(rows, indent=1))
+    (directory / f"{name}.md").write_text(table(rows))
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -176,7 +192,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# Training on {where}",
         "",
         f"Policy steps of all worlds together per second, in {name}; `python -m benchmarks.training`. Stock rsl-rl trains on the same "
-        "simulation, captured, in the same run.",
+        f"simulation, captured, in the same run. {told(rows)}",
         "",
         "| task | worlds | environment | + policy | training | stock rsl-rl | ratio | collect | learn | until captured |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",

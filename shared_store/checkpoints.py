@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.epoch import StaleEpoch, check_epoch
-from shared_store.files import read_json, remove_tree, sync_directory, sync_file, write_atomic, write_json
+from shared_store.files import read_json, remove_tree, sync_directory, write_atomic, write_json
 from shared_store.layout import Run
 
 FORMAT = 1
@@ -191,7 +191,7 @@ def sweep(run: Run, up_to: tuple[int, int] | None = None) -> list[str]:
 
 
 class CheckpointWriter:
-    """One checkpoint in the making: every rank writes its own files into ``path``, then the main rank commits."""
+    """One checkpoint in the making: every rank writes its own files into ``path``, durably, then the main rank commits."""
 
     def __init__(self, run: Run, iteration: int, epoch: int) -> None:
         self.run, self.iteration, self.epoch = run, iteration, epoch
@@ -199,10 +199,6 @@ class CheckpointWriter:
         self.path = run.checkpoints / f".{self.name}.tmp"
         run.checkpoints.mkdir(exist_ok=True)  # not its parents: a run that somebody deleted does not come back in part
         self.path.mkdir(exist_ok=True)
-
-    def add_file(self, name: str) -> None:
-        """Make a file that was written into ``path`` durable. Raises OSError."""
-        sync_file(self.path / name)
 
     def commit(
         self, facts: Mapping[str, Any], keep: int | None = None, digests: Mapping[str, Any] | None = None

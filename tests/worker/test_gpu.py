@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import pytest
 import torch
+
+from worker.learning.recording import Recorded
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -44,3 +47,11 @@ def test_a_graph_computes_what_the_same_code_computes_eagerly(tmp_path: Path) ->
         found.append((torch.tensor([[r["surrogate_loss"], r["value_loss"], r["kl"]] for r in records]), weights))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=2e-3, atol=1e-5)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=2e-3, atol=1e-4)
+
+
+def test_no_garbage_is_collected_while_a_graph_is_recorded() -> None:
+    found = []
+    part = Recorded(lambda: found.append(gc.isenabled()), "cuda:0", "part")
+    for _ in range(3):
+        part()
+    assert found == [True, False] and part.captured and gc.isenabled()

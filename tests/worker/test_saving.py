@@ -14,9 +14,11 @@ import torch
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Run, Store
+from tests.shared_store.test_files import durable_operations
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.saving import Saver
+from worker.saver import Orders, save
 
 
 @pytest.fixture
@@ -109,6 +111,19 @@ def test_a_stale_attempt_is_stopped_by_its_own_save(run: Run) -> None:
     with pytest.raises(StaleEpoch, match="now belongs to epoch 2"):
         saver.wait()
     assert list_checkpoints(run) == []
+
+
+def test_a_file_is_durable_before_its_writer_tells_the_others(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = os.memfd_create("snapshot")
+    os.pwrite(memory, b"state", 0)
+    order = {"run": str(run.path), "iteration": 1, "epoch": 1, "rank": 1, "ranks": 2, "memory": memory, "facts": None}
+    seen = durable_operations(monkeypatch)
+    answer = save({**order, "files": [("rank-1.pt", 0, 5)]}, Orders())
+    os.close(memory)
+    making = run.checkpoints / ".00000001-e1.tmp"
+    assert answer["written"] == "00000001-e1" and (making / "rank-1.pt").read_bytes() == b"state"
+    told = seen.index(("rename", str(making / ".rank-1.json")))
+    assert ("fsync", str(making / "rank-1.pt")) in seen[:told]
 
 
 def test_auto_saves_as_often_as_one_percent_allows() -> None:

@@ -72,13 +72,16 @@ def test_the_example_rewards_and_observes_as_it_says(monkeypatch: pytest.MonkeyP
     spec = yaml.safe_load((REPOSITORY / "job_specs/my-task.yaml").read_text())
     task = task_type(configure(task_type, spec["train"]), 4, seed=1)
     assert task.max_episode_length == 240 and task.reward_terms == ("upright", "speed", "effort")
-    put(task, joint_q=[[math.pi], [0.0]], joint_qd=[[2.0], [0.0]], episode_length=[10, 239])
+    rows = {"joint_q": [[math.pi], [0.0]], "joint_qd": [[2.0], [0.0], [math.nan]], "episode_length": [10, 239]}
+    put(task, **rows, solver_warm_start=[[5.0], [5.0], [math.nan], [5.0]])
     task.actions[:, 0] = torch.tensor([0.5, 0.0, 0.0, 0.0])
     observe(task)
     assert task.observations[0].tolist() == pytest.approx([-1.0, 0.0, 0.2], abs=1e-6)
     assert task.rewards[:2].tolist() == pytest.approx([1.0 - 0.01 * 4.0 - 0.02 * 0.25, -1.0], abs=1e-6)
     assert task.dones[:2].tolist() == task.time_outs[:2].tolist() == [False, True]
-    assert statistics(task)["episodes"] == 1
+    assert statistics(task)["episodes"] == 1 and statistics(task)["nan_worlds"] == 1
+    warm = task.state_dict()["solver_warm_start"].flatten().tolist()
+    assert warm == [5.0, 0.0, 0.0, 5.0], "an episode begins with a cold solver, that of a world which failed, too"
     assert len(set(task.worlds.solver.mjw_model.body_mass.numpy()[:, 1])) == 4, "randomize of the YAML"
 
 

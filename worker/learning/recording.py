@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import torch
 
+from worker.simulation.capture import garbage_collection_paused
+
 
 class Recorded:
     """A function without arguments that a CUDA device replays as one graph.
@@ -56,7 +58,8 @@ class Recorded:
         started = time.perf_counter()
         graph = torch.cuda.CUDAGraph()
         # on the stream of the first call, where autograd expects the gradients; NCCL's watchdog thread asks events meanwhile
-        with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+        graphed = torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local")
+        with garbage_collection_paused(), graphed:
             self._function()
         self.seconds = time.perf_counter() - started
         return graph

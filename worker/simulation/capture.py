@@ -11,8 +11,8 @@ import warp as wp
 
 
 @contextlib.contextmanager
-def _garbage_collection_paused() -> Iterator[None]:
-    """A finaliser that frees an array while a graph is recorded would be recorded into it."""
+def garbage_collection_paused() -> Iterator[None]:
+    """For recording a graph: a finaliser that frees an array meanwhile would be recorded into it, or would break the recording."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -60,7 +60,7 @@ class CapturedStep:
         # The legacy default stream of CUDA cannot be captured: record on a stream of our own, replay on torch's.
         stream = wp.Stream(device) if self._is_cuda else None
         scope = wp.ScopedStream(stream) if stream is not None else contextlib.nullcontext()
-        with _garbage_collection_paused(), scope, wp.ScopedCapture(device=device, stream=stream) as capture:
+        with garbage_collection_paused(), scope, wp.ScopedCapture(device=device, stream=stream) as capture:
             function()
         self._graph = capture.graph
         self._parts_of_others: list[wp.Graph] = []
@@ -75,7 +75,7 @@ class CapturedStep:
         with on_torch_stream(self._device) as stream:
             if torch.cuda.is_current_stream_capturing():
                 # mujoco_warp's solver loop is a conditional node, which a child graph may not hold: record it afresh.
-                with _garbage_collection_paused(), wp.ScopedCapture(stream=stream, external=True) as part:
+                with garbage_collection_paused(), wp.ScopedCapture(stream=stream, external=True) as part:
                     self._function()
                 # Holds the kernels that torch's graph launches.
                 self._parts_of_others.append(part.graph)

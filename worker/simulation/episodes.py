@@ -42,6 +42,7 @@ class EpisodeArrays:
         weights: Weight of each reward term, shape ``(terms,)``.
         level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
         memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
+        warm_start: Accelerations from which the constraint solver starts, those of the worlds, shape ``(worlds, dofs)``.
         broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
@@ -61,6 +62,7 @@ class EpisodeArrays:
     weights: wp.array(dtype=wp.float32)
     level: wp.array(dtype=wp.float32)
     memory: wp.array2d(dtype=wp.float32)
+    warm_start: wp.array2d(dtype=wp.float32)
     broken: wp.array(dtype=wp.int32)
     mishap: wp.array(dtype=wp.int32)
     statistics: wp.array(dtype=wp.float64)
@@ -98,10 +100,11 @@ def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
 
 @wp.func
 def begin_episode(episodes: EpisodeArrays, world: int):
-    """Clear a world's clock, sums and memory."""
+    """Clear a world's clock, sums and memory, and what its solver remembers of the old episode."""
     episodes.ages[world] = 0
     clear_row(episodes.sums, world)
     clear_row(episodes.memory, world)
+    clear_row(episodes.warm_start, world)
 
 
 @wp.func

@@ -89,13 +89,12 @@ def write_observation(observations: wp.array2d(dtype=wp.float32), worlds: WorldA
 
 @wp.func
 def place(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Put a world at a random start, with a cold solver."""
+    """Put a world at a random start."""
     stream = random_stream(episodes, world)
     worlds.joint_q[world, 0] = parameters.start_position * wp.randf(stream, -1.0, 1.0)
     worlds.joint_q[world, 1] = parameters.start_angle * wp.randf(stream, -1.0, 1.0)
     worlds.joint_qd[world, 0] = parameters.start_velocity * wp.randf(stream, -1.0, 1.0)
     worlds.joint_qd[world, 1] = parameters.start_velocity * wp.randf(stream, -1.0, 1.0)
-    clear_row(worlds.warm_start, world)
 
 
 @wp.kernel

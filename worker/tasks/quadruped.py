@@ -217,10 +217,9 @@ def write_observation(
 
 @wp.func
 def place(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Stand a world's robot at the origin facing +x, with a new command and a cold solver."""
+    """Stand a world's robot at the origin facing +x, with a new command."""
     stream = random_stream(episodes, world)
     clear_row(worlds.joint_q, world)
-    clear_row(worlds.warm_start, world)
     worlds.joint_q[world, 2] = parameters.start_height
     worlds.joint_q[world, 6] = 1.0
     for dof in range(FIRST_DOF + JOINTS):

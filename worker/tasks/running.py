@@ -147,11 +147,10 @@ def write_observation(
 
 @wp.func
 def place(parameters: RunnerParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Stand a world's robot at the origin facing +x, joints near their usual pose, with a cold solver."""
+    """Stand a world's robot at the origin facing +x, joints near their usual pose."""
     stream = random_stream(episodes, world)
     clear_row(worlds.joint_q, world)
     clear_row(worlds.joint_qd, world)
-    clear_row(worlds.warm_start, world)
     worlds.joint_q[world, 2] = parameters.start_height
     worlds.joint_q[world, 6] = 1.0
     for joint in range(parameters.ranges.shape[0]):

@@ -314,6 +314,7 @@ class Task:
             return wp.to_torch(array)
 
         self._episodes = EpisodeArrays()
+        self._episodes.warm_start = self.worlds.arrays.warm_start
         self.actions = buffer("actions", (count, self.action_size), wp.float32)
         states = len(self.observation_names)
         self.states = self.observations = buffer("observations", (count, states), wp.float32)

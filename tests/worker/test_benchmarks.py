@@ -1,0 +1,52 @@
+"""A table that is made on a loaded machine says so, or is not made; tables of one machine do not contradict one another."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+
+from benchmarks import load
+from benchmarks.processor import contradictions
+
+BUSY = "while :; do :; done"
+
+
+def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(load, "WATCHED", 0.5)
+    started = f"timeout 60 sh -c '{BUSY}' >/dev/null & echo $!"  # its parent ends: it is nobody's child here
+    other = int(subprocess.run(["sh", "-c", started], stdout=subprocess.PIPE, text=True, check=True).stdout)
+    try:
+        with pytest.raises(SystemExit, match=r"the machine is loaded: other processes used \d+ % .*--loaded-anyway"):
+            load.Watch(loaded_anyway=False)
+        row = load.Watch(loaded_anyway=True).start
+    finally:
+        os.kill(other, signal.SIGTERM)
+    assert row["others"] > load.LIMIT
+    assert load.told([row]).startswith("**The machine was loaded.** Other processes used at most ")
+    assert "loaded" not in load.told([{"others": 0.01, "load_average": 0.2}])
+
+
+def test_what_a_benchmark_starts_is_not_the_load_of_others() -> None:
+    before = load.own_seconds()
+    child = subprocess.Popen(["sh", "-c", f"sh -c '{BUSY}' & wait"], start_new_session=True)
+    try:
+        deadline = time.monotonic() + 60
+        while load.own_seconds() < before + 0.3:  # while it runs, and its child's child
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        os.killpg(child.pid, signal.SIGKILL)
+        child.wait()
+
+
+def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> None:
+    rates = [{"task": "Cartpole", "worlds": 64, "train": 64_740.0, "stock": 30_140.0}]
+    curve = [[9.2, 153_600, 27.3, 300.0]]
+    ours = {"task": "Cartpole", "worlds": 64, "seconds": 9.2, "curve": curve}
+    theirs = {**ours, "stock": True, "seconds": 5.3}
+    (line,) = contradictions(rates, [ours, theirs, {**ours, "worlds": 128}])
+    assert line == "Cartpole with 64 worlds by Muster: 153,600 steps took 9.2 s, its rate says 2.4 s"
