@@ -10,7 +10,6 @@ import json
 import os
 import time
 import uuid
-from collections import Counter
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
@@ -96,16 +95,18 @@ class Client:
         With ``follow=True`` until the job is over: a controller that goes away is waited for, and its successor's stream is taken
         up where this one broke off, no line twice and none left out.
         """
-        seen: Counter[tuple[int, int]] = Counter()
+        for lines in self.log_batches(job, **query):
+            yield from lines
+
+    def log_batches(self, job: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
+        """:meth:`logs`, as many lines at a time as have come."""
+        positions: dict[str, int] = {}
         while True:
-            passed: Counter[tuple[int, int]] = Counter()
             try:
-                for line in self._stream(job, query):
-                    source = (line["attempt"], line["node"])
-                    passed[source] += 1
-                    if passed[source] > seen[source]:  # a node's file only grows, so its lines keep their order
-                        seen[source] += 1
-                        yield line
+                for lines in self._stream(job, query, positions):
+                    for line in lines:
+                        positions[f"{line['attempt']}/{line['node']}"] = line["position"]
+                    yield lines
                 if not query.get("follow") or self.get(f"/api/jobs/{job}")["status"] in ("SUCCEEDED", "FAILED"):
                     return
                 self.await_return()  # a controller that was stopped ends its streams in order
@@ -114,8 +115,10 @@ class Client:
                     raise
                 self.await_return()
 
-    def _stream(self, job: str, query: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
         wanted = {key: value for key, value in query.items() if value is not None}
+        if positions:
+            wanted["positions"] = json.dumps(positions)
         try:
             with self._http.stream(
                 "GET", f"/api/jobs/{job}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
@@ -123,9 +126,11 @@ class Client:
                 if answer.is_error:
                     answer.read()
                     self._raise(answer)
-                for line in answer.iter_lines():
-                    if line:
-                        yield json.loads(line)
+                rest = b""
+                for chunk in answer.iter_bytes():
+                    whole, _, rest = (rest + chunk).rpartition(b"\n")
+                    if lines := [line for line in whole.split(b"\n") if line]:  # an empty one: the stream lives
+                        yield json.loads(b"[" + b",".join(lines) + b"]")
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from orchestrator.scheduling.snapshot import NodeShape, Shape
 from orchestrator.spec import Spec
+from shared_store.log_files import LIMIT
 
 _MODULES = {"train": "worker.train", "evaluate": "worker.evaluate", "export": "worker.export"}
 
@@ -30,6 +31,7 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
         "MUSTER_RANKS_PER_NODE": str(spec.ranks_per_node),
         "MUSTER_MIN_NODES": str(spec.nodes.min),
         "MUSTER_DIRECTORY": directory,
+        "MUSTER_LOG_LIMIT": str(spec.logs.limit),
     }
     if spec.train:
         ours["MUSTER_STALL_TIMEOUT"] = f"{spec.stall_timeout:g}"
@@ -121,6 +123,11 @@ class GangNeeds:
         if spec is not None and not isinstance(spec, dict):
             raise ValueError("MUSTER_SPEC is not a mapping")
         return spec
+
+    @property
+    def log_limit(self) -> int:
+        """Bytes of each node's log that are kept. Raises ValueError."""
+        return int(self.setting("MUSTER_LOG_LIMIT") or LIMIT)
 
     @property
     def is_native(self) -> bool:

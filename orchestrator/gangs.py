@@ -132,6 +132,7 @@ class Gangs:
             grace=GRACE,
             directory=needs.setting("MUSTER_DIRECTORY") or None,
             stall_timeout=float(stall) if (stall := needs.setting("MUSTER_STALL_TIMEOUT")) else None,
+            log_limit=needs.log_limit,
             is_gang=job.kind == "multinode",
             containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from orchestrator.excerpts import excerpt, shown
 from shared_store.layout import NAME
+from shared_store.log_files import LEAST_LIMIT, LIMIT
 
 KINDS = ("train", "evaluate", "export", "command")
 """What a job can do: exactly one of these keys is in a spec."""
@@ -60,6 +61,16 @@ def _mebibytes(value: object) -> object:
         if not match:
             raise ValueError("expected an amount of memory such as 512MiB or 4GiB")
         return int(float(match[1]) * _BYTES[match[2]] / 2**20)
+    return value
+
+
+def _bytes(value: object) -> object:
+    """``64MiB``, ``1GiB`` or a number of bytes → whole bytes."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
+        if not match:
+            raise ValueError("expected a size such as 64MiB or 1GiB")
+        return int(float(match[1]) * _BYTES[match[2]])
     return value
 
 
@@ -119,6 +130,7 @@ def known_tasks() -> list[str]:
 
 Duration = Annotated[float, BeforeValidator(_duration)]
 Memory = Annotated[int, BeforeValidator(_mebibytes)]
+Size = Annotated[int, BeforeValidator(_bytes)]
 RunName = Annotated[str, AfterValidator(_run_name)]
 
 
@@ -224,6 +236,15 @@ class CheckpointPolicy(_Section):
     keep: int = Field(default=5, ge=2)
 
 
+class Logs(_Section):
+    """How much of what a node prints is kept."""
+
+    limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
+        default=LIMIT,
+        description="of each node in each attempt, at least 1MiB; of a longer log its beginning and its end are kept",
+    )
+
+
 class Retry(_Section):
     """How often a failed gang is started, in all."""
 
@@ -253,6 +274,7 @@ class Spec(_Section):
     environment: Annotated[dict[str, str], AfterValidator(_environment)] = Field(default_factory=dict)
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
+    logs: Logs = Field(default_factory=Logs)
     retry: Retry = Field(default_factory=Retry)
     on_child_failure: Literal["restart", "fail", "ignore"] = "restart"
     timeout: Annotated[Duration, Field(ge=60)] | None = Field(default=None, description="of each attempt, such as 2h")
@@ -346,6 +368,7 @@ def schema() -> dict[str, Any]:
     definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
     text = {"type": ["string", "number"]}
     definitions["Resources"]["properties"]["memory"] |= text
+    definitions["Logs"]["properties"]["limit"] |= {**text, "default": "1GiB"}
     document["properties"]["stall_timeout"] = {**text, "default": "5m", "description": "of one training iteration"}
     document["properties"]["timeout"] = {**text, "description": "of each attempt, such as 2h"}
     document["$schema"] = "https://json-schema.org/draft/2020-12/schema"

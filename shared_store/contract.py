@@ -9,6 +9,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from shared_store.log_files import LIMIT
+
 BUS_VARIABLES = ("MUSTER_BUS", "MUSTER_BUS_TOKEN")
 """For the node's supervisor only: the job's own program does not get them."""
 
@@ -46,6 +48,8 @@ class NodeContract:
     """The node's share of CPUs, divided among its ranks."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck; None where nobody asked."""
+    log_limit: int = LIMIT
+    """Bytes of the node's log that are kept."""
     is_gang: bool = True
     """False for a single-node job: AWS gives it no node variables."""
     array: tuple[int, int] | None = None
@@ -94,6 +98,7 @@ class NodeContract:
             "MUSTER_RANKS_PER_NODE": str(self.ranks_per_node),
             "MUSTER_GRACE_SECONDS": f"{self.grace:g}",
             "MUSTER_CPUS": f"{self.cpus:g}",
+            "MUSTER_LOG_LIMIT": str(self.log_limit),
         }
         stall = None if self.stall_timeout is None else f"{self.stall_timeout:g}"
         optional = {
@@ -164,6 +169,7 @@ class NodeContract:
             compute_environment=env.get("AWS_BATCH_CE_NAME", "local"),
             cpus=number("MUSTER_CPUS", 1.0),
             stall_timeout=float(env["MUSTER_STALL_TIMEOUT"]) if env.get("MUSTER_STALL_TIMEOUT") else None,
+            log_limit=integer("MUSTER_LOG_LIMIT", LIMIT),
             is_gang="AWS_BATCH_JOB_NODE_INDEX" in env,
             array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
             address=env.get("MUSTER_ADDRESS"),

@@ -1,29 +1,43 @@
-"""Logs: one file a node and attempt, one writer a file, one line ``<RFC 3339 UTC, µs> <rank or -> <o|e> <text>``.
+"""Logs: one log a node and attempt, one writer a log, one line ``<RFC 3339 UTC, µs> <rank or -> <o|e> <text>``.
 
-Followers poll sizes and open the file anew each round, which is what works on NFS (no inotify, no kept handles).
+Followers poll sizes and open the files (:mod:`.log_files`) anew each round, which is what works on NFS (no inotify, no kept
+handles).
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+import time
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
+from json.encoder import encode_basestring_ascii
+from operator import itemgetter
+from typing import NamedTuple
 
 from shared_store.layout import Run
+from shared_store.log_files import Chunk, Segment, left_out, log_segments, read_log
 
-_LINE = re.compile(r"(\S+) (-|\d+) ([oe]) (.*)", re.DOTALL)
-_NODE = re.compile(r"node-(\d+)\.log")
+_LINE = re.compile(r"(\S+) (-|\d{1,9}) ([oe]) (.*)", re.DOTALL)
+_LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
+_HEAD = re.compile(r"node-(\d+)\.log")
 _CHUNK = 1 << 20
+"""Bytes that a poll reads of a log; of the logs of many nodes less."""
+_LEAST_CHUNK = 256 << 10
+"""More than the longest line."""
+_MOST = 8 << 20
+"""Bytes that a poll reads of all logs of an attempt."""
+
+LIMIT_REACHED = "the log reached its limit"
+REPLACED = "the log was truncated or replaced; following goes on from its new beginning"
 
 OUTCOME_LINE = "muster-outcome "
 """How the last line begins that a supervisor prints where its log leaves the node as text (AWS); the outcome follows as JSON."""
 
 
-@dataclass(frozen=True)
-class LogLine:
+class LogLine(NamedTuple):
     """One line of a node's log."""
 
     time: str
@@ -35,6 +49,16 @@ class LogLine:
     stream: str
     """``o`` standard output, ``e`` standard error."""
     text: str
+    position: int = 0
+    """Where the log goes on after it (:mod:`.log_files`)."""
+
+    def to_json(self) -> str:
+        """One line of JSON, without its newline; printable ASCII only."""
+        rank = "null" if self.rank is None else self.rank
+        return (
+            f'{{"time": {encode_basestring_ascii(self.time)}, "attempt": {self.attempt}, "node": {self.node}, "rank": {rank}, '
+            f'"stream": "{self.stream}", "text": {encode_basestring_ascii(self.text)}, "position": {self.position}}}'
+        )
 
 
 def timestamp(seconds: float) -> str:
@@ -44,8 +68,17 @@ def timestamp(seconds: float) -> str:
 
 def format_line(seconds: float, rank: int | None, stream: str, text: str) -> str:
     """One line of the file, with its newline; a newline inside ``text`` is kept as ``\\n``'s two characters."""
-    escaped = text.replace("\r", "").replace("\n", "\\n")
-    return f"{timestamp(seconds)} {'-' if rank is None else rank} {stream} {escaped}\n"
+    return format_lines(seconds, rank, stream, [text])
+
+
+def format_lines(seconds: float, rank: int | None, stream: str, texts: Iterable[str]) -> str:
+    """:func:`format_line` for many lines of the same time and origin."""
+    before = f"{timestamp(seconds)} {'-' if rank is None else rank} {stream} "
+    return "".join([f"{before}{_escaped(text)}\n" for text in texts])
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\r", "").replace("\n", "\\n") if "\n" in text or "\r" in text else text
 
 
 def parse_line(line: str, attempt: int, node: int) -> LogLine | None:
@@ -58,11 +91,76 @@ def parse_line(line: str, attempt: int, node: int) -> LogLine | None:
 
 
 @dataclass
+class _Source:
+    """What a follower knows of one log."""
+
+    attempt: int
+    node: int
+    position: int
+    """Up to which it was read."""
+    given: int = 0
+    """Up to which it was given out."""
+    identity: bytes = b""
+    """How the file begins that was read last."""
+    inside: bool = False
+    """Whether ``position`` is inside a line that is longer than any of ours."""
+    newest: str = ""
+    """The greatest time so far. Lines are merged by it: a clock that is set back does not move a line before an earlier one."""
+    read: list[tuple[str, LogLine]] = field(default_factory=list)
+    """Lines that were read and not given out yet, with the time to merge by."""
+    more: bool = False
+    """Whether there may be more to read already."""
+
+    def fill(self, segments: Sequence[Segment], most: int, rank: int | None) -> None:
+        """Read on, where everything that was read was given out."""
+        if self.read:
+            return
+        try:
+            chunk = read_log(segments, self.position, most, self.identity, self.inside)
+        except OSError:  # deleted meanwhile, ESTALE, or not yet visible on NFS: the next poll opens it again
+            self.more = False
+            return
+        whole = chunk.data.rfind(b"\n") + 1
+        self.inside = not whole and len(chunk.data) == most
+        if self.inside:
+            whole = len(chunk.data)
+        found = list(_LINES.finditer(chunk.data, 0, whole))
+        if chunk.left_out or chunk.replaced:
+            self._explain(chunk, found[0][1].decode(errors="replace") if found else timestamp(time.time()))
+        for match in found:
+            written, number, stream, text = match.groups()
+            stamp = written.decode(errors="replace")
+            if stamp > self.newest:
+                self.newest = stamp
+            place = None if number == b"-" else int(number)
+            if rank is None or place == rank:
+                origin = (stamp, self.attempt, self.node, place, stream.decode())
+                line = LogLine(*origin, text.decode(errors="replace"), chunk.start + match.end())
+                self.read.append((self.newest, line))
+        self.more = chunk.more and bool(whole)
+        self.position, self.identity = chunk.start + whole, chunk.identity
+
+    def _explain(self, chunk: Chunk, stamp: str) -> None:
+        """Say what the reader can't have, in a line of its own."""
+        text = REPLACED if chunk.replaced else left_out(*chunk.left_out, LIMIT_REACHED) if chunk.left_out else ""
+        self.newest = self.newest or stamp
+        self.read.append((self.newest, LogLine(self.newest, self.attempt, self.node, None, "e", text, chunk.start)))
+
+    def take(self, until: str | None) -> list[tuple[str, LogLine]]:
+        """The lines up to that time; all where it is None."""
+        count = len(self.read) if until is None else bisect_right(self.read, until, key=itemgetter(0))
+        taken, self.read = self.read[:count], self.read[count:]
+        self.given = taken[-1][1].position if taken and self.read else self.given if self.read else self.position
+        return taken
+
+
+@dataclass
 class LogFollower:
     """Reads a job's log lines, all nodes and attempts merged by time, each line once.
 
-    ``offsets`` (bytes read of each file) is the follower's whole state: a new one with the same offsets goes on where the old
-    one stopped. ``node`` and ``rank`` select.
+    Lines of one node keep the order in which they were written. ``offsets`` (bytes that were given out of each log) is the
+    follower's whole state: a new one with the same offsets goes on where the old one stopped. ``node`` and ``rank`` select.
+    What was deleted before the follower came to it, and a log that was truncated or replaced, is said in a line (rank None).
     """
 
     run: Run
@@ -71,47 +169,59 @@ class LogFollower:
     rank: int | None = None
     attempt: int | None = None
     offsets: dict[str, int] = field(default_factory=dict)
+    behind: bool = False
+    """Whether there was more than the last poll gave out."""
+    _sources: dict[str, _Source] = field(default_factory=dict)
 
     def poll(self) -> list[LogLine]:
-        """The whole lines that were added since the last call (at most 1 MiB a file), in the order of their times."""
+        """The whole lines that were added since the last call, or the first few MiB of them, in the order of their times."""
         lines: list[LogLine] = []
-        for attempt, node, path in self._files():
-            key = f"{attempt}/{node}"
-            chunk = _read_from(path, self.offsets.get(key, 0))
-            whole = chunk.rfind(b"\n") + 1
-            self.offsets[key] = self.offsets.get(key, 0) + whole
-            for raw in chunk[:whole].decode(errors="replace").split("\n")[:-1]:
-                line = parse_line(raw, attempt, node)
-                if line and (self.rank is None or line.rank == self.rank):
-                    lines.append(line)
-        return sorted(lines, key=lambda line: (line.attempt, line.time))
+        self.behind = False
+        for attempt in [self.attempt] if self.attempt is not None else _attempts(self.run, self.job):
+            logs = self._logs(attempt)
+            most = min(_CHUNK, max(_LEAST_CHUNK, _MOST // max(1, len(logs))))
+            for source, segments in logs:
+                source.fill(segments, most, self.rank)
+            # what was not read yet of one log may be older than what was read of another
+            until = min((source.newest for source, _ in logs if source.more), default=None)
+            taken = []
+            for source, _ in logs:
+                taken += source.take(until)
+                self.offsets[f"{attempt}/{source.node}"] = source.given
+            taken.sort(key=itemgetter(0))
+            lines += [line for _, line in taken]
+            if until is not None:
+                self.behind = True
+                break
+        return lines
 
     def drain(self) -> Iterator[LogLine]:
         """All that is there now."""
-        before: dict[str, int] | None = None
-        while before != self.offsets:  # a poll may pass over 1 MiB of another rank's lines and return none
-            before = dict(self.offsets)
-            yield from self.poll()
+        for lines in self.batches():
+            yield from lines
 
-    def _files(self) -> Iterator[tuple[int, int, Path]]:
-        attempts = [self.attempt] if self.attempt is not None else _attempts(self.run, self.job)
-        for attempt in attempts:
-            directory = self.run.logs(self.job, attempt)
-            for name in sorted(os.listdir(directory)) if directory.exists() else []:
-                match = _NODE.fullmatch(name)
-                if match and (self.node is None or int(match[1]) == self.node):
-                    yield attempt, int(match[1]), directory / name
+    def batches(self) -> Iterator[list[LogLine]]:
+        """:meth:`drain`, many lines at a time."""
+        self.behind = True
+        while self.behind:  # a poll may pass over 1 MiB of another rank's lines and return none
+            if lines := self.poll():
+                yield lines
+
+    def _logs(self, attempt: int) -> list[tuple[_Source, list[Segment]]]:
+        """The logs of one attempt, by node."""
+        found = log_segments(self.run.logs(self.job, attempt))
+        logs = []
+        for name, segments in found.items():
+            match = _HEAD.fullmatch(name)
+            if match and (self.node is None or int(match[1]) == self.node):
+                key = f"{attempt}/{int(match[1])}"
+                if key not in self._sources:
+                    start = self.offsets.get(key, 0)
+                    self._sources[key] = _Source(attempt, int(match[1]), start, start)
+                logs.append((self._sources[key], segments))
+        return sorted(logs, key=lambda log: log[0].node)
 
 
 def _attempts(run: Run, job: str) -> list[int]:
     directory = run.path / "logs" / job
     return sorted(int(name) for name in os.listdir(directory) if name.isdigit()) if directory.exists() else []
-
-
-def _read_from(path: Path, offset: int) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            file.seek(offset)
-            return file.read(_CHUNK)
-    except OSError:
-        return b""  # ESTALE or not yet visible on NFS: the next poll opens it again

@@ -15,14 +15,14 @@ import socket
 import sys
 import time
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
 from shared_store.contract import ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
 from shared_store.layout import Run, Store, StoreError
-from shared_store.logs import OUTCOME_LINE, format_line
+from shared_store.logs import OUTCOME_LINE, format_line, format_lines
 from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from worker import supervisor
 from worker.lifeline import ChildEnd, Loss, MainEnd
@@ -43,9 +43,9 @@ class AwsSupervisor(supervisor.Supervisor):
         self._line = line
         self._loss: Loss | None = None
 
-    def write(self, rank: int | None, stream: str, text: str) -> None:
-        super().write(rank, stream, text)
-        _say(format_line(time.time(), rank, stream, text))
+    def write_lines(self, rank: int | None, stream: str, texts: Sequence[str]) -> None:
+        super().write_lines(rank, stream, texts)
+        _say(format_lines(time.time(), rank, stream, texts))
 
     def _watch(self) -> None:
         super()._watch()

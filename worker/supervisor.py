@@ -15,13 +15,14 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
-from shared_store.logs import format_line
+from shared_store.log_files import LogWriter, left_out
+from shared_store.logs import format_line, format_lines
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
 from worker.bus import Command, NodeBus
 from worker.network import interface_of
@@ -35,6 +36,11 @@ _FENCE_INTERVAL = 1.0
 """Seconds between two looks at the run's EPOCH."""
 _WAITING_EXTRA = 3.0
 """Seconds that a rank which waits gets beyond the stall timeout: the one that it waits for is to be found first."""
+_FLOOD = 32768
+"""Characters read at once, half of a full pipe, beyond which a rank prints faster than the supervisor should work: it rests then
+for as long as it has worked, and takes no more than half a core."""
+_COMPLAINTS = 60.0
+"""Seconds between two lines on standard error about a log that can't be written."""
 _PATIENCE = 1800.0
 """Seconds that a training may take to start, and to finish after its last iteration."""
 _STATES = {
@@ -56,10 +62,11 @@ class Supervisor:
         self.stopping: str | None = None
         self._next_fence = 0.0
         self._saving: list[tuple[int, Command]] = []
-        self._log_broken = False
-        log = run.log(contract.job, contract.attempt, contract.node_index)
-        log.parent.mkdir(parents=True, exist_ok=True)
-        self._log = open(log, "a", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115 - lives as long as the supervisor
+        self._log = LogWriter(run.log(contract.job, contract.attempt, contract.node_index), contract.log_limit)
+        self._lost = (0, 0, "")
+        """Lines and bytes that the log could not take since the last one that it could, and why."""
+        self._complain = 0.0
+        """When standard error may be told again of a log that can't be written (monotonic [s])."""
 
     # -- life ---------------------------------------------------------------------------------------------------------
 
@@ -214,28 +221,44 @@ class Supervisor:
     # -- output -------------------------------------------------------------------------------------------------------
 
     def write(self, rank: int | None, stream: str, text: str) -> None:
-        """Append one line to the node's log. A full or lost volume is said once on stderr; the ranks go on."""
-        try:
-            self._log.write(format_line(time.time(), rank, stream, text))
-            self._log.flush()
-            self._log_broken = False
-        except OSError as error:
-            if not self._log_broken:
-                print(
-                    f"log of node {self.contract.node_index} can't be written: {error.strerror}",
-                    file=sys.stderr,
-                    flush=True,
-                )
-            self._log_broken = True
+        """Append one line to the node's log, as :meth:`write_lines` does."""
+        self.write_lines(rank, stream, [text])
+
+    def write_lines(self, rank: int | None, stream: str, texts: Sequence[str]) -> None:
+        """Append lines to the node's log. A full or lost volume is said once on stderr; the ranks go on.
+
+        The log counts the lines that it could not take as soon as it takes one again.
+        """
+        if self._lost[0]:
+            lines, size, why = self._lost
+            note = left_out(lines, size, f"the log could not be written ({why})")
+            if self._log.append(format_line(time.time(), None, "e", note).encode()):
+                self._lost = (0, 0, "")
+        data = format_lines(time.time(), rank, stream, texts).encode(errors="backslashreplace")
+        rest = data if self._lost[0] else data[self._log.append(data) :]
+        if rest and self._log.error:
+            self._lose(rest, self._log.error)
+
+    def _lose(self, data: bytes, error: OSError) -> None:
+        why = error.strerror or str(error)
+        if not self._lost[0] and time.monotonic() >= self._complain:
+            print(
+                f"log of node {self.contract.node_index} can't be written: {why}",
+                file=sys.stderr,
+                flush=True,
+            )
+            self._complain = time.monotonic() + _COMPLAINTS
+        self._lost = (self._lost[0] + data.count(b"\n"), self._lost[1] + len(data), why)
 
     def _read(self, timeout: float) -> bool:
         """Move what the ranks printed into the log; False where there was nothing. Raises StaleEpoch."""
-        moved = False
+        moved, flooded = False, False
         ready = self.selector.select(timeout)
         if time.monotonic() >= self._next_fence:  # before anything is written: a node that was frozen must not log
             with contextlib.suppress(OSError, ValueError):  # a volume that is away: a commit reads it again
                 check_epoch(self.run, self.contract.epoch)
             self._next_fence = time.monotonic() + _FENCE_INTERVAL
+        began = time.thread_time()
         for key, _ in ready:
             if key.data is None:
                 with contextlib.suppress(BlockingIOError):
@@ -252,8 +275,11 @@ class Supervisor:
                 self.selector.unregister(key.fileobj)
                 continue
             moved = True
-            for line in lines:
-                self.write(rank.number, stream, line)
+            if lines:
+                self.write_lines(rank.number, stream, lines)
+            flooded = flooded or sum(map(len, lines)) + len(lines) > _FLOOD
+        if flooded and timeout:  # the pipe fills meanwhile, and the program waits: the cores are for the ranks
+            time.sleep(time.thread_time() - began)
         return moved
 
     def _answer_saves(self, said: list[str]) -> None:
@@ -288,7 +314,7 @@ class Supervisor:
 
     def _commit(self, outcome: Outcome) -> int:
         with contextlib.suppress(OSError):
-            os.fsync(self._log.fileno())
+            self._log.sync()
         if not self.run.path.exists():
             return outcome.exit_code  # somebody deleted the run: it must not come back in part
         try:

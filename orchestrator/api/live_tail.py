@@ -49,16 +49,19 @@ class LiveTail:
         matches: Whether a line is asked for.
         """
         self._controller, self._wanted, self._matches = controller, wanted, matches
-        self._began = self._asked = now()
+        self._started = self._asked = now()
         self._next_refresh = 0.0
         self._read: dict[str, int] = {}
         """Bytes of each stream that were looked through."""
+        self._begun: dict[str, int] = {}
+        """How often each stream had begun when it was looked at last."""
         self._open: dict[str, LogFile] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
         self._refresh()
         for name, file in self._open.items():
-            self._read[name] = file.look().end
+            view = file.look()
+            self._read[name], self._begun[name] = view.end, view.begun
 
     def poll(self) -> tuple[list[Event], bool]:
         """The events since the last call, in order, and whether some were left out. Raises OSError."""
@@ -67,15 +70,17 @@ class LiveTail:
         for name, file in self._open.items():
             view = file.look()
             start = self._read.get(name, 0)
-            if view.end < start:  # deleted, or begun anew
-                start = 0
+            told = []
+            if self._begun.setdefault(name, view.begun) != view.begun:
+                start, told, self._begun[name] = 0, [view.replaced()], view.begun
             behind = behind or view.end - start > _MOST_BEHIND
             events = view.forward(0, max(start, view.end - _MOST_BEHIND))
-            fresh.append([event for event in events if self._matches(event.text)])
+            fresh.append([*told, *(event for event in events if self._matches(event.text))])
             self._read[name] = view.end
         for name in ended:
             self._open.pop(name)
             self._read.pop(name, None)
+            self._begun.pop(name, None)
             self._over.add(name)
         merged = list(heapq.merge(*fresh))
         if len(merged) > _MOST_PENDING:
@@ -87,7 +92,7 @@ class LiveTail:
         """Take up streams that began; returns the names of those that ended before this call: the next look is their last."""
         asked = now()
         with self._controller.database.session() as session:
-            since = max(self._began, self._asked - _OVERLAP)
+            since = max(self._started, self._asked - _OVERLAP)
             streams = newest_streams(session, self._controller.store, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         found = [stream for stream in streams if stream.name not in self._over and self._wanted(stream.name)]

@@ -14,16 +14,19 @@ import re
 import threading
 from bisect import bisect_left, bisect_right
 from calendar import timegm
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
+
+from shared_store.log_files import Segment, left_out, read_log, segments_of
+from shared_store.logs import LIMIT_REACHED, REPLACED
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""
-_LONGEST_LINE = 1 << 20
-"""Bytes after which a line that has no end is cut; supervisors cut at 128 KiB."""
+_READ = 1 << 20
+"""Bytes that are read at once: more than the longest line; supervisors cut at 128 KiB."""
 _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
 
@@ -65,44 +68,78 @@ class LogFile:
         self.path, self.stream = path, stream
         self.source = int.from_bytes(hashlib.sha256(stream.encode()).digest()) % 10**24
         self._lock = threading.Lock()
+        self._begun = 0
         self._forget()
 
     def look(self) -> View:
-        """What is in the file now: whole lines only. A file that is not there yet is empty. Raises OSError."""
+        """What is in the log now: whole lines only. A log that is not there yet is empty. Raises OSError."""
         with self._lock:
-            try:
-                with open(self.path, "rb") as file:  # anew each time: what a network file system keeps honest
-                    size = os.fstat(file.fileno()).st_size
-                    if size < self._end:
-                        self._forget()
-                    file.seek(self._end)
-                    while self._end < size and self._extend(file):
-                        pass
-            except FileNotFoundError:
+            segments = segments_of(self.path)
+            if not segments and self._end:
                 self._forget()
-            return View(self, self._marks, len(self._marks), self._end, self._top)
+            while segments:
+                try:
+                    if not self._extend(segments):
+                        break
+                except FileNotFoundError:  # deleted since it was listed
+                    segments = segments_of(self.path)
+            self._drop_deleted(segments)
+            return View(self, segments, self._marks, len(self._marks), self._end, self._top, self._gap, self._begun)
 
     def _forget(self) -> None:
         self._marks: list[tuple[int, int]] = [(0, 0)]
-        """Of every block: where it begins, and the greatest time before it."""
+        """Of every block: where it begins, and the greatest time before it. A block is in one file, or it is the gap."""
+        self._gap: Gap | None = None
+        self._tail: tuple[int, int] | None = None
+        """Where the head ended, and the greatest time up to there; None while there is no tail."""
         self._end = 0
         self._top = 0
+        self._identity, self._inside = b"", False
+        self._begun += 1
 
-    def _extend(self, file: BinaryIO) -> bool:
-        """Take up the next block; False where no whole line is left."""
-        block = file.read(_BLOCK)
-        if not block.endswith(b"\n"):
-            block += file.readline(_LONGEST_LINE)
-        if len(block) < _BLOCK + _LONGEST_LINE:
-            block = block[: block.rfind(b"\n") + 1]
-        if not block:
-            return False
-        if self._end - self._marks[-1][0] >= _BLOCK:  # looks at a growing file must not leave a mark each
-            self._marks.append((self._end, self._top))
-        self._top = max(self._top, _milliseconds(max(_STAMPS.findall(block), default=b"")))
-        self._end += len(block)
-        file.seek(self._end)
-        return True
+    def _extend(self, segments: Sequence[Segment]) -> bool:
+        """Take up the next blocks; False where no whole line is left."""
+        chunk = read_log(segments, self._end, _READ, self._identity, self._inside)
+        if chunk.replaced:
+            self._forget()
+            return True
+        if chunk.start and any(segment.start == chunk.start for segment in segments):
+            self._tail = self._tail or (self._end, self._top)
+            self._mark(chunk.start)
+        self._end, self._identity = chunk.start, chunk.identity
+        whole = chunk.data.rfind(b"\n") + 1
+        self._inside = not whole and len(chunk.data) == _READ
+        whole = len(chunk.data) if self._inside else whole
+        start = 0
+        while start < whole:
+            stop = (chunk.data.find(b"\n", start + _BLOCK - 1, whole) + 1) or whole
+            if self._end - self._marks[-1][0] >= _BLOCK:  # looks at a growing file must not leave a mark each
+                self._mark(self._end)
+            self._top = max(self._top, _milliseconds(max(_STAMPS.findall(chunk.data, start, stop), default=b"")))
+            self._end, start = chunk.start + stop, stop
+        return bool(whole)
+
+    def _mark(self, offset: int) -> None:
+        if self._marks[-1][0] != offset:
+            self._marks.append((offset, self._top))
+
+    def _drop_deleted(self, segments: Sequence[Segment]) -> None:
+        """Put the gap in the place of segments that are gone; a view keeps the marks that it has."""
+        if self._tail is None or len(segments) < 2 or segments[1].start > self._end:
+            return
+        (start, top), (end, lines, _) = self._tail, segments[1]
+        if end > start and (self._gap is None or end > self._gap.end):
+            kept = [mark for mark in self._marks if mark[0] < start], [mark for mark in self._marks if mark[0] >= end]
+            self._marks = [*kept[0], (start, top), *kept[1]]
+            self._gap = Gap(start, end, lines)
+
+
+class Gap(NamedTuple):
+    """Lines that the log's writer deleted, behind its head."""
+
+    start: int
+    end: int
+    lines: int
 
 
 @dataclass(frozen=True)
@@ -110,13 +147,21 @@ class View:
     """A log as it was at one look."""
 
     file: LogFile
+    segments: Sequence[Segment]
     marks: list[tuple[int, int]]
     """Shared with the file, which only adds to it; the first ``count`` are this view's."""
     count: int
     end: int
-    """Bytes of whole lines."""
+    """Position after the last whole line."""
     top: int
     """The newest time [ms]; 0 where there is no event."""
+    gap: Gap | None
+    begun: int
+    """How often the log began: another number than at the look before says that it was truncated or replaced."""
+
+    def replaced(self) -> Event:
+        """What a follower is told of a log that was truncated or replaced."""
+        return Event(self.top, self.file.source, 0, 0, self.file.stream, REPLACED)
 
     def forward(self, since: int = 0, start: int = 0) -> Iterator[Event]:
         """Events not before the time ``since`` [ms] and the byte ``start``, the oldest first. Raises OSError."""
@@ -126,7 +171,9 @@ class View:
         by_place = bisect_right(self.marks, start, hi=self.count, key=lambda mark: mark[0]) - 1
         for block in range(max(by_time, by_place, 0), self.count):
             for event in self._events(block):
-                if event.time >= since and event.offset >= start:
+                if self.gap and event.offset == self.gap.start:  # a reader may have stopped inside it
+                    event = event._replace(offset=max(event.offset, min(start, event.end)))
+                if event.time >= since and start <= event.offset < event.end:
                     yield event
 
     def backward(self, before: int | None = None, until: int | None = None) -> Iterator[Event]:
@@ -143,8 +190,11 @@ class View:
     def _events(self, block: int) -> list[Event]:
         offset, time = self.marks[block]
         stop = self.marks[block + 1][0] if block + 1 < self.count else self.end
+        if self.gap and offset == self.gap.start:
+            text = left_out(self.gap.lines, self.gap.end - self.gap.start, LIMIT_REACHED)
+            return [Event(time, self.file.source, offset, self.gap.end, self.file.stream, text)]
         events = []
-        for line in _read(self.file.path, offset, stop - offset).split(b"\n"):
+        for line in self._read(offset, stop - offset).split(b"\n"):
             end = offset + len(line) + 1
             if match := _LINE.fullmatch(line):
                 time = max(time, _milliseconds(match[1]))
@@ -152,6 +202,15 @@ class View:
                 events.append(Event(time, self.file.source, offset, end, self.file.stream, text))
             offset = end
         return events
+
+    def _read(self, offset: int, size: int) -> bytes:
+        start, _, path = self.segments[bisect_right(self.segments, offset, key=lambda each: each.start) - 1]
+        try:
+            with open(path, "rb") as file:
+                file.seek(offset - start)
+                return file.read(size)
+        except FileNotFoundError:  # deleted since the look
+            return b""
 
 
 @lru_cache(maxsize=4096)
@@ -163,26 +222,18 @@ def log_file(path: Path, stream: str) -> LogFile:
 def first_and_last(path: Path) -> tuple[int, int, int] | None:
     """First and last time [ms] and size [bytes] of a log, from its two ends alone; None without an event. Raises OSError."""
     try:
+        sizes = [os.stat(segment.path).st_size for segment in segments_of(path)]
         with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
             head = _STAMPS.search(file.read(_ENDS))
-            file.seek(max(0, size - _ENDS))
+        with open(segments_of(path)[-1].path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
             tail = _STAMPS.findall(file.read(_ENDS))
-    except FileNotFoundError:
+    except (FileNotFoundError, IndexError):
         return None
     if not head:
         return None
     first = _milliseconds(head[1])
-    return first, max(first, _milliseconds(max(tail, default=b""))), size
-
-
-def _read(path: Path, offset: int, size: int) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            file.seek(offset)
-            return file.read(size)
-    except FileNotFoundError:  # the run was deleted since the look
-        return b""
+    return first, max(first, _milliseconds(max(tail, default=b""))), sum(sizes)
 
 
 def _milliseconds(stamp: bytes) -> int:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from functools import cache
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import botocore.session
@@ -144,8 +144,10 @@ def get_log_events(controller: Controller, request: dict[str, Any]) -> dict[str,
     forward = token[1] == "f" if token else request.get("startFromHead", False)
     if forward:
         here = int(token[2]) if token else 0
+        told = [view.replaced()] if here > view.end else []
+        here = 0 if told else here
         found = _until(view.forward(since, here), lambda event: before is not None and event.time >= before)
-        page = _page(found, limit)
+        page = _page(chain(told, found), limit)
     else:
         here = int(token[2]) if token else view.end
         page = _page(_until(view.backward(before, here), lambda event: event.time < since), limit)[::-1]

@@ -6,7 +6,7 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -32,7 +32,7 @@ from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
-from shared_store.logs import LogFollower
+from shared_store.logs import LogFollower, LogLine
 from shared_store.metrics import read_metrics
 
 router = APIRouter(prefix="/api")
@@ -188,8 +188,12 @@ def job_logs(
     rank: int | None = None,
     attempt: int | None = None,
     follow: bool = False,
+    positions: str = "{}",
 ) -> StreamingResponse:
-    """The job's log lines as JSON lines, all nodes merged; with ``follow`` until the job is over."""
+    """The job's log lines as JSON lines, all nodes merged; with ``follow`` until the job is over.
+
+    ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
+    """
     controller = _controller(request)
     with controller.database.session() as session:
         job = _job(session, reference)
@@ -198,12 +202,23 @@ def job_logs(
             raise ClientError(
                 f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt)
+        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, _positions(positions))
         job_id = job.id
     closing: threading.Event = request.app.state.closing
     lines: AsyncIterator[str] | Iterator[str]
     lines = _follow(controller, job_id, follower, closing) if follow else _stored(follower)
     return StreamingResponse(lines, media_type="application/x-ndjson")
+
+
+def _positions(text: str) -> dict[str, int]:
+    """Raises ClientError."""
+    try:
+        given = json.loads(text)
+        if all(isinstance(position, int) and 0 <= position < 2**63 for position in given.values()):
+            return dict(given)
+    except (ValueError, AttributeError, RecursionError):
+        pass
+    raise ClientError('positions: expected a JSON object such as {"1/0": 4096}')
 
 
 @router.post("/jobs/{reference}/checkpoint")
@@ -334,8 +349,12 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
 
 
 def _stored(follower: LogFollower) -> Iterator[str]:
-    for line in follower.drain():
-        yield json.dumps(asdict(line)) + "\n"
+    """All that is there, many lines at a time: each piece costs a hand-over between threads."""
+    return map(_json_lines, follower.batches())
+
+
+def _json_lines(lines: Sequence[LogLine]) -> str:
+    return "".join([f"{line.to_json()}\n" for line in lines])
 
 
 async def _follow(
@@ -343,23 +362,24 @@ async def _follow(
 ) -> AsyncIterator[str]:
     """Lines as they come; a thread is taken only for each look, since any number of people may follow."""
 
-    def look() -> tuple[list[str], bool]:
+    def look() -> tuple[str, bool]:
         with controller.database.session() as session:
             job = session.get(Job, job_id)
             over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
-        return [json.dumps(asdict(line)) + "\n" for line in follower.poll()], over
+        return _json_lines(follower.poll()), over
 
     spoken = time.monotonic()
     while not closing.is_set():
         lines, over = await run_in_threadpool(look)
         if lines:
-            yield "".join(lines)
+            yield lines
             spoken = time.monotonic()
         if over:
-            async for line in iterate_in_threadpool(_stored(follower)):
-                yield line
+            async for lines in iterate_in_threadpool(_stored(follower)):
+                yield lines
             return
         if time.monotonic() - spoken > _HEARTBEAT:
             yield "\n"
             spoken = time.monotonic()
-        await asyncio.sleep(_POLL)
+        if not follower.behind:
+            await asyncio.sleep(_POLL)

@@ -13,6 +13,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.members import check_consumables, check_members
 from orchestrator.definition import GangNeeds, gang_needs, target_nodes
 from orchestrator.excerpts import shown
+from shared_store.log_files import LEAST_LIMIT
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
@@ -111,9 +112,12 @@ def _check_settings(needs: GangNeeds) -> None:
         if _depth(spec) > _DEEPEST_SPEC:
             raise ValueError
         float(needs.setting("MUSTER_STALL_TIMEOUT", "0"))
+        if not LEAST_LIMIT <= needs.log_limit < 2**63:
+            raise ValueError
     except (ValueError, RecursionError):
         raise ClientError(
-            "MUSTER_SPEC or MUSTER_STALL_TIMEOUT is malformed; both are written by `muster submit`"
+            "MUSTER_SPEC, MUSTER_STALL_TIMEOUT or MUSTER_LOG_LIMIT (bytes, at least 1048576) is malformed; they are written by "
+            "`muster submit`"
         ) from None
     if needs.setting("MUSTER_ON_CHILD_FAILURE", "ignore") not in ("restart", "fail", "ignore"):
         raise ClientError("MUSTER_ON_CHILD_FAILURE: expected restart, fail or ignore")

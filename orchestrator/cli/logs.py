@@ -43,10 +43,14 @@ def logs(
     colour = sys.stdout.isatty()
     with Client.connect() as client:
         client.told = lambda line: print(line, file=sys.stderr, flush=True)
-        for line in client.logs(job, follow=follow, node=node, rank=rank, attempt=attempt):
-            if (oldest and line["time"] < oldest) or (pattern and not pattern.search(line["text"])):
-                continue
-            print(json.dumps(line) if as_json else _format(line, colour), flush=True)
+        for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
+            shown = [
+                json.dumps(line) if as_json else _format(line, colour)
+                for line in lines
+                if not (oldest and line["time"] < oldest) and (not pattern or pattern.search(line["text"]))
+            ]
+            if shown:
+                print("\n".join(shown), flush=True)
 
 
 def _format(line: dict[str, Any], colour: bool) -> str:

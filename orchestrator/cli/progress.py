@@ -94,10 +94,13 @@ def evaluated(figures: dict[str, Any]) -> str:
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
-    for line in client.logs(job_id, follow=True):
-        who = "-" if line["rank"] is None else line["rank"]
-        print(f"[node {line['node']} rank {who}] {line['text']}", flush=True)
+    for lines in client.log_batches(job_id, follow=True):
+        print("\n".join(map(_format, lines)), flush=True)
     return summary(client, job_id)
+
+
+def _format(line: dict[str, Any]) -> str:
+    return f"[node {line['node']} rank {'-' if line['rank'] is None else line['rank']}] {line['text']}"
 
 
 def _describe(record: dict[str, Any]) -> dict[str, str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from shared_store.contract import NodeContract
+from shared_store.log_files import LIMIT
 
 PRIVATE = (
     *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE"),
@@ -96,6 +97,8 @@ class Gang:
     """Working directory of the commands."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
+    log_limit: int = LIMIT
+    """Bytes of each node's log that are kept."""
     is_gang: bool = True
     """False for a single-node job, whose environment has no node variables on AWS."""
     array: tuple[int, int] | None = None
@@ -164,6 +167,7 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             array=gang.array,
             cpus=placement.cpus,
             stall_timeout=gang.stall_timeout,
+            log_limit=gang.log_limit,
             address=addresses[index],
             bus=gang.bus,
             bus_token=gang.bus_token,

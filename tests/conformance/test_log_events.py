@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from orchestrator.api import log_events
-from orchestrator.api.log_events import LogFile
+from orchestrator.api.log_events import LogFile, View
 from orchestrator.api.log_filter import parse
 from shared_store.logs import format_line
 from tests.conftest import PATIENCE
@@ -69,13 +69,13 @@ def test_a_poll_near_the_end_reads_only_the_end(tmp_path: Path, monkeypatch: pyt
     path = tmp_path / "node-0.log"
     path.write_text("".join(format_line(1e9 + i / 100, 0, "o", f"line {i} {'x' * 80}") for i in range(100_000)))
     file, read = LogFile(path, "s"), []
-    genuine = log_events._read
+    genuine = View._read
 
-    def counting(path: Path, offset: int, size: int) -> bytes:
+    def counting(view: View, offset: int, size: int) -> bytes:
         read.append(size)
-        return genuine(path, offset, size)
+        return genuine(view, offset, size)
 
-    monkeypatch.setattr(log_events, "_read", counting)
+    monkeypatch.setattr(View, "_read", counting)
     view = file.look()
     found = [event.text.split()[1] for event in view.forward(since=int(1e12) + 999_900)]
     assert found == [str(i) for i in range(99_990, 100_000)]

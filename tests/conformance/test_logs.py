@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from shared_store.logs import format_line
+from shared_store.logs import REPLACED, format_line
 from tests.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, messages, stream_of
 from tests.conftest import MAIN_LAST, Serving
 
@@ -164,12 +164,14 @@ def test_a_malformed_token_is_an_invalid_parameter(shared_server: Serving, logs:
         logs.get_log_events(logGroupName=GROUP, logStreamName=stream_of(shared_server, counted), nextToken=token)
 
 
-def test_a_token_from_inside_a_line_goes_on_with_the_next_one(shared_server: Serving, logs: Any, counted: str) -> None:
+def test_a_token_from_inside_a_line_goes_on_with_the_next_one_and_one_from_behind_the_end_with_the_first(
+    shared_server: Serving, logs: Any, counted: str
+) -> None:
     name = stream_of(shared_server, counted)
     page = logs.get_log_events(logGroupName=GROUP, logStreamName=name, nextToken="f/5", limit=1)
     assert messages(page) == ["line 0001"]
     past = logs.get_log_events(logGroupName=GROUP, logStreamName=name, nextToken="f/99999999999")
-    assert past["events"] == [] and past["nextForwardToken"] == "f/99999999999"
+    assert messages(past)[:2] == [REPLACED, "line 0000"]  # the file was longer once
 
 
 # -- FilterLogEvents --------------------------------------------------------------------------------------------------

@@ -64,6 +64,7 @@ def test_a_training_spec_becomes_a_multinode_definition() -> None:
         "MUSTER_RANKS_PER_NODE": "2",
         "MUSTER_MIN_NODES": "3",
         "MUSTER_STALL_TIMEOUT": "300",
+        "MUSTER_LOG_LIMIT": "1073741824",
         "MUSTER_DIRECTORY": "/home/me",
     }
 

@@ -44,7 +44,7 @@ LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digi
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
 TASKS = "(known: Ant, Cartpole, CartpolePixels, Humanoid, Quadruped; your own: module:Class)"
 TOP = (
-    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, retry, "
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, logs, retry, "
     "on_child_failure, timeout, stall_timeout"
 )
 

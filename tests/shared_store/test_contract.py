@@ -109,6 +109,7 @@ def test_our_own_variables_name_the_job_the_run_and_the_attempt() -> None:
         "MUSTER_RANKS_PER_NODE": "2",
         "MUSTER_GRACE_SECONDS": "12.5",
         "MUSTER_CPUS": "0.5",
+        "MUSTER_LOG_LIMIT": "1073741824",
         "MUSTER_ADDRESS": "127.64.0.2",
     }
 

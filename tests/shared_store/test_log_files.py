@@ -1,0 +1,228 @@
+"""A log keeps its head and its tail within its limit; followers get every line once, and are told what they can't have."""
+
+from __future__ import annotations
+
+import os
+import random
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from orchestrator.api.log_events import LogFile
+from shared_store.layout import Run
+from shared_store.log_files import LEAST_LIMIT, LogWriter, left_out, log_segments, read_log, segments_of
+from shared_store.logs import REPLACED, LogFollower, format_line, timestamp
+
+START = 1_800_000_000.0
+LIMIT = LEAST_LIMIT
+
+
+def lines_of(first: int, count: int, size: int = 100) -> bytes:
+    """Lines that carry their number, a millisecond apart."""
+    return "".join(
+        format_line(START + i / 1000, 0, "o", f"{i:08d} {'x' * size}") for i in range(first, first + count)
+    ).encode()
+
+
+def numbers(texts: list[str]) -> list[int]:
+    return [int(text[:8]) for text in texts if text[:8].isdigit()]
+
+
+def written(path: Path, count: int, step: int = 500) -> LogWriter:
+    writer = LogWriter(path, LIMIT)
+    for first in range(0, count, step):
+        data = lines_of(first, min(step, count - first))
+        assert writer.append(data) == len(data)
+    return writer
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run(tmp_path)
+
+
+def test_a_log_within_its_limit_is_one_file(run: Run) -> None:
+    written(run.log("job", 1, 0), 1000)
+    assert [segment.path.name for segment in segments_of(run.log("job", 1, 0))] == ["node-0.log"]
+
+
+def test_of_a_log_beyond_its_limit_both_ends_are_kept_and_what_is_between_is_counted(run: Run) -> None:
+    path, count = run.log("job", 1, 0), 50_000
+    assert written(path, count).lines == count
+    size = sum(segment.path.stat().st_size for segment in segments_of(path))
+    assert LIMIT * 0.9 < size <= LIMIT
+    texts = [line.text for line in LogFollower(run, "job").drain()]
+    kept = numbers(texts)
+    assert len(texts) == len(kept) + 1
+    gap = next(place for place, text in enumerate(texts) if text.startswith("…"))
+    head, tail = kept[:gap], kept[gap:]
+    assert head == list(range(len(head))) and tail == list(range(tail[0], count))
+    missing = tail[0] - len(head)
+    assert texts[gap] == left_out(missing, len(lines_of(0, missing)), "the log reached its limit")
+    assert abs(len(head) - len(tail)) < 0.2 * len(head)
+
+
+def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behind_it(run: Run) -> None:
+    dice, writer, follower = random.Random(3), LogWriter(run.log("job", 1, 0), LIMIT), LogFollower(run, "job")
+    count, texts = 0, []
+    while count < 40_000:
+        more = dice.randrange(1, 900)
+        data = lines_of(count, more, dice.randrange(300))
+        assert writer.append(data) == len(data)
+        count += more
+        if dice.random() < 0.9:
+            follower = LogFollower(run, "job", offsets=follower.offsets) if dice.random() < 0.1 else follower
+            texts += [line.text for line in follower.drain()]
+    texts += [line.text for line in follower.drain()]
+    assert numbers(texts) == list(range(count)) and len(texts) == count
+
+
+def test_a_follower_that_falls_behind_is_told_how_much_it_missed(run: Run) -> None:
+    writer, follower = written(run.log("job", 1, 0), 6000), LogFollower(run, "job")
+    before = [line.text for line in follower.drain()]
+    position = follower.offsets["1/0"]
+    for first in range(6000, 50_000, 500):
+        writer.append(lines_of(first, 500))
+    after = [line.text for line in follower.drain()]
+    tail = segments_of(run.log("job", 1, 0))[1]
+    assert numbers(before) == list(range(6000))
+    assert after[0] == left_out(None, tail.start - position, "the log reached its limit")
+    assert numbers(after)[-1] == 49_999 and all(b == a + 1 for a, b in pairwise(numbers(after)))
+
+
+def test_a_writer_that_comes_back_goes_on_where_the_one_before_was_killed(run: Run) -> None:
+    path = run.log("job", 1, 0)
+    written(path, 9000).close()
+    last = segments_of(path)[-1].path
+    with open(last, "ab") as file:
+        file.write(b"2027-01-15T08:00:00.000000Z 0 o half a li")
+    again = LogWriter(path, LIMIT)
+    assert again.lines == 9000
+    again.append(lines_of(9000, 1000))
+    assert again.lines == 10_000
+    assert numbers([line.text for line in LogFollower(run, "job").drain()])[-1000:] == list(range(9000, 10_000))
+
+
+def test_a_line_longer_than_a_file_of_the_log_is_kept_whole(run: Run) -> None:
+    writer = LogWriter(run.log("job", 1, 0), LIMIT)
+    long = [format_line(START, 0, "o", f"{i} " + "y" * 300_000).encode() for i in range(6)]
+    assert writer.append(b"".join(long)) == sum(map(len, long))
+    texts = [line.text for line in LogFollower(run, "job").drain()]
+    assert texts[0].startswith("0 ") and texts[-1] == "5 " + "y" * 300_000
+
+
+def test_a_full_volume_takes_whole_lines_only_and_the_log_goes_on_when_there_is_room(tmp_path: Path) -> None:
+    if os.geteuid() != 0 or os.system(f"mount -t tmpfs -o size=4m none {tmp_path}") != 0:
+        pytest.skip("only root can mount a small volume")
+    try:
+        path = Run(tmp_path).log("job", 1, 0)
+        writer = LogWriter(path, 64 << 20)
+        data = lines_of(0, 60_000)
+        first = writer.append(data)
+        assert 2 << 20 < first < len(data) and data[first - 1 : first] == b"\n" and writer.error is not None
+        volume = os.statvfs(tmp_path)
+        assert volume.f_bavail * volume.f_frsize > 40_000  # of 4 MiB two per cent are left to others
+        (tmp_path / "filler").write_bytes(b"x" * volume.f_bavail * volume.f_frsize)
+        assert writer.append(lines_of(0, 5000)) == 0 or writer.error is not None
+        (tmp_path / "filler").unlink()
+        assert path.read_bytes().endswith(b"\n")
+    finally:
+        os.system(f"umount -l {tmp_path}")
+
+
+def test_on_a_full_volume_the_end_of_a_long_log_replaces_its_middle(tmp_path: Path) -> None:
+    if os.geteuid() != 0 or os.system(f"mount -t tmpfs -o size=4m none {tmp_path}") != 0:
+        pytest.skip("only root can mount a small volume")
+    try:
+        run = Run(tmp_path)
+        writer = LogWriter(run.log("job", 1, 0), 6 << 20)
+        for first in range(0, 80_000, 500):
+            data = lines_of(first, 500)
+            assert writer.append(data) == len(data)
+        kept = numbers([line.text for line in LogFollower(run, "job").drain()])
+        assert kept[0] == 0 and kept[-1] == 79_999
+    finally:
+        os.system(f"umount -l {tmp_path}")
+
+
+def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -> None:
+    clock = [START, START + 1, START - 86_400, START - 86_399, START + 2]
+    LogWriter(run.log("job", 1, 0)).append(
+        "".join(format_line(at, 0, "o", f"a{i}") for i, at in enumerate(clock)).encode()
+    )
+    LogWriter(run.log("job", 1, 1)).append(format_line(START + 1.5, 1, "o", "b").encode())
+    lines = list(LogFollower(run, "job").drain())
+    assert [line.text for line in lines] == ["a0", "a1", "a2", "a3", "b", "a4"]
+    assert lines[2].time == timestamp(START - 86_400), "the time that the node wrote is shown"
+
+
+def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: Run) -> None:
+    sizes = {0: 300, 1: 5, 2: 40}
+    for node, size in sizes.items():
+        lines = [format_line(START + i + node / 10, node, "o", "z" * size) for i in range(12_000)]
+        LogWriter(run.log("job", 1, node)).append("".join(lines).encode())
+    LogWriter(run.log("job", 2, 0)).append(format_line(START, 0, "o", "second attempt").encode())
+    lines = list(LogFollower(run, "job").drain())
+    assert len(lines) == 36_001
+    keys = [(line.attempt, line.time) for line in lines]
+    assert keys == sorted(keys)
+
+
+@pytest.mark.parametrize("how", ["truncated", "replaced by a shorter one", "replaced by a longer one"])
+def test_a_log_that_is_truncated_or_replaced_is_said_and_followed_from_its_new_beginning(run: Run, how: str) -> None:
+    path = run.log("job", 1, 0)
+    LogWriter(path).append(lines_of(0, 100))
+    follower, file = LogFollower(run, "job"), LogFile(path, "stream")
+    assert len(follower.poll()) == 100 and file.look().begun == 1
+    if how == "truncated":
+        os.truncate(path, 0)
+        assert [line.text for line in follower.poll()] == [REPLACED]
+    else:
+        path.unlink()
+    LogWriter(path).append(lines_of(500, 60 if "shorter" in how else 300))
+    texts = [line.text for line in follower.poll()]
+    assert texts[0] == REPLACED or how == "truncated"
+    assert numbers(texts)[0] == 500 and len(numbers(texts)) == (60 if "shorter" in how else 300)
+    assert [line.text for line in follower.poll()] == []
+    view = file.look()
+    assert view.begun == 2 and numbers([event.text for event in view.forward()])[0] == 500
+
+
+def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: Run) -> None:
+    path = run.log("job", 1, 0)
+    early, writer = LogFile(path, "stream"), LogWriter(path, LIMIT)
+    for first in range(0, 40_000, 500):
+        writer.append(lines_of(first, 500))
+        if first % 7000 == 0:
+            early.look()
+    late = LogFile(path, "stream").look()
+    seen = list(early.look().forward())
+    assert seen == list(late.forward()) == list(late.backward())[::-1]
+    gap = next(event for event in seen if event.text.startswith("…"))
+    texts = [line.text for line in LogFollower(run, "job").drain()]
+    assert [event.text for event in seen] == texts
+    inside = list(late.forward(start=gap.offset + 1000))
+    assert (
+        inside[0].text == gap.text
+        and numbers([event.text for event in inside])[0] == numbers(texts)[texts.index(gap.text)]
+    )
+    assert all(event.end == after.offset for event, after in pairwise(seen))
+    for event in random.Random(1).sample(seen, 50):
+        assert next(late.forward(start=event.offset)) == event
+
+
+def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
+    path = run.log("job", 1, 0)
+    writer = written(path, 12_000)
+    view = LogFile(path, "stream").look()
+    for first in range(12_000, 40_000, 500):
+        writer.append(lines_of(first, 500))
+    assert numbers([event.text for event in view.forward()])[:3500] == list(range(3500))
+
+
+def test_files_of_other_names_are_no_part_of_a_log(tmp_path: Path) -> None:
+    for name in ("node-0.log", "node-0.log.gz", "node-0.log.1", f"node-0.log.{5:015d}.2", "node-x.log", "notes"):
+        (tmp_path / name).write_text("x\n")
+    assert {name: [s.start for s in found] for name, found in log_segments(tmp_path).items()} == {"node-0.log": [0, 5]}
+    assert read_log(segments_of(tmp_path / "node-0.log"), 2, 100).left_out == (2, 3)
