@@ -108,8 +108,19 @@ def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: N
     numbers = [int(text[:3]) for text in texts if re.fullmatch(r"\d{3} x{100} end", text)]
     assert numbers[-1] == 149
     assert numbers == sorted(set(numbers))
-    broken = [text for text in raw[:-1] if not re.search(r"(\d{3} x{100} end|ended: done)$", text)]
-    assert len(broken) <= 1, "at most the line that was being written when the volume was full"
+    other = [text for text in raw[:-1] if not re.search(r"(\d{3} x{100} end|ended: done)$", text)]
+    assert len(other) == 1 and f" {150 - len(numbers)} lines (" in other[0] and "left out" in other[0]
+
+
+def test_of_a_flood_both_ends_are_in_the_log_and_what_is_between_is_counted(node: Nodes) -> None:
+    n = node(log_limit=1 << 20)
+    assert n.python("for i in range(60_000): print(f'{i:020d}')\nraise SystemExit('the error')") == 1
+    output = [text for text in n.output() if text.isdigit()]
+    assert output[0] == f"{0:020d}" and output[-1] == f"{59_999:020d}" and len(output) < 40_000
+    [gap] = [text for _, _, text in n.lines() if text.startswith("…")]
+    assert gap.startswith(f"… {60_000 - len(output):,} lines (")
+    assert "the error" in n.output() and n.lines()[-1][2].startswith("node 0 ended")
+    assert sum(path.stat().st_size for path in n.run.logs("job", 1).iterdir()) <= 1 << 20
 
 
 def test_a_store_that_refuses_the_outcome_does_not_change_the_exit_code(node: Nodes) -> None:
