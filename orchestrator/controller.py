@@ -21,6 +21,7 @@ from orchestrator.database import Database, DatabaseError
 from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs
 from orchestrator.jobs import Ending, Status
+from orchestrator.peers import Peers
 from orchestrator.roster import Roster
 from orchestrator.scheduling import Board, Decisions, Leading, decide
 from orchestrator.tables import Job, JobQueue, now
@@ -50,14 +51,15 @@ class Controller:
         engine: Several,
         store: Store,
         bus: Bus,
+        peers: Peers,
         interval: float = 0.2,
         retention: float | None = None,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept."""
-        self.database, self.engine, self.store, self.bus = database, engine, store, bus
+        self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
         self.roster = Roster()
-        self.gangs = Gangs(engine, store, bus, self.wake)
+        self.gangs = Gangs(engine, store, bus, peers, self.wake)
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
         self.submissions = Together(database, self.writing)

@@ -6,6 +6,7 @@ its ending before the gang is stopped. A controller that starts on the database 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -23,13 +24,14 @@ from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.peers import Peers
 from orchestrator.pools import engine_options
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
 from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
+from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import read_outcome
 
@@ -52,8 +54,8 @@ _STOP_AGAIN = 2.0
 class Gangs:
     """Drives attempts; ``changed`` is called (from any thread) when one of them should be looked at."""
 
-    def __init__(self, engine: Several, store: Store, bus: Bus, changed: Callable[[], None]) -> None:
-        self.engine, self.store, self.bus, self.changed = engine, store, bus, changed
+    def __init__(self, engine: Several, store: Store, bus: Bus, peers: Peers, changed: Callable[[], None]) -> None:
+        self.engine, self.store, self.bus, self.peers, self.changed = engine, store, bus, peers, changed
         self._stops: dict[tuple[str, int], Future[None]] = {}
         self._finished: dict[tuple[str, int], float] = {}
         self._denied: dict[tuple[str, int], str] = {}
@@ -65,15 +67,19 @@ class Gangs:
         try:
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
             known = [attempt.epoch for attempt in session.scalars(select(Attempt).join(Job).where(Job.run == job.run))]
-            epoch = max([read_epoch(run), *known]) + 1
+            if read_epoch(run) not in known and (writer := self.peers.writer(run)):
+                raise StoreError(f"it is being written by {writer}; stop that job first")
             if job.first_epoch is not None and run.description() is None:
                 raise StoreError("it was deleted from the store while the job ran")
             self._describe(run, job)
-            raise_epoch(run, epoch)
-        except OSError as error:  # a volume that is full or away may come back
+            epoch = take_epoch(run, max(known, default=0), Claim(self.peers.id, job.id, len(job.attempts) + 1))
+        except (
+            OSError,
+            StaleEpoch,
+        ) as error:  # a volume that is full or away may come back; another controller was faster
             job.status_reason = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
             return
-        except (StoreError, StaleEpoch, ValueError) as error:
+        except (StoreError, ValueError) as error:
             job.move(Status.FAILED, f"store {self.store.path}: can't prepare run {job.run}: {error}")
             return
         if job.first_epoch is None:
@@ -295,6 +301,10 @@ class Gangs:
     ) -> None:
         """The gang is gone: close its attempt and decide what becomes of the job."""
         self.bus.forget(job.id, attempt.number)
+        with contextlib.suppress(
+            OSError
+        ):  # while this controller lives, another one may then say that the run is written
+            close_claim(self.store.run(job.run), attempt.epoch)
         ended, ending = now(), verdict.ending
         attempt.ending, attempt.status_reason, attempt.exit_code = ending, verdict.reason, verdict.exit_code
         attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended

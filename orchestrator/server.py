@@ -20,6 +20,7 @@ from orchestrator.engines.base import EngineError
 from orchestrator.engines.several import Several
 from orchestrator.home import HomeLock, ServerError
 from orchestrator.keys import KeyStore
+from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
 from shared_store.layout import Store
 
@@ -77,7 +78,8 @@ class Server:
         with found.session() as session:
             ensure_pools(session, nodes.names)
         self.bus = Bus(home, nodes.addresses)
-        self.controller = Controller(found, nodes, self.store, self.bus, retention=retention)
+        self.peers = Peers(self.store, home)
+        self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]
         self.url = (
@@ -92,6 +94,7 @@ class Server:
     def start(self) -> None:
         """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
+        self.peers.start()
         self.controller.start()
         self._thread.start()
         self._lock.publish(self.url)
@@ -103,6 +106,7 @@ class Server:
         if self._thread.is_alive():
             self._thread.join(timeout=5)
         self.controller.close()
+        self.peers.close()
         self.bus.close()
         self.controller.database.close()
         self._socket.close()

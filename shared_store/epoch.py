@@ -1,43 +1,99 @@
-"""Fencing: every attempt that may write to a run has an epoch, and only the newest one may commit.
+"""Fencing: every attempt that may write to a run has an epoch, and only the attempt that the run's ``EPOCH`` names may commit.
 
-The controller writes a greater number to the run's ``EPOCH`` file before it launches a gang. A gang that was believed dead and
-comes back reads a number that is not its own, and stops.
+Before it launches a gang, the controller creates ``EPOCH.<n>``, exclusively: of several controllers on one store one alone gets
+the number, on NFS and EFS too. Then it writes n to ``EPOCH``. A gang that was believed dead and comes back reads a number there
+that is not its own, and stops. Readers open ``EPOCH`` alone; ``EPOCH.<n>`` tells controllers which attempt writes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import socket
 import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
-from shared_store.files import write_atomic
+from shared_store.files import sync_directory, write_atomic
 from shared_store.layout import Run, StoreError
+
+LARGEST_EPOCH = 10**15 - 1
+"""A greater number in ``EPOCH`` is damage: no run has that many attempts."""
+_KEPT = 64
+"""Claims that are kept behind the newest one, so that a controller that froze while it claimed can't free a number."""
+_LONGEST_CLAIM = 4096
+"""Bytes that are read of a claim."""
 
 
 class StaleEpoch(Exception):
-    """A newer attempt owns the run: this process must stop and must not write."""
+    """Another attempt owns the run: this process must stop and must not write."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Which attempt has an epoch, as ``EPOCH.<n>`` says while the attempt is open."""
+
+    controller: str
+    """Id of the attempt's controller on this store."""
+    job: str
+    attempt: int
 
 
 def read_epoch(run: Run) -> int:
     """The epoch that may write to ``run``; 0 before the first attempt. Raises ValueError where the file is damaged."""
     path = run.path / "EPOCH"
     try:
-        text = path.read_bytes().decode(errors="replace").strip()
+        with open(path, "rb") as file:
+            text = file.read(32).decode(errors="replace").strip()
     except FileNotFoundError:
         return 0
-    if not re.fullmatch(r"[0-9]+", text):
-        raise ValueError(f"{path}: expected a whole number, found {text!r}")
+    if not re.fullmatch(r"[0-9]{1,15}", text):
+        raise ValueError(f"{path}: expected a whole number of at most 15 digits, found {text!r}")
     return int(text)
 
 
-def raise_epoch(run: Run, epoch: int) -> None:
-    """Give the run to ``epoch``. Raises StaleEpoch where the run already belongs to it or to a later one."""
+def take_epoch(run: Run, after: int, claim: Claim) -> int:
+    """Give the run to ``claim``, with the first free epoch greater than ``after`` and than the run's; returns it.
+
+    Raises:
+        StaleEpoch: Another controller took the run meanwhile.
+        ValueError: ``EPOCH`` is damaged, or no epoch is left.
+        OSError: The store can't be written.
+    """
+    epoch = max(read_epoch(run), after) + 1
+    while not _create(run, epoch, claim):
+        epoch += 1
+    _publish(run, epoch)
+    return epoch
+
+
+def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
+    """Give the run to ``epoch``. Raises StaleEpoch where that is not greater than the run's, or where another attempt has it."""
     current = read_epoch(run)
     if epoch <= current:
         raise StaleEpoch(f"run {run.name}: epoch {epoch} does not follow {current}")
-    write_atomic(run.path / "EPOCH", f"{epoch}\n".encode())
+    if not _create(run, epoch, claim):
+        raise StaleEpoch(f"run {run.name}: another attempt has epoch {epoch}")
+    _publish(run, epoch)
+
+
+def read_claim(run: Run, epoch: int) -> Claim | None:
+    """Which open attempt has ``epoch``; None where that is closed, unknown or damaged. Raises OSError."""
+    try:
+        with open(_claim_path(run, epoch), "rb") as file:
+            value = json.loads(file.read(_LONGEST_CLAIM))
+        return Claim(str(value["controller"]), str(value["job"]), int(value["attempt"]))
+    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
+def close_claim(run: Run, epoch: int) -> None:
+    """Note that the attempt with ``epoch`` is closed. The file stays, empty: the number is never given again. Raises OSError."""
+    with contextlib.suppress(FileNotFoundError), open(_claim_path(run, epoch), "rb+") as file:
+        file.truncate()
+        os.fsync(file.fileno())
 
 
 def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
@@ -47,7 +103,7 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
         patience: Seconds that a network file system gets to show what another machine has written.
 
     Raises:
-        StaleEpoch: A newer attempt owns the run.
+        StaleEpoch: Another attempt owns the run.
         StoreError: The epoch is not here: another directory of the same name, or nothing mounted.
     """
     deadline = time.monotonic() + patience
@@ -66,12 +122,48 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
         raise _stale(run, epoch, current)
 
 
+def check_epoch(run: Run, epoch: int) -> None:
+    """Raises StaleEpoch where another attempt owns the run.
+
+    A smaller number counts as well: of two controllers that publish at the same instant the last one owns the run, and exactly one
+    gang goes on. A missing file proves nothing.
+    """
+    current = read_epoch(run)
+    if current not in (0, epoch):
+        raise _stale(run, epoch, current)
+
+
+def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
+    """Create ``EPOCH.<epoch>``; False where it exists: the number is taken."""
+    if epoch > LARGEST_EPOCH:
+        raise ValueError(f"{run.path / 'EPOCH'}: no epoch is left after {LARGEST_EPOCH}")
+    run.path.mkdir(parents=True, exist_ok=True)
+    try:
+        descriptor = os.open(_claim_path(run, epoch), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    except FileExistsError:
+        return False
+    with open(descriptor, "wb") as file:
+        if claim is not None:
+            file.write(json.dumps(asdict(claim)).encode())
+            file.flush()
+        os.fsync(descriptor)
+    sync_directory(run.path)  # a number that a crash of the volume forgets could be given again
+    return True
+
+
+def _publish(run: Run, epoch: int) -> None:
+    if (current := read_epoch(run)) >= epoch:
+        raise _stale(run, epoch, current)
+    write_atomic(run.path / "EPOCH", f"{epoch}\n".encode())
+    for name in os.listdir(run.path):
+        claim = re.fullmatch(r"EPOCH\.([0-9]{1,15})", name)
+        if claim and int(claim[1]) < epoch - _KEPT:
+            (run.path / name).unlink(missing_ok=True)
+
+
+def _claim_path(run: Run, epoch: int) -> Path:
+    return run.path / f"EPOCH.{epoch}"
+
+
 def _stale(run: Run, epoch: int, current: int) -> StaleEpoch:
     return StaleEpoch(f"run {run.name}: this attempt has epoch {epoch}, the run now belongs to epoch {current}")
-
-
-def check_epoch(run: Run, epoch: int) -> None:
-    """Raises StaleEpoch where a newer attempt owns the run."""
-    current = read_epoch(run)
-    if current > epoch:
-        raise _stale(run, epoch, current)

@@ -20,7 +20,7 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from shared_store.contract import ContractError, NodeContract
-from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
+from shared_store.epoch import Claim, StaleEpoch, raise_epoch, read_claim, read_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.logs import OUTCOME_LINE, format_line, format_lines
 from shared_store.outcomes import EX_TEMPFAIL, Outcome
@@ -134,14 +134,19 @@ def take_run(contract: NodeContract, description: Mapping[str, object], line: Ma
     The main node does it, the children wait for it. A run that belongs to a later attempt stays with it; the supervisor refuses.
 
     Raises:
+        StaleEpoch: Another controller's attempt has this epoch.
         StoreError, OSError, ValueError: The volume can't be used.
     """
     run = Store(contract.store).open().run(contract.run)
     if contract.node_index == contract.main_index:
         spec = json.loads(os.environ.get("MUSTER_SPEC") or "null")
         run.create({**description, "created": int(time.time() * 1000), "spec": spec})
-        with contextlib.suppress(StaleEpoch):
-            raise_epoch(run, contract.epoch)
+        if read_epoch(run) < contract.epoch:
+            raise_epoch(run, contract.epoch, Claim("", contract.job, contract.attempt))
+        elif (held := read_claim(run, contract.epoch)) and (held.job, held.attempt) != (contract.job, contract.attempt):
+            raise StaleEpoch(
+                f"run {run.name}: attempt {held.attempt} of job {held.job} has epoch {contract.epoch} already"
+            )
         return
     deadline = time.monotonic() + _PATIENCE
     taken = attached = False
@@ -171,6 +176,9 @@ def main(argv: list[str]) -> int:
     except (ContractError, StoreError, OSError, ValueError) as error:
         print(f"muster: node on AWS Batch: {error}", file=sys.stderr)
         return 2
+    except StaleEpoch as error:
+        print(f"muster: node on AWS Batch: {error}; leaving", file=sys.stderr)
+        return 3
     return supervisor.main(argv, partial(AwsSupervisor, line=line))
 
 

@@ -88,7 +88,7 @@ def save(order: dict[str, Any], orders: Orders) -> dict[str, Any]:
             "failed": f"{error.strerror or error}: {error.filename or run.checkpoints}",
             "iteration": order["iteration"],
         }
-    except Abandoned as error:
+    except (Abandoned, ValueError) as error:  # ValueError: EPOCH is damaged
         _give_up(writer, order)
         return {"failed": str(error), "iteration": order["iteration"]}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import uuid
 from collections.abc import Mapping, Sequence
@@ -98,8 +99,9 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     timeout = request.get("timeout") or document.get("timeout") or {}
     job_id = str(uuid.uuid4())
     is_array = bool(request.get("arrayProperties"))
-    run = needs.setting("MUSTER_RUN") or f"{name[:110]}-{job_id[:8]}"
-    _check_run(context, run, is_array)
+    named = needs.setting("MUSTER_RUN")
+    run = named or f"{name[:110]}-{job_id[:8]}"
+    _check_run(context, run, bool(named))
     if not request.get("dependsOn"):
         _check_source(context, needs.spec)
     return Job(
@@ -139,7 +141,8 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
     return properties
 
 
-def _check_run(context: Context, run: str, is_array: bool) -> None:
+def _check_run(context: Context, run: str, named: bool) -> None:
+    """``named``: the caller chose the name. Raises ClientError where it can't be a run's, or where a job writes that run now."""
     if not NAME.fullmatch(run):
         raise ClientError(f"MUSTER_RUN {run[:100]!r}: a run is named with letters, digits, '.', '_' and '-'")
     over = [Status.SUCCEEDED, Status.FAILED]
@@ -148,6 +151,9 @@ def _check_run(context: Context, run: str, is_array: bool) -> None:
         raise ClientError(
             f"run {run} is being written by job {holder.name} ({holder.id[:8]}); stop it first: muster stop {holder.id[:8]}"
         )
+    with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
+        if named and (writer := context.controller.peers.writer(context.controller.store.run(run))):
+            raise ClientError(f"run {run} is being written by {writer}; stop that job first")
 
 
 def _check_source(context: Context, spec: Mapping[str, Any] | None) -> None:

@@ -248,7 +248,10 @@ def test_a_damaged_epoch_file_is_told_in_one_line(node: Nodes) -> None:
     n = node()
     (n.run.path / "EPOCH").write_text("")
     assert n.call("true") == 2
-    assert n.stderr.read_text() == f"muster supervisor: {n.run.path}/EPOCH: expected a whole number, found ''\n"
+    assert (
+        n.stderr.read_text()
+        == f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
+    )
 
 
 def test_a_store_that_is_not_the_controllers_is_told_before_anything_starts(node: Nodes, tmp_path: Path) -> None:

@@ -260,7 +260,7 @@ def test_a_node_of_an_old_attempt_does_not_even_start(node: Nodes, tmp_path: Pat
     raise_epoch(n.run, 2)
     assert n.call("touch", str(tmp_path / "started")) == 3
     assert not (tmp_path / "started").exists()
-    assert sorted(os.listdir(n.run.path)) == ["EPOCH"]
+    assert {name.partition(".")[0] for name in os.listdir(n.run.path)} == {"EPOCH"}
     assert n.stderr.read_text().count("\n") == 1
 
 

@@ -1,0 +1,137 @@
+"""The controllers that use a store: each leaves a heartbeat there, and reads those of the others.
+
+Controllers of several homes may share a store, each with jobs of its own; a run that one of them writes is not started by another.
+Heartbeats are advice: what keeps two gangs apart is the epoch (:mod:`shared_store.epoch`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import socket
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from shared_store.epoch import read_claim, read_epoch
+from shared_store.files import read_json, write_json
+from shared_store.layout import NAME, Run, Store
+
+log = logging.getLogger("muster.controller")
+
+BEAT = 5.0
+"""Seconds between two heartbeats."""
+GONE = 30.0
+"""Seconds without a new heartbeat after which a controller counts as gone."""
+_OUTDATED = 3600.0
+"""Age of a heartbeat [s] that is not taken for a sign of life at first sight, however the clocks of the machines differ."""
+_LONGEST_NAME = 256
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A controller, as its heartbeat describes it."""
+
+    home: str
+    host: str
+    pid: int
+    beat: int
+    """Grows with every heartbeat."""
+    time: float
+    """Unix time [s] of the heartbeat, by that controller's clock."""
+
+    def __str__(self) -> str:
+        return f"the controller of {self.home} on {self.host} (pid {self.pid})"
+
+
+class Peers:
+    """This controller's heartbeat, in a thread of its own, and those of the others."""
+
+    def __init__(self, store: Store, home: Path) -> None:
+        self.store = store
+        self.id = hashlib.sha256(f"{socket.gethostname()}\0{home}".encode()).hexdigest()[:16]
+        self._home, self._directory = home, store.path / "controllers"
+        self._lock = threading.Lock()
+        self._seen: dict[str, tuple[Peer, float | None]] = {}
+        """By id: the newest heartbeat, and when it came (monotonic [s]); None where it was outdated at first sight."""
+        self._beat = 0
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="peers", daemon=True)
+
+    def start(self) -> None:
+        """Leave the first heartbeat; log a warning for each other controller that is present, now and later."""
+        self._look()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Withdraw the heartbeat."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(BEAT)
+        with contextlib.suppress(OSError):  # a volume that is away: the heartbeat goes out of date
+            self._path.unlink(missing_ok=True)
+
+    def writer(self, run: Run) -> str | None:
+        """Which attempt of another controller writes the run now, in words; None where none does.
+
+        Raises:
+            OSError, ValueError: The store can't be read, or the run's ``EPOCH`` is damaged.
+        """
+        claim = read_claim(run, read_epoch(run))
+        if claim is None or claim.controller == self.id or (peer := self._present(claim.controller)) is None:
+            return None
+        return f"job {claim.job[:8]} (attempt {claim.attempt}) of {peer}"
+
+    def _present(self, controller: str) -> Peer | None:
+        with self._lock:
+            peer, heard = self._seen.get(controller, (None, None))
+        return peer if heard is not None and time.monotonic() - heard < GONE else None
+
+    @property
+    def _path(self) -> Path:
+        return self._directory / f"{self.id}.json"
+
+    def _loop(self) -> None:
+        while not self._ending.wait(BEAT):
+            self._look()
+
+    def _look(self) -> None:
+        """Leave a heartbeat and read the others'; where the store is away, the next one comes in time."""
+        self._beat += 1
+        own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, time.time())
+        try:
+            write_json(self._path, asdict(own))
+            names = [name.removesuffix(".json") for name in os.listdir(self._directory)]
+        except OSError:
+            return
+        for name in names:
+            if name != self.id and NAME.fullmatch(name) and (peer := self._read(name)):
+                self._note(name, peer)
+
+    def _read(self, name: str) -> Peer | None:
+        try:
+            value = read_json(self._directory / f"{name}.json") or {}
+            home, host = str(value["home"])[:_LONGEST_NAME], str(value["host"])[:_LONGEST_NAME]
+            return Peer(home, host, int(value["pid"]), int(value["beat"]), float(value["time"]))
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+            return None
+
+    def _note(self, name: str, peer: Peer) -> None:
+        before, heard = self._seen.get(name, (None, None))
+        if before == peer:
+            return
+        outdated = before is None and abs(time.time() - peer.time) > _OUTDATED
+        if outdated:  # left by one that was killed; one that lives writes it again
+            with contextlib.suppress(OSError):
+                (self._directory / f"{name}.json").unlink(missing_ok=True)
+        with self._lock:
+            self._seen[name] = peer, None if outdated else time.monotonic()
+        if heard is None and not outdated:
+            log.warning(
+                "%s uses the store %s too: each runs jobs of its own, and neither starts a run that the other is writing",
+                peer,
+                self.store.path,
+            )
