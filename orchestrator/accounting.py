@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from sqlalchemy import delete, or_, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from orchestrator.jobs import Ending, Status
 from orchestrator.scheduling import decayed
@@ -88,7 +88,10 @@ def forget_before(session: Session, moment: int, most: int = 500) -> int:
     open_jobs = select(Job.id).where(Job.status.not_in([Status.SUCCEEDED, Status.FAILED]))
     needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))
     alone = or_(Job.parent.is_(None), Job.parent.not_in(open_jobs))
-    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone)
+    child = aliased(Job)
+    # after its children, which have their definition from it
+    last = or_(Job.kind != "array", ~select(child.id).where(child.parent == Job.id).exists())
+    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone, last)
     query = query.order_by(Job.stopped_at).limit(most)
     ids = list(session.scalars(query))
     for table, column in ((Attempt, Attempt.job_id), (Dependency, Dependency.job_id), (Job, Job.id)):

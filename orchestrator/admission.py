@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.accounting import usage_now
-from orchestrator.definition import gang_needs
+from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import Host, Placement, engine_of
 from orchestrator.pools import pool_engine
 from orchestrator.scheduling import FairShare, Leading, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
@@ -46,6 +46,7 @@ def take_snapshot(
     pools = {each.name: read_pool(each, first) for each in session.scalars(select(ComputeEnvironment))}
     holding = open_attempts(session, active)
     counted = [(job, attempt) for job, attempt in holding if engine_of(attempt.nodes[0]["host"]) not in queueing]
+    facts: dict[int, GangNeeds] = {}
     decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
     return Snapshot(
         now=now(),
@@ -53,7 +54,7 @@ def take_snapshot(
         pools=pools,
         queues=queues,
         waiting=waiting,
-        running=[_running(job, attempt) for job, attempt in counted],
+        running=[_running(job, attempt, facts) for job, attempt in counted],
         usage=usage_now(session, decays, holding),
         leading=leading or {},
     )
@@ -106,8 +107,11 @@ def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
     return tuple(Placement(node["host"], tuple(node["gpus"]), node["cpus"], node["memory"]) for node in attempt.nodes)
 
 
-def _running(job: Job, attempt: Attempt) -> Running:
-    needs = gang_needs(job.node_properties)
+def _running(job: Job, attempt: Attempt, facts: dict[int, GangNeeds]) -> Running:
+    """``facts``: what was read already, by the definition's identity; the children of an array share one."""
+    properties = job.node_properties
+    if (needs := facts.get(id(properties))) is None:
+        needs = facts[id(properties)] = gang_needs(properties)
     return Running(
         job=job.id,
         name=job.name,

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session, selectinload
 from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.bus import Bus
-from orchestrator.database import Database, DatabaseError
+from orchestrator.database import Database, DatabaseError, ask_to_end
 from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs
 from orchestrator.jobs import Ending, Status
@@ -30,6 +30,8 @@ from shared_store.layout import Store
 
 _SETTLED_AT_ONCE = 200
 """Jobs a commit, of those that only change their state."""
+_SETTLED_A_TICK = 1000
+"""The same in one pass: a large array that ends must not keep running gangs from being looked at."""
 _GATHERING = 0.02
 """Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
 _PASS_INTERVAL = 1.0
@@ -65,6 +67,7 @@ class Controller:
         self.submissions = Together(database, self.writing)
         bus.changed = self.wake
         database.committed = self._committed
+        database.changed = self.roster.look_again
         self._board: Board | None = None
         self._leading: Mapping[str, Leading] = {}
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
@@ -112,7 +115,9 @@ class Controller:
         self._keep_database()
         with self.database.session() as session:
             self.roster.take_dependents(session)
-        due = self.roster.take_due()
+        due = self.roster.take_due(_SETTLED_A_TICK)
+        if len(due) == _SETTLED_A_TICK:
+            self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
             self._guarded(due[start : start + _SETTLED_AT_ONCE], self._settle)
         for job_id in self.roster.active():
@@ -292,9 +297,7 @@ class Controller:
 
     def drain(self, session: Session, queue: JobQueue) -> None:
         """Ask all jobs of a queue to end."""
-        over = [Status.SUCCEEDED, Status.FAILED]
-        for job in session.scalars(select(Job).where(Job.queue == queue.name, Job.status.not_in(over))):
-            job.stop_reason = job.stop_reason or f"job queue {queue.name} was deleted"
+        ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
     def _sweep(self) -> None:
         """Remove deleted queues that are empty, and history that is older than it is kept."""

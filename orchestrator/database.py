@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,11 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, create_engine, event, inspect, select, text
+from sqlalchemy import ColumnElement, Connection, and_, create_engine, event, inspect, select, text, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from orchestrator.jobs import Status
 from orchestrator.tables import Attempt, Base, Job, now
 
 __all__ = ["Attempt", "Base", "Database", "DatabaseError", "Job", "find_job", "now"]
@@ -38,6 +39,8 @@ class Database:
             DatabaseError: It can't be reached, is of a newer Muster, or another controller has it (PostgreSQL).
         """
         self.committed: Callable[[Sequence[Job]], None] | None = None
+        self.changed: Callable[[Collection[str]], None] | None = None
+        """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self._lock: Connection | None = None
         try:
             self.engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
@@ -132,15 +135,32 @@ class _Session(Session):
 
 @event.listens_for(_Session, "after_commit")
 def _tell(session: Session) -> None:
-    jobs = session.info.pop("jobs", None)
-    committed = session.info["database"].committed
-    if jobs and committed:
-        committed(list(jobs.values()))
+    jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
+    database = session.info["database"]
+    if jobs and database.committed:
+        database.committed(list(jobs.values()))
+    if ids and database.changed:
+        database.changed(ids)
 
 
 @event.listens_for(_Session, "after_rollback")
 def _forget(session: Session) -> None:
     session.info.pop("jobs", None)
+    session.info.pop("ids", None)
+
+
+def note_changed(session: Session, ids: Iterable[str]) -> None:
+    """Have the controller look at these jobs after the commit: they were changed by a statement, not as objects."""
+    session.info.setdefault("ids", {}).update(dict.fromkeys(ids))
+
+
+def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, cancelled: bool = False) -> None:
+    """Ask the jobs ``which`` that are not over to end, in one statement; one that was asked already keeps its reason."""
+    over = [Status.SUCCEEDED, Status.FAILED]
+    asked = and_(which, Job.status.not_in(over), Job.stop_reason.is_(None))
+    note_changed(session, session.scalars(select(Job.id).where(asked)))
+    changes = {"stop_reason": reason, **({"cancelled": True} if cancelled else {})}
+    session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
 
 
 @event.listens_for(_Session, "after_flush")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Sequence
+from itertools import islice
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -29,6 +30,8 @@ class Roster:
         self._due: dict[str, None] = {}
         self._ended: dict[str, None] = {}
         self._shapes: dict[Shape, Shape] = {}
+        self._arrays: dict[str, Shape] = {}
+        """Of the children of each array, which all have the same."""
         self.version = 0
         """Grows whenever something changes that a scheduling pass depends on."""
 
@@ -54,6 +57,7 @@ class Roster:
             group.pop(job.id, None)
         if job.is_over:
             self._ended[job.id] = None
+            self._arrays.pop(job.id, None)
             if job.parent is not None:
                 self._due[job.parent] = None
         elif job.status in (Status.STARTING, Status.RUNNING):
@@ -66,10 +70,12 @@ class Roster:
         if before != (job.id in self._waiting, job.id in self._active):
             self.version += 1
 
-    def take_due(self) -> Sequence[str]:
-        """The jobs to be looked at once, oldest note first; each is handed out once."""
+    def take_due(self, most: int | None = None) -> Sequence[str]:
+        """The jobs to be looked at once, oldest note first, at most so many; each is handed out once."""
         with self._lock:
-            due, self._due = list(self._due), {}
+            due = list(islice(self._due, most))
+            for job in due:
+                del self._due[job]
         return due
 
     def look_again(self, jobs: Iterable[str]) -> None:
@@ -106,7 +112,11 @@ class Roster:
         return entry.since if entry else None
 
     def _entry(self, job: Job) -> Waiting:
-        shape = gang_needs(job.node_properties).shape
-        shape = self._shapes.setdefault(shape, shape)
+        shape = self._arrays.get(job.parent or "")
+        if shape is None:
+            shape = gang_needs(job.node_properties).shape
+            shape = self._shapes.setdefault(shape, shape)
+        if job.parent is not None:
+            self._arrays[job.parent] = shape
         since = job.runnable_at or job.created_at
         return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, job.created_at, since, job.timeout)

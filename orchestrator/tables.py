@@ -6,7 +6,7 @@ Times are Unix milliseconds, as in the Batch API. A change here needs a migratio
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, Index, String
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
@@ -18,6 +18,10 @@ from orchestrator.jobs import Status, check_transition
 def now() -> int:
     """Unix time [ms], the unit of every time in the database and in the Batch API."""
     return int(time.time() * 1000)
+
+
+_T = TypeVar("_T")
+_JSON_OR_NULL = JSON(none_as_null=True)
 
 
 class Base(DeclarativeBase):
@@ -89,6 +93,24 @@ class SchedulingPolicy(Base):
     created_at: Mapped[int] = mapped_column(default=now)
 
 
+class _OfArray(Generic[_T]):
+    """A fact that the children of an array share: stored with the array once, however many children it has."""
+
+    def __init__(self, own: str) -> None:
+        """``own``: the column that holds it; NULL in a child."""
+        self._own = own
+
+    def __get__(self, job: Job | None, owner: type[Job]) -> _T:
+        if job is None:
+            return self  # type: ignore[return-value]  # how SQLAlchemy looks at a class
+        holder = job if job.array is None else job.array
+        value: _T = getattr(holder, self._own)
+        return value
+
+    def __set__(self, job: Job, value: _T) -> None:
+        setattr(job, self._own, value)
+
+
 class Job(Base):
     """A submitted job: a multi-node job, a single-node one, an array of such, or one child of an array."""
 
@@ -107,7 +129,8 @@ class Job(Base):
     """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
     request: Mapped[dict[str, Any]]
     """SubmitJob as it came; empty for an array's child."""
-    node_properties: Mapped[dict[str, Any]]
+    own_node_properties: Mapped[dict[str, Any] | None] = mapped_column("node_properties", _JSON_OR_NULL)
+    node_properties = _OfArray[dict[str, Any]]("own_node_properties")
     """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
     run: Mapped[str] = mapped_column(index=True)
     status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
@@ -118,7 +141,10 @@ class Job(Base):
     started_at: Mapped[int | None] = mapped_column(default=None)
     stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
     attempts_allowed: Mapped[int] = mapped_column(default=1)
-    evaluate_on_exit: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
+    own_evaluate_on_exit: Mapped[list[dict[str, Any]] | None] = mapped_column(
+        "evaluate_on_exit", _JSON_OR_NULL, default=list
+    )
+    evaluate_on_exit = _OfArray[list[dict[str, Any]]]("own_evaluate_on_exit")
     timeout: Mapped[int | None] = mapped_column(default=None)
     """Seconds of each attempt."""
     stop_reason: Mapped[str | None] = mapped_column(default=None)
@@ -129,8 +155,10 @@ class Job(Base):
     share: Mapped[str | None] = mapped_column(default=None)
     priority: Mapped[int] = mapped_column(default=0)
     """Within its share; greater is served first."""
-    parameters: Mapped[dict[str, str]] = mapped_column(default=dict)
-    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    own_parameters: Mapped[dict[str, str] | None] = mapped_column("parameters", _JSON_OR_NULL, default=dict)
+    parameters = _OfArray[dict[str, str]]("own_parameters")
+    own_tags: Mapped[dict[str, str] | None] = mapped_column("tags", _JSON_OR_NULL, default=dict)
+    tags = _OfArray[dict[str, str]]("own_tags")
     parent: Mapped[str | None] = mapped_column(default=None, index=True)
     array_index: Mapped[int | None] = mapped_column(default=None)
     array_size: Mapped[int | None] = mapped_column(default=None)
@@ -142,6 +170,11 @@ class Job(Base):
     dependencies: Mapped[list[Dependency]] = relationship(
         foreign_keys="Dependency.job_id", order_by="Dependency.on_id", cascade="all, delete-orphan"
     )
+
+    array: Mapped[Job | None] = relationship(
+        primaryjoin="foreign(Job.parent) == remote(Job.id)", viewonly=True, lazy="selectin", join_depth=1
+    )
+    """The array that it is a child of."""
 
     @validates("status_reason", "stop_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:

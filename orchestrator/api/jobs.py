@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import selectinload
 
 from orchestrator.api import auth
@@ -14,10 +14,11 @@ from orchestrator.api.context import Context
 from orchestrator.api.describe import array_properties, describe_job, summarize
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import decode, encode, page, page_size
+from orchestrator.database import ask_to_end
+from orchestrator.excerpts import LONGEST_REASON
 from orchestrator.jobs import Status
 from orchestrator.tables import Job
 
-_LONGEST_REASON = 1024
 _MOST_ENDED = 50
 """Jobs that TerminateJobs and CancelJobs take."""
 _BEFORE_NAME = len(definition_arn("", 1)) - 1
@@ -135,14 +136,14 @@ def _by_definition(value: str) -> Any:
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; a job that does not run yet is cancelled; one that is over stays so."""
     _check_reason(request, "TerminateJob")
-    _terminate(_targets(context, request["jobId"], "TerminateJob"), request["reason"])
+    _terminate(context, _target(context, request["jobId"], "TerminateJob"), request["reason"])
     return {}
 
 
 def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
     _check_reason(request, "CancelJob")
-    _cancel(_targets(context, request["jobId"], "CancelJob"), request["reason"])
+    _cancel(context, _target(context, request["jobId"], "CancelJob"), request["reason"])
     return {}
 
 
@@ -157,7 +158,10 @@ def cancel_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _each(
-    context: Context, request: Mapping[str, Any], operation: str, end: Callable[[Sequence[Job], str], None]
+    context: Context,
+    request: Mapping[str, Any],
+    operation: str,
+    end: Callable[[Context, ColumnElement[bool], str], None],
 ) -> dict[str, Any]:
     """What became of each job; as on AWS, one that does not exist counts as ended."""
     _check_reason(request, operation)
@@ -167,7 +171,7 @@ def _each(
     errors: list[dict[str, str]] = []
     for reference in request["jobs"]:
         try:
-            end(_targets(context, reference, operation), request["reason"])
+            end(context, _target(context, reference, operation), request["reason"])
         except UnknownJob:
             pass
         except ClientError as error:
@@ -178,16 +182,12 @@ def _each(
     return {"successful": successful, "errors": errors}
 
 
-def _terminate(jobs: Sequence[Job], reason: str) -> None:
-    for job in jobs:
-        if not job.is_over and job.stop_reason is None:
-            job.stop_reason = reason
+def _terminate(context: Context, target: ColumnElement[bool], reason: str) -> None:
+    ask_to_end(context.session, target, reason)
 
 
-def _cancel(jobs: Sequence[Job], reason: str) -> None:
-    for job in jobs:
-        if job.status in _EARLY and job.stop_reason is None:
-            job.stop_reason, job.cancelled = reason, True
+def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
+    ask_to_end(context.session, and_(target, Job.status.in_(_EARLY)), reason, cancelled=True)
 
 
 class UnknownJob(ClientError):
@@ -195,12 +195,12 @@ class UnknownJob(ClientError):
 
 
 def _check_reason(request: Mapping[str, Any], operation: str) -> None:
-    if len(request["reason"]) > _LONGEST_REASON:
-        raise ClientError(f"{operation}: the reason is longer than {_LONGEST_REASON} characters")
+    if len(request["reason"]) > LONGEST_REASON:
+        raise ClientError(f"{operation}: the reason is longer than {LONGEST_REASON} characters")
 
 
-def _targets(context: Context, reference: str, operation: str) -> Sequence[Job]:
-    """The job; an array's children too. Raises ClientError, UnknownJob."""
+def _target(context: Context, reference: str, operation: str) -> ColumnElement[bool]:
+    """The row of the job; of an array those of its children too. Raises ClientError, UnknownJob."""
     job_id, node = split_reference(reference)
     if node is not None:
         raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
@@ -208,10 +208,7 @@ def _targets(context: Context, reference: str, operation: str) -> Sequence[Job]:
     if job is None:
         raise UnknownJob(f"Job {reference[:300]} does not exist")
     auth.current_identity.get().check_queue(job.queue)
-    if job.kind != "array":
-        return [job]
-    over = [Status.SUCCEEDED, Status.FAILED]
-    return [job, *context.session.scalars(select(Job).where(Job.parent == job.id, Job.status.not_in(over)))]
+    return or_(Job.id == job.id, Job.parent == job.id) if job.kind == "array" else Job.id == job.id
 
 
 def _count_children(context: Context, job: Job) -> Mapping[str, int]:

@@ -8,13 +8,15 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import BigInteger, ColumnElement, String, cast, insert, literal, select
+from sqlalchemy.orm import Session
 
 from orchestrator.api import auth, rules
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
 from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.members import check_consumables
+from orchestrator.database import note_changed
 from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
 from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, now
@@ -22,6 +24,7 @@ from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
 _ARRAY_SIZES = range(2, 10_001)
+WAITING = "waiting for the scheduler"
 _KEY = re.compile(r"[\x21-\x7e]{1,128}")
 
 
@@ -168,45 +171,76 @@ def _release(job: Job) -> None:
     """A job that waits for nobody is RUNNABLE with the commit that stores it: a second commit would cost as much again."""
     job.status = Status.SUBMITTED
     if not job.dependencies:
-        job.move(Status.RUNNABLE, "waiting for the scheduler")
+        job.move(Status.RUNNABLE, WAITING)
 
 
 def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> None:
-    """The children of an array: jobs of their own, by index."""
+    """The array and its children, jobs of their own by index; what the children share is stored with the array alone."""
     size = request["arrayProperties"].get("size", 0)
     if size not in _ARRAY_SIZES:
         raise ClientError(f"arrayProperties size is {size}; it must be 2 to 10000")
     if gang_needs(parent.node_properties).setting("MUSTER_RUN"):
         raise ClientError("MUSTER_RUN is for one job; the children of an array have runs of their own")
     parent.array_size = size
-    shared = (
-        *("name", "queue", "definition", "node_properties", "attempts_allowed", "evaluate_on_exit"),
-        *("timeout", "share", "priority", "parameters", "tags", "array_size", "created_at"),
-    )
-    values = {key: getattr(parent, key) for key in shared}
     waits = _dependencies(context, request, size)
-    for index in range(size):
-        child = Job(
-            id=f"{parent.id}:{index}",
-            kind="container",
-            request={},
-            run=f"{parent.run}-{index}",
-            parent=parent.id,
-            array_index=index,
-            **values,
-        )
-        for each in waits:
-            on = each.on_id
-            if each.kind == "N_TO_N":
-                on = f"{on}:{index}"
-            elif each.kind == "SEQUENTIAL":
-                if index == 0:
-                    continue
-                on = f"{parent.id}:{index - 1}"
-            child.dependencies.append(Dependency(on_id=on, kind=each.kind))
-        _release(child)
-        context.session.add(child)
     parent.dependencies.extend(each for each in waits if each.kind != "SEQUENTIAL")
+    context.session.add(parent)
+    context.session.flush()
+    free = size if not waits else 1 if all(each.kind == "SEQUENTIAL" for each in waits) else 0
+    ready = {"status": Status.RUNNABLE, "status_reason": WAITING, "runnable_at": parent.created_at}
+    _insert_children(context.session, parent, range(free), ready)
+    _insert_children(context.session, parent, range(free, size), {"status": Status.SUBMITTED})
+    for each in waits:
+        _insert_waits(context.session, parent, each, size)
+    note_changed(context.session, (f"{parent.id}:{index}" for index in range(size)))
+
+
+def _insert_children(session: Session, parent: Job, indices: range, state: Mapping[str, Any]) -> None:
+    """The children of these indices, in one statement: ten thousand must not hold up other submissions."""
+    if not indices:
+        return
+    index = _numbers(indices)
+    copied = ("name", "queue", "definition", "attempts_allowed", "timeout", "share", "priority", "array_size")
+    same = {
+        **{name: getattr(parent, name) for name in copied},
+        **{
+            "kind": "container",
+            "request": {},
+            "parent": parent.id,
+            "created_at": parent.created_at,
+            "cancelled": False,
+        },
+        **state,
+    }
+    table = Job.metadata.tables["jobs"]
+    values: dict[str, ColumnElement[Any]] = {
+        **{name: literal(value, table.c[name].type) for name, value in same.items() if value is not None},
+        "id": literal(f"{parent.id}:", String) + cast(index, String),
+        "run": literal(f"{parent.run}-", String) + cast(index, String),
+        "array_index": index,
+    }
+    session.execute(insert(table).from_select(list(values), select(*values.values()), include_defaults=False))
+
+
+def _insert_waits(session: Session, parent: Job, wait: Dependency, size: int) -> None:
+    """What each child waits for, of one entry of ``dependsOn``."""
+    index = _numbers(range(1, size) if wait.kind == "SEQUENTIAL" else range(size))
+    on: ColumnElement[Any] = literal(wait.on_id, String)
+    if wait.kind == "N_TO_N":
+        on = literal(f"{wait.on_id}:", String) + cast(index, String)
+    elif wait.kind == "SEQUENTIAL":
+        on = literal(f"{parent.id}:", String) + cast(index - 1, String)
+    child = literal(f"{parent.id}:", String) + cast(index, String)
+    rows = select(child, on, literal(wait.kind, String))
+    session.execute(insert(Dependency).from_select(["job_id", "on_id", "kind"], rows))
+
+
+def _numbers(numbers: range) -> ColumnElement[int]:
+    """The column of a table that has these whole numbers as its rows."""
+    first = select(literal(numbers.start, BigInteger).label("number")).cte("numbers", recursive=True)
+    step = select(first.c.number + 1).where(first.c.number < numbers.stop - 1)
+    column: ColumnElement[int] = first.union_all(step).c.number
+    return column
 
 
 def _dependencies(context: Context, request: Mapping[str, Any], size: int | None) -> Sequence[Dependency]:

@@ -1,0 +1,86 @@
+"""However large a request, what it makes and what it is answered stay within limits, and others are served meanwhile."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import func, select
+
+from orchestrator.server import Server
+from orchestrator.tables import Job
+from tests.conftest import wait_for
+
+RESOURCES = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+LARGE = [{"name": f"A{number}", "value": "x" * 200} for number in range(90)]
+
+
+@pytest.fixture(scope="module")
+def waiting(http: httpx.Client) -> str:
+    """A queue whose jobs don't start."""
+    resources = {"type": "EC2", "maxvCpus": 1, "subnets": ["none"]}
+    environment = {"computeEnvironmentName": "off", "type": "MANAGED", "state": "DISABLED"}
+    call(http, "CreateComputeEnvironment", **environment, computeResources=resources)
+    order = [{"order": 1, "computeEnvironment": "off"}]
+    call(http, "CreateJobQueue", jobQueueName="waiting", priority=1, computeEnvironmentOrder=order)
+    return "waiting"
+
+
+def call(http: httpx.Client, operation: str, **request: Any) -> dict[str, Any]:
+    answer = http.post(f"/v1/{operation.lower()}", json=request)
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def large_array(http: httpx.Client, queue: str, size: int, **request: Any) -> str:
+    container = {"image": "any", "command": ["true"], "environment": LARGE, "resourceRequirements": RESOURCES}
+    call(http, "RegisterJobDefinition", jobDefinitionName="large", type="container", containerProperties=container)
+    submission = {"jobName": "large", "jobQueue": queue, "jobDefinition": "large", "arrayProperties": {"size": size}}
+    return str(call(http, "SubmitJob", **submission, **request)["jobId"])
+
+
+def test_an_array_stores_its_definition_once_and_each_child_shows_it(
+    inside: Server, http: httpx.Client, waiting: str
+) -> None:
+    array = large_array(http, waiting, 3_000, parameters={"a": "b"}, tags={"c": "d"})
+    with inside.controller.database.session() as session:
+        copies = select(func.count(Job.own_node_properties), func.count()).where(Job.parent == array)
+        assert session.execute(copies).one() == (0, 3_000)
+    parent, first, last = call(http, "DescribeJobs", jobs=[array, f"{array}:0", f"{array}:2999"])["jobs"]
+    assert first["container"]["environment"] == last["container"]["environment"] == LARGE
+    assert (last["parameters"], last["tags"]) == (parent["parameters"], parent["tags"]) == ({"a": "b"}, {"c": "d"})
+    assert last["arrayProperties"] == {"index": 2999, "size": 3_000}
+    call(http, "TerminateJob", jobId=array, reason="enough")
+    call(http, "CancelJob", jobId=array, reason="too late")
+    with inside.controller.database.session() as session:
+        reasons = select(Job.stop_reason, Job.cancelled).where(Job.parent == array).distinct()
+        assert [tuple(row) for row in session.execute(reasons)] == [("enough", False)]
+    wait_for(
+        lambda: all(each["status"] == "FAILED" for each in call(http, "DescribeJobs", jobs=[array])["jobs"]),
+        60,
+        "the end",
+    )
+    ended = call(http, "DescribeJobs", jobs=[array, f"{array}:77"])["jobs"]
+    assert [(each["status"], each["statusReason"]) for each in ended] == [("FAILED", "enough")] * 2
+
+
+def test_the_children_of_an_array_wait_for_each_other_and_for_others_as_asked(
+    inside: Server, http: httpx.Client, waiting: str
+) -> None:
+    first = large_array(http, waiting, 3, dependsOn=[{"type": "SEQUENTIAL"}])
+    second = large_array(http, waiting, 3, dependsOn=[{"type": "N_TO_N", "jobId": first}])
+
+    def waits(job: str) -> list[tuple[str, str | None]]:
+        [detail] = call(http, "DescribeJobs", jobs=[job])["jobs"]
+        return [(each["jobId"], each.get("type")) for each in detail["dependsOn"]]
+
+    assert [waits(f"{first}:{index}") for index in range(3)] == [
+        [],
+        [(f"{first}:0", "SEQUENTIAL")],
+        [(f"{first}:1", "SEQUENTIAL")],
+    ]
+    assert waits(f"{second}:2") == [(f"{first}:2", "N_TO_N")]
+    for job in (first, second):
+        call(http, "TerminateJob", jobId=job, reason="done with")
