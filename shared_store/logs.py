@@ -33,6 +33,8 @@ _MOST = 8 << 20
 LIMIT_REACHED = "the log reached its limit"
 REPLACED = "the log was truncated or replaced; following goes on from its new beginning"
 
+END_LINE = "node {node} ended: {reason}"
+"""The supervisor's last line: no output of the job, so CloudWatch Logs does not show it."""
 OUTCOME_LINE = "muster-outcome "
 """How the last line begins that a supervisor prints where its log leaves the node as text (AWS); the outcome follows as JSON."""
 

@@ -22,7 +22,7 @@ from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
-from shared_store.logs import format_line, format_lines
+from shared_store.logs import END_LINE, format_line, format_lines
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
 from worker.bus import Command, NodeBus
 from worker.network import interface_of
@@ -98,7 +98,7 @@ class Supervisor:
             reap_orphans()
             self._drain()
             outcome = self._outcome(started)
-        self.write(None, "o", f"node {self.contract.node_index} ended: {outcome.reason}")
+        self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
         code = self._commit(outcome)
         self.bus.close()
         return code

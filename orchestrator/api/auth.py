@@ -25,6 +25,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from orchestrator.api import elsewhere
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import Body, RateLimit
 from orchestrator.excerpts import LONGEST_ERROR, excerpt
@@ -32,7 +33,6 @@ from orchestrator.keys import Key, KeyStore
 
 SKEW = 15 * 60
 """Seconds that a signature's time may differ from the server's."""
-_SERVICES = ("batch", "logs")
 _ALGORITHM = "AWS4-HMAC-SHA256"
 _READS = ("describe", "list", "get", "filter", "startlivetail")
 """How operations begin (lower case) that change nothing."""
@@ -120,6 +120,9 @@ class Guard:
             await self.app(scope, receive, send)
             return
         request = _Request(scope)
+        if scope["type"] == "http" and (service := request.foreign_service) is not None:
+            await elsewhere.refusal(service, request.first_of_each())(scope, receive, send)
+            return
         body = Body(receive, request.first("content-length"), request.operation)
         try:
             identity = await self._admit(request, body)
@@ -231,6 +234,14 @@ class _Request:
         values = self.headers.get(name)
         return values[0].decode("latin-1") if values else None
 
+    def first_of_each(self) -> dict[str, str]:
+        return {name: values[0].decode("latin-1") for name, values in self.headers.items()}
+
+    @property
+    def foreign_service(self) -> str | None:
+        """The AWS service that the request is meant for, where it is none of ours."""
+        return elsewhere.foreign_service(self.method, self.path, self.query, self.first_of_each())
+
     def single(self, name: str) -> str | None:
         """A header that decides about access. Raises Refusal where it was sent twice: which one would count?"""
         if len(self.headers.get(name, ())) > 1:
@@ -292,11 +303,11 @@ class Claim:
             if not parts.get(name):
                 raise Refusal("IncompleteSignature", f"Authorization header requires {name!r} parameter")
         scope = parts["Credential"].split("/")
-        if len(scope) != 5 or scope[4] != "aws4_request" or scope[3] not in _SERVICES:
+        if len(scope) != 5 or scope[4] != "aws4_request" or scope[3] not in elsewhere.OURS:
             raise Refusal(
                 "IncompleteSignature",
                 f"Credential {parts['Credential'][:160]!r}: expected KEY/DATE/REGION/SERVICE/aws4_request with service "
-                f"{' or '.join(_SERVICES)}",
+                f"{' or '.join(elsewhere.OURS)}",
             )
         signed = tuple(sorted(set(parts["SignedHeaders"].lower().split(";"))))
         return cls(scope[0], scope[1], scope[2], scope[3], signed, parts["Signature"])

@@ -23,6 +23,8 @@ from typing import NamedTuple
 from shared_store.log_files import Segment, left_out, read_log, segments_of
 from shared_store.logs import LIMIT_REACHED, REPLACED
 
+from shared_store.logs import END_LINE
+
 _BLOCK = 32 << 10
 """Bytes between two marks."""
 _READ = 1 << 20
@@ -31,8 +33,10 @@ _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
 
 _STAMP = rb"(?:19[7-9]\d|2[01]\d\d)-(?:0[1-9]|1[0-2])-(?:0[1-9]|[12]\d|3[01])T(?:[01]\d|2[0-3]):[0-5]\d:[0-5]\d\.\d{6}Z"
-_LINE = re.compile(rb"(" + _STAMP + rb") (?:-|\d+) [oe] (.*)", re.DOTALL)
-_STAMPS = re.compile(rb"^(" + _STAMP + rb") (?:-|\d+) [oe] ", re.MULTILINE)
+_SOURCE = rb" (?!- o " + END_LINE.format(node=r"\d+", reason="").encode() + rb")(?:-|\d+) [oe] "
+"""Rank and stream of a line that is an event: the supervisor's last line is none."""
+_LINE = re.compile(rb"(" + _STAMP + rb")" + _SOURCE + rb"(.*)", re.DOTALL)
+_STAMPS = re.compile(rb"^(" + _STAMP + rb")" + _SOURCE, re.MULTILINE)
 
 
 class Event(NamedTuple):

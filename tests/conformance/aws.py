@@ -86,7 +86,7 @@ class Batch:
 
     def stream(self, name: str) -> list[str]:
         page = self.logs.get_log_events(logGroupName=GROUP, logStreamName=name, startFromHead=True)
-        return [event["message"] for event in page["events"] if not event["message"].startswith("node ")]
+        return [event["message"] for event in page["events"]]
 
     def front(self, queue: str) -> list[str]:
         """Ids of the waiting jobs in the order in which GetJobQueueSnapshot shows them."""
