@@ -21,9 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.log_files import Segment, left_out, read_log, segments_of
-from shared_store.logs import LIMIT_REACHED, REPLACED
-
-from shared_store.logs import END_LINE
+from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""
