@@ -65,7 +65,8 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
     found = []
     for job_id in jobs:
         job = session.get(Job, job_id)
-        if job is not None and (attempt := job.open_attempt) is not None:
+        # a damaged row has no nodes: what it holds is not known, and the controller says so of the job
+        if job is not None and (attempt := job.open_attempt) is not None and attempt.nodes:
             found.append((job, attempt))
     return found
 
@@ -110,7 +111,8 @@ def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
 def _running(job: Job, attempt: Attempt, facts: dict[int, GangNeeds]) -> Running:
     """``facts``: what was read already, by the definition's identity; the children of an array share one."""
     properties = job.node_properties
-    if (needs := facts.get(id(properties))) is None:
+    needs = facts.get(id(properties))
+    if needs is None and properties:  # empty where the row is damaged, which the controller says of the job
         needs = facts[id(properties)] = gang_needs(properties)
     return Running(
         job=job.id,
@@ -122,6 +124,6 @@ def _running(job: Job, attempt: Attempt, facts: dict[int, GangNeeds]) -> Running
         placements=placements_of(attempt),
         started_at=attempt.started_at,
         timeout=job.timeout,
-        preemptible=needs.setting("MUSTER_PREEMPTIBLE") == "1",
+        preemptible=needs is not None and needs.setting("MUSTER_PREEMPTIBLE") == "1",
         ending=attempt.ending is not None or job.stop_reason is not None,
     )

@@ -9,21 +9,24 @@ import logging
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from functools import partial
 
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
+from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
 from orchestrator.database import Database, DatabaseError, ask_to_end
+from orchestrator.definition import gang_needs
 from orchestrator.engines.several import Several
-from orchestrator.gangs import Gangs
+from orchestrator.gangs import Gangs, StoreUnavailable
 from orchestrator.jobs import Ending, Status
 from orchestrator.peers import Peers
 from orchestrator.roster import Roster
-from orchestrator.scheduling import Board, Decisions, Leading, decide
+from orchestrator.scheduling import Board, Cancel, Decisions, Leading, Preempt, Start, decide
 from orchestrator.tables import Job, JobQueue, now
 from orchestrator.together import Together
 from shared_store.layout import Store
@@ -65,15 +68,18 @@ class Controller:
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
         self.submissions = Together(database, self.writing)
-        bus.changed = self.wake
+        bus.changed = engine.changed = self.wake
         database.committed = self._committed
-        database.changed = self.roster.look_again
+        database.changed = self._look_again
         self._board: Board | None = None
         self._leading: Mapping[str, Leading] = {}
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
         self._swept = self._kept = 0.0
         self._wake, self._ending = threading.Event(), threading.Event()
-        self._troubles: dict[str, str] = {}
+        self.trouble: str | None = None
+        """Why the database can't be used at present: nothing is launched, and no request is accepted."""
+        self._backoff = Backoff(log)
+        """By job, what goes wrong with it; ``("start", job)`` where it is its start."""
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
         with database.session() as session:
             self.roster.load(session)
@@ -91,18 +97,12 @@ class Controller:
         """Leave the loop; running gangs go on, and the next controller on this database finds them."""
         self._ending.set()
         self._wake.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
 
     def _loop(self) -> None:
         while not self._ending.is_set():
-            try:
-                self.tick()
-            except DatabaseError as error:
-                if self._troubles.get("") != str(error):
-                    log.error("%s; doing nothing until it is free", error)
-                self._troubles[""] = str(error)
-            except Exception:
-                log.exception("reconciling failed; trying again")
+            self._isolated("reconciling", self.tick)
             if self._wake.wait(self.interval):
                 self._ending.wait(_GATHERING)
             self._wake.clear()
@@ -110,49 +110,82 @@ class Controller:
     def tick(self) -> None:
         """One pass over every job that needs a look; one that can't be handled now does not hold up the others.
 
-        Raises DatabaseError where another controller has taken the database over.
+        Raises DatabaseError where the database can't be used; the next pass tries again.
         """
         self._keep_database()
         with self.database.session() as session:
             self.roster.take_dependents(session)
-        due = self.roster.take_due(_SETTLED_A_TICK)
-        if len(due) == _SETTLED_A_TICK:
+        taken = self.roster.take_due(_SETTLED_A_TICK)
+        due = [job_id for job_id in taken if not self._backoff.waits(job_id)]
+        self.roster.look_again(job_id for job_id in taken if self._backoff.waits(job_id))
+        if due and len(taken) == _SETTLED_A_TICK:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
             self._guarded(due[start : start + _SETTLED_AT_ONCE], self._settle)
         for job_id in self.roster.active():
-            self._guarded([job_id], self._advance)
-        self._admit()
-        self._sweep()
+            if not self._backoff.waits(job_id):
+                self._guarded([job_id], self._advance)
+        self._isolated("scheduling", self._admit)
+        self._isolated("clearing away", self._sweep)
 
     def _keep_database(self) -> None:
-        if time.monotonic() - self._kept > _SWEEP_INTERVAL:
+        """Raises DatabaseError where it is away, or another controller's; where it is back, what is known of jobs is read anew."""
+        self.database.check()
+        if self.trouble is not None or time.monotonic() - self._kept > _SWEEP_INTERVAL:
             self.database.keep_lock()
             self._kept = time.monotonic()
+        if self.trouble is not None:
+            with self.database.session() as session:
+                self.roster.load(session)
+            self.trouble = None
+            log.warning("the database can be used again")
+
+    def _isolated(self, what: str, body: Callable[[], None]) -> None:
+        """Carry out a part of a pass, whose failure must not stop the other parts."""
+        try:
+            body()
+            self._backoff.worked(what)
+        except DatabaseError as error:
+            if self.trouble is None:
+                log.error("%s; no job is started or accepted until then", error)
+            self.trouble = str(error)
+        except Exception as error:
+            self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
     def _guarded(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
-        """Look at these jobs in one commit; where that fails, at each by itself."""
-        name = ids[0]
+        """Look at these jobs in one commit; where that fails, at each by itself, and later again at those that fail."""
         try:
-            with self.database.session() as session:
-                query = select(Job).where(Job.id.in_(ids)).options(selectinload(Job.attempts))
-                jobs = {job.id: job for job in session.scalars(query)}
-                for job_id in ids:
-                    if job_id in jobs:
-                        body(session, jobs[job_id])
-            self._troubles.pop(name, None)
-        except OSError as error:
-            if self._troubles.get(name) != str(error):  # said once, not at every look
-                log.error("job %s: the store can't be read (%s); trying again", name, error)
-            self._troubles[name] = str(error)
-            self.roster.look_again(ids)
-        except Exception:
+            self._carried_out(ids, body)
+        except DatabaseError:
+            raise
+        except Exception as error:
             if len(ids) > 1:
                 for job_id in ids:
                     self._guarded([job_id], body)
                 return
-            log.exception("job %s: reconciling failed; trying again", name)
+            self._failed(ids[0], ids[0], error)
             self.roster.look_again(ids)
+            return
+        for job_id in ids:
+            self._backoff.worked(job_id)
+
+    def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
+        with self.database.session() as session:
+            query = select(Job).where(Job.id.in_(ids)).options(selectinload(Job.attempts))
+            jobs = {job.id: job for job in session.scalars(query)}
+            for job_id in ids:
+                if job_id in jobs:
+                    body(session, jobs[job_id])
+
+    def _failed(self, subject: Hashable, job_id: str, error: Exception) -> None:
+        """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
+        expected = isinstance(error, StoreUnavailable)
+        reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
+        if self._backoff.failed(subject, f"job {job_id}: {reason}", None if expected else error):
+            with self.database.session() as session:  # by its id alone: its row may be what is damaged
+                over = [Status.SUCCEEDED, Status.FAILED]
+                told = update(Job).where(Job.id == job_id, Job.status.not_in(over)).values(status_reason=reason[:1024])
+                session.execute(told)
 
     def _advance(self, session: Session, job: Job) -> None:
         if attempt := job.open_attempt:
@@ -163,7 +196,14 @@ class Controller:
         if threading.current_thread() is self._thread:
             self.roster.note(jobs)
         else:
-            self.roster.look_again(job.id for job in jobs)
+            self._look_again([job.id for job in jobs])
+
+    def _look_again(self, ids: Collection[str]) -> None:
+        """Requests have changed these jobs: what failed of them is tried at once."""
+        for job_id in ids:
+            self._backoff.hurry(job_id)
+            self._backoff.hurry(("start", job_id))
+        self.roster.look_again(ids)
 
     # -- jobs without a gang ------------------------------------------------------------------------------------------
 
@@ -187,6 +227,8 @@ class Controller:
                 job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
             else:
                 job.move(Status.RUNNABLE, "waiting for the scheduler")
+        elif job.status == Status.RUNNABLE:
+            gang_needs(job.node_properties)  # raises where the row is damaged, which is why the job is looked at
 
     def _settle_array(self, session: Session, job: Job) -> None:
         """An array is over when its last child is; one failed child makes it FAILED."""
@@ -218,7 +260,7 @@ class Controller:
         if idle < pause or (version == self.roster.version and idle < _PASS_INTERVAL):
             return
         started, version = time.monotonic(), self.roster.version
-        waiting = self.roster.waiting()
+        waiting = [each for each in self.roster.waiting() if not self._backoff.waits(("start", each.job))]
         if not waiting:
             self._board, self._passed = None, (version, started, 0.0)
             return
@@ -238,25 +280,41 @@ class Controller:
         self._carry_out(decisions)
 
     def _carry_out(self, decisions: Decisions) -> None:
+        """Each decision by itself: one that fails does not stop the others."""
         for cancel in decisions.cancels:
-            with self.database.session() as session:
-                job = session.get_one(Job, cancel.job)
-                job.cancelled, job.stop_reason = True, cancel.reason
+            self._decided(cancel.job, partial(self._cancel, cancel))
         for preempt in decisions.preempts:
-            with self.database.session() as session:
-                job, by = session.get_one(Job, preempt.job), session.get_one(Job, preempt.by)
-                attempt = job.open_attempt
-                if attempt is not None and attempt.ending is None:
-                    attempt.ending = Ending.PREEMPTED
-                    attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+            self._decided(preempt.job, partial(self._preempt, preempt))
         for start in decisions.starts:
-            with self.database.session() as session:
-                job = session.get_one(Job, start.job)
-                # a request may have ended the job since the snapshot was taken
-                if job.status == Status.RUNNABLE and job.stop_reason is None:
-                    self.gangs.begin(session, job, start)
-                else:
-                    self.roster.look_again([job.id])
+            self._decided(start.job, partial(self._start, start))
+
+    def _decided(self, job_id: str, body: Callable[[Session, Job], None]) -> None:
+        subject = ("start", job_id)
+        try:
+            self._carried_out([job_id], body)
+            self._backoff.worked(subject)
+        except DatabaseError:
+            raise
+        except Exception as error:
+            self._failed(subject, job_id, error)
+
+    @staticmethod
+    def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
+        job.cancelled, job.stop_reason = True, cancel.reason
+
+    @staticmethod
+    def _preempt(preempt: Preempt, session: Session, job: Job) -> None:
+        by, attempt = session.get_one(Job, preempt.by), job.open_attempt
+        if attempt is not None and attempt.ending is None:
+            attempt.ending = Ending.PREEMPTED
+            attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+
+    def _start(self, start: Start, session: Session, job: Job) -> None:
+        # a request may have ended the job since the snapshot was taken
+        if job.status == Status.RUNNABLE and job.stop_reason is None:
+            self.gangs.begin(session, job, start)
+        else:
+            self.roster.look_again([job.id])
 
     # -- what the API asks --------------------------------------------------------------------------------------------
 
@@ -320,3 +378,8 @@ class Controller:
                     session.delete(queue)
             if self.retention is not None:
                 forget_before(session, now() - int(self.retention * 1000))
+
+
+def _words(error: Exception) -> str:
+    """An unexpected error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +12,20 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import ColumnElement, Connection, and_, create_engine, event, inspect, select, text, update
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy import (
+    URL,
+    ColumnElement,
+    Connection,
+    and_,
+    create_engine,
+    event,
+    inspect,
+    make_url,
+    select,
+    text,
+    update,
+)
+from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from orchestrator.jobs import Status
@@ -42,15 +55,29 @@ class Database:
         self.changed: Callable[[Collection[str]], None] | None = None
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self._lock: Connection | None = None
+        self._file: Path | None = None
+        self._identity: tuple[int, int] | None = None
+        """Device and inode of the file, once it is open."""
         try:
-            self.engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
+            self.engine = create_engine(
+                url,
+                pool_pre_ping=not url.startswith("sqlite"),
+                connect_args=_connect_args(make_url(url)),
+                json_deserializer=_read_document,
+            )
             if self.engine.dialect.name == "sqlite":
+                event.listen(self.engine, "do_connect", self._check_before_connect)
                 event.listen(self.engine, "connect", _tune_sqlite)
+                if (path := self.engine.url.database) not in (None, "", ":memory:"):
+                    self._file = Path(str(path))
             else:
                 self._lock = self._take_lock()
             self._migrate()
+            if self._file is not None:
+                found = self._file.stat()
+                self._identity = found.st_dev, found.st_ino
         except (SQLAlchemyError, ModuleNotFoundError) as error:
-            raise DatabaseError(f"database {_shown(url)}: {str(error).splitlines()[0]}") from None
+            raise DatabaseError(f"database {_shown(url)}: {_first_line(error)}") from None
 
     @classmethod
     def at(cls, home: Path) -> Database:
@@ -59,15 +86,44 @@ class Database:
 
     @contextmanager
     def session(self) -> Iterator[Session]:
-        """A session: committed at the end of the block (and wherever the block commits), rolled back on an exception."""
-        with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
-            yield session
-            session.commit()
+        """A session: committed at the end of the block (and wherever the block commits), rolled back on an exception.
+
+        Raises DatabaseError where the database can't be used, also after a commit into a file that is gone: what was written there
+        must not be acknowledged.
+        """
+        self.check()
+        try:
+            with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
+                yield session
+                session.commit()
+        except (OperationalError, InterfaceError) as error:
+            raise DatabaseError(f"database {self._shown}: {_first_line(error)}") from error
+
+    def check(self) -> None:
+        """Make sure that the SQLite file is still the one that was opened: two system calls.
+
+        Raises DatabaseError where it is not.
+        """
+        if self._file is None or self._identity is None:
+            return
+        try:
+            found = self._file.stat()
+        except FileNotFoundError:
+            raise DatabaseError(
+                f"database {self._file} was deleted while the controller runs; put that file back"
+            ) from None
+        except OSError as error:
+            raise DatabaseError(f"database {self._file} can't be reached ({error.strerror})") from None
+        if (found.st_dev, found.st_ino) != self._identity:
+            raise DatabaseError(
+                f"database {self._file} was replaced by another file while the controller runs; put the former one back, or "
+                "restart the controller to use this one"
+            )
 
     def keep_lock(self) -> None:
         """Make sure that this controller is still the database's only one (PostgreSQL forgets it with the connection).
 
-        Raises DatabaseError where another has it by now.
+        Raises DatabaseError where another has it by now, or the server can't be reached.
         """
         if self._lock is None:
             return
@@ -75,7 +131,18 @@ class Database:
             self._lock.scalar(text("SELECT 1"))
         except SQLAlchemyError:
             self._lock.close()
-            self._lock = self._take_lock()
+            try:
+                self._lock = self._take_lock()
+            except SQLAlchemyError as error:
+                raise DatabaseError(f"database {self._shown}: {_first_line(error)}") from error
+
+    @property
+    def _shown(self) -> str:
+        return _shown(str(self.engine.url))
+
+    def _check_before_connect(self, *_: object) -> None:
+        """SQLite would make a new, empty file in place of one that was deleted."""
+        self.check()
 
     def close(self) -> None:
         if self._lock is not None:
@@ -129,8 +196,32 @@ def _shown(url: str) -> str:
     return f"{scheme}{sign}{rest.rpartition('@')[2]}"
 
 
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:500]
+
+
+def _connect_args(url: URL) -> dict[str, Any]:
+    """So that a PostgreSQL server that vanished is noticed within seconds; what the URL itself says counts more."""
+    if url.get_backend_name() != "postgresql":
+        return {}
+    told = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+    return {name: value for name, value in {**told, "tcp_user_timeout": 10_000}.items() if name not in url.query}
+
+
+def _read_document(text: str) -> Any:
+    """A JSON column. One that is damaged is empty, so that its row alone can't be used, and not the whole query's."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return {}
+
+
 class _Session(Session):
     """A session that tells its database which jobs a commit has changed."""
+
+    def commit(self) -> None:
+        super().commit()
+        self.info["database"].check()
 
 
 @event.listens_for(_Session, "after_commit")

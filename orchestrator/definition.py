@@ -151,6 +151,8 @@ def target_nodes(text: str, count: int) -> range:
 
 def gang_needs(node_properties: Mapping[str, Any]) -> GangNeeds:
     """Read ``nodeProperties`` (overrides applied already); of nested ranges the later, inner one counts. Raises ValueError."""
+    if not node_properties:
+        raise ValueError("nodeProperties are empty: the job's row in the database is damaged")
     count = int(node_properties["numNodes"])
     nodes: list[NodeNeeds | None] = [None] * count
     for entry in sorted(

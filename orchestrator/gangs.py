@@ -6,12 +6,12 @@ its ending before the gang is stopped. A controller that starts on the database 
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from sqlalchemy import select
@@ -19,9 +19,10 @@ from sqlalchemy.orm import Session
 
 from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
+from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import EngineError, Gang, GangStatus, NotYet, engine_of
+from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.peers import Peers
@@ -47,8 +48,12 @@ _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
 """An attempt that leaves with 75 sooner than this [ms] counts as spent, so that a program that always does can't spin."""
-_STOP_AGAIN = 2.0
-"""Seconds after which a gang that could not be stopped is asked again."""
+_STOP_AGAIN, _STOP_RARELY = 2.0, 30.0
+"""Seconds after which a gang that could not be stopped is asked again: at first, and at most."""
+
+
+class StoreUnavailable(Exception):
+    """The store can't be used now; the message says why. What was to be done is tried again."""
 
 
 class Gangs:
@@ -56,13 +61,16 @@ class Gangs:
 
     def __init__(self, engine: Several, store: Store, bus: Bus, peers: Peers, changed: Callable[[], None]) -> None:
         self.engine, self.store, self.bus, self.peers, self.changed = engine, store, bus, peers, changed
-        self._stops: dict[tuple[str, int], Future[None]] = {}
+        self._stops: dict[tuple[str, int], Future[GangStatus]] = {}
         self._finished: dict[tuple[str, int], float] = {}
-        self._denied: dict[tuple[str, int], str] = {}
+        self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
-        """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle."""
+        """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle.
+
+        Raises StoreUnavailable where the run can't be prepared now; nothing is recorded then.
+        """
         run = self.store.run(job.run)
         try:
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
@@ -73,12 +81,9 @@ class Gangs:
                 raise StoreError("it was deleted from the store while the job ran")
             self._describe(run, job)
             epoch = take_epoch(run, max(known, default=0), Claim(self.peers.id, job.id, len(job.attempts) + 1))
-        except (
-            OSError,
-            StaleEpoch,
-        ) as error:  # a volume that is full or away may come back; another controller was faster
-            job.status_reason = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
-            return
+        except (OSError, StaleEpoch) as error:  # a volume that is full or away may come back; another controller was faster
+            said = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
+            raise StoreUnavailable(said) from error
         except (StoreError, ValueError) as error:
             job.move(Status.FAILED, f"store {self.store.path}: can't prepare run {job.run}: {error}")
             return
@@ -110,11 +115,11 @@ class Gangs:
         try:
             attempt.handle = self.engine.launch(self.engine.plan(self.gang(session, job, attempt, needs)))
         except NotYet as wait:
-            if job.stop_reason is None or wait.unknown:
-                job.status_reason = str(wait)
-            else:  # nothing of it was started: there is nothing to stop
+            if job.stop_reason is not None and not wait.unknown:  # nothing of it was started: there is nothing to stop
                 self._close(session, job, attempt, Verdict(Ending.STOPPED, job.stop_reason), [])
-        except (EngineError, OSError, ValueError) as error:  # ValueError: a zero byte in a variable or an argument
+            elif str(wait):
+                job.status_reason = str(wait)[:1024]
+        except EngineError as error:
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
 
@@ -156,6 +161,8 @@ class Gangs:
             self._launch(session, job, attempt)
             return
         status = self.engine.observe(attempt.handle)
+        if status is None:
+            return  # the engine's first look is under way
         ends = self._ends(job, attempt, status)
         main = gang_needs(job.node_properties).main
         runs = f"attempt {attempt.number} runs on {_size(job, len(status))}"
@@ -173,15 +180,12 @@ class Gangs:
             session.commit()
         if attempt.ending is not None and (trouble := next((n.detail for n in status if n.running and n.detail), "")):
             job.status_reason = f"{attempt.status_reason}; waits for {trouble}"
-        if attempt.ending is not None and not self._finishing(job, attempt, status) and self._stopped(job, attempt):
-            ends = self._ends(job, attempt, self.engine.observe(attempt.handle))
-            self._close(
-                session,
-                job,
-                attempt,
-                Verdict(Ending(attempt.ending), attempt.status_reason or "", attempt.exit_code),
-                ends,
-            )
+        if attempt.ending is None or self._finishing(job, attempt, status):
+            return
+        if (last := self._stopped(job, attempt)) is not None:
+            ends = self._ends(job, attempt, last)
+            verdict = Verdict(Ending(attempt.ending), attempt.status_reason or "", attempt.exit_code)
+            self._close(session, job, attempt, verdict, ends)
 
     def _finishing(self, job: Job, attempt: Attempt, status: GangStatus) -> bool:
         """Whether the children of a native job whose main node is done are still given time to end by themselves.
@@ -193,16 +197,14 @@ class Gangs:
         since = self._finished.setdefault((job.id, attempt.number), time.monotonic())
         return any(node.running for node in status) and time.monotonic() - since < _FINISHING
 
-    def _stop(self, handle: str, grace: float) -> Future[None]:
+    def _stop(self, handle: str, grace: float) -> Future[GangStatus]:
         """Stop a gang in a thread of its own: a daemon, since a controller that leaves must not wait for a grace time."""
-        done: Future[None] = Future()
+        done: Future[GangStatus] = Future()
 
         def stop() -> None:
             try:
-                self.engine.stop(handle, grace)
-                done.set_result(None)
+                done.set_result(self.engine.stop(handle, grace))
             except BaseException as error:
-                time.sleep(_STOP_AGAIN)
                 done.set_exception(error)
             self.changed()
 
@@ -240,7 +242,8 @@ class Gangs:
         for record, node in zip(attempt.nodes, status, strict=True):
             end, stopped = None, now()
             if not node.running:
-                outcome = read_outcome(run, job.id, attempt.number, record["index"])
+                with self._reading():
+                    outcome = read_outcome(run, job.id, attempt.number, record["index"])
                 if outcome:
                     stopped = min(stopped, int(outcome.ended * 1000))
                     message = outcome.error.message if outcome.error else None
@@ -273,38 +276,54 @@ class Gangs:
             attempt.nodes = records
         return ends
 
-    def _stopped(self, job: Job, attempt: Attempt) -> bool:
-        """Stop the gang in the background; True once no process of it is left. Where the engine can't, the job says why."""
+    def _stopped(self, job: Job, attempt: Attempt) -> GangStatus | None:
+        """Stop the gang in the background; how its nodes ended, once no process of it is left.
+
+        Where the engine can't stop it the job says why, and the engine is asked again, later and later.
+        """
         key = (job.id, attempt.number)
-        if key not in self._stops:
+        if key not in self._stops and not self._denied.waits(key):
             grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
             assert attempt.handle is not None
             self._stops[key] = self._stop(attempt.handle, grace)
-        if self._stops[key].done():
-            error = self._stops.pop(key).exception()
+        if key in self._stops and self._stops[key].done():
+            stop = self._stops.pop(key)
+            error = stop.exception()
             if error is None:
-                self._finished.pop(key, None)
-                self._denied.pop(key, None)
-                return True
-            if not isinstance(error, EngineError):
-                raise error
+                return stop.result()
             said = f"attempt {attempt.number} can't be stopped: {' '.join(str(error).split())}; trying again"
-            if self._denied.get(key) != said:  # said once, not at every try
-                log.error("job %s: %s", job.id, said)
-            self._denied[key] = said
-        if key in self._denied:
-            job.status_reason = self._denied[key]
-        return False
+            expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
+            self._denied.failed(key, f"job {job.id}: {said}", None if expected else error)
+        if said_last := self._denied.said(key):
+            job.status_reason = said_last.removeprefix(f"job {job.id}: ")[:1024]
+        return None
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Around reads of the store. Raises StoreUnavailable."""
+        try:
+            yield
+        except OSError as error:
+            raise StoreUnavailable(f"the store {self.store.path} can't be read now ({error}); trying again") from error
 
     def _close(
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
     ) -> None:
-        """The gang is gone: close its attempt and decide what becomes of the job."""
-        self.bus.forget(job.id, attempt.number)
-        with contextlib.suppress(
-            OSError
-        ):  # while this controller lives, another one may then say that the run is written
+        """The gang is gone: close its attempt and decide what becomes of the job. Raises StoreUnavailable."""
+        with self._reading():
+            self._close_attempt(session, job, attempt, verdict, ends)
+        key = (job.id, attempt.number)
+        self._finished.pop(key, None)
+        self._denied.worked(key)
+        self.bus.forget(*key)
+        with suppress(OSError):  # while this controller lives, another one may then say that the run is written
             close_claim(self.store.run(job.run), attempt.epoch)
+        name = f"{job.id}/{attempt.number}/{attempt.epoch}"
+        self.engine.forget(str(attempt.nodes[0]["host"]), name, attempt.handle)
+
+    def _close_attempt(
+        self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
+    ) -> None:
         ended, ending = now(), verdict.ending
         attempt.ending, attempt.status_reason, attempt.exit_code = ending, verdict.reason, verdict.exit_code
         attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended

@@ -36,7 +36,10 @@ class Roster:
         """Grows whenever something changes that a scheduling pass depends on."""
 
     def load(self, session: Session) -> None:
-        """Read all jobs that are not over. Whoever depends on a job that ended meanwhile is looked at too."""
+        """Read all jobs that are not over, in place of what was known. Those that depend on a job that has ended are looked at too."""
+        with self._lock:
+            self._waiting, self._active = {}, {}
+            self.version += 1
         over = [Status.SUCCEEDED, Status.FAILED]
         query = select(Job).where(Job.status.not_in(over)).order_by(Job.created_at, Job.id)
         for jobs in session.scalars(query).partitions(_LOADED_AT_ONCE):
@@ -63,7 +66,10 @@ class Roster:
         elif job.status in (Status.STARTING, Status.RUNNING):
             self._active[job.id] = None
         elif job.status == Status.RUNNABLE and job.stop_reason is None:
-            self._waiting[job.id] = self._entry(job)
+            try:
+                self._waiting[job.id] = self._entry(job)
+            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+                self._due[job.id] = None
         elif job.stop_reason is not None or job.status == Status.SUBMITTED:
             self._due[job.id] = None
         # a PENDING job is looked at when one that it waits for, or a child of it, has ended

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import uvicorn
@@ -44,7 +45,7 @@ class Server:
         retention: float | None = None,
         engines: Sequence[str] = ("local",),
     ) -> None:
-        """Take the lock, the port, the store and the database, in this order; nothing runs until :meth:`start`.
+        """Take the lock, the port, the store, the database and the engines, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
@@ -53,33 +54,30 @@ class Server:
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
-        try:
-            nodes = Several([make_engine(name, home, cpus, gpus) for name in dict.fromkeys(engines)])
-        except EngineError as error:
-            raise ServerError(str(error)) from None
         self.access = Access(KeyStore(home), token, exposed=not is_loopback(host))
         _check_exposure(host, self.access)
-        try:
-            self._lock = HomeLock(home)
-        except OSError as error:
-            raise ServerError(
-                f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"
-            ) from None
-        try:
+        with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
+            self._lock = _take_lock(home)
+            stack.callback(self._lock.release)
             self._socket = _listen(host, port)
+            stack.callback(self._socket.close)
             self.store = Store(store or home / "store").open()
             try:
                 found = Database(database) if database else Database.at(home)
-            except DatabaseError as error:
+                stack.callback(found.close)
+                nodes = _make_engines(engines, home, cpus, gpus)
+                stack.callback(nodes.close)
+                with found.session() as session:
+                    ensure_pools(session, nodes.names)
+            except (DatabaseError, EngineError) as error:
                 raise ServerError(str(error)) from None
-        except BaseException:
-            self._lock.release()
-            raise
-        with found.session() as session:
-            ensure_pools(session, nodes.names)
-        self.bus = Bus(home, nodes.addresses)
-        self.peers = Peers(self.store, home)
-        self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
+            self.bus = Bus(home, nodes.addresses)
+            stack.callback(self.bus.close)
+            self.peers = Peers(self.store, home)
+            stack.callback(self.peers.close)
+            self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
+            stack.callback(self.controller.close)
+            self._opened = stack.pop_all()
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]
         self.url = (
@@ -105,12 +103,28 @@ class Server:
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5)
-        self.controller.close()
-        self.peers.close()
-        self.bus.close()
-        self.controller.database.close()
-        self._socket.close()
-        self._lock.release()
+        self._opened.close()
+
+
+def _take_lock(home: Path) -> HomeLock:
+    try:
+        return HomeLock(home)
+    except OSError as error:
+        raise ServerError(
+            f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"
+        ) from None
+
+
+def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Sequence[str] | None) -> Several:
+    """The engines; where one can't be made, those before it are closed. Raises EngineError."""
+    with ExitStack() as stack:
+        made = []
+        for name in dict.fromkeys(names):
+            made.append(make_engine(name, home, cpus, gpus))
+            stack.callback(made[-1].close)
+        several = Several(made)
+        stack.pop_all()
+    return several
 
 
 def _check_exposure(host: str, access: Access) -> None:

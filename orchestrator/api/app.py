@@ -19,6 +19,7 @@ from orchestrator.api.auth import Access, Guard, error_response, kind_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import RateLimit
 from orchestrator.controller import Controller
+from orchestrator.database import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
 
@@ -38,13 +39,21 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _refused_by_database)
+    app.add_exception_handler(DatabaseError, _database_away)
     app.add_exception_handler(DamagedFile, _damaged_file)
     app.add_exception_handler(Exception, _server_error)
 
     @app.get("/healthz")
-    def healthz() -> dict[str, str]:
-        """Alive, and which version."""
-        return {"status": "ok", "version": __version__}
+    def healthz() -> JSONResponse:
+        """Alive, and which version; 503 with the reason while the database can't be used."""
+        try:
+            controller.database.check()
+            trouble = controller.trouble
+        except DatabaseError as error:
+            trouble = str(error)
+        if trouble is not None:
+            return JSONResponse({"status": "unavailable", "reason": trouble, "version": __version__}, 503)
+        return JSONResponse({"status": "ok", "version": __version__})
 
     @app.post("/v1/{operation}", include_in_schema=False)
     async def aws_batch(operation: str, request: Request) -> JSONResponse:
@@ -116,6 +125,10 @@ async def _refused_by_database(request: Request, error: Exception) -> JSONRespon
 async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
     """What lies on the volume was written by jobs, and may be anything: that is no error of the server."""
     return error_response(f"the store holds a damaged file: {error}", 409)
+
+
+async def _database_away(request: Request, error: Exception) -> JSONResponse:
+    return error_response(str(error), 503, "ServerException")
 
 
 async def _server_error(request: Request, error: Exception) -> JSONResponse:

@@ -30,7 +30,7 @@ from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
 from orchestrator.api.log_streams import Stream, find_stream, newest_streams
 from orchestrator.controller import Controller
-from orchestrator.database import Job, now
+from orchestrator.database import DatabaseError, Job, now
 
 GROUP = "/aws/batch/job"
 GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{GROUP}"
@@ -96,6 +96,8 @@ async def answer(
         return error.response()
     except ClientError as error:
         return LogsError("InvalidParameterException", str(error), error.status).response()
+    except DatabaseError as error:
+        return LogsError("ServiceUnavailableException", str(error), 503).response()
     except OSError as error:
         return LogsError("ServiceUnavailableException", f"the store can't be read: {error}", 503).response()
 

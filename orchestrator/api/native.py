@@ -27,6 +27,7 @@ from orchestrator.controller import Controller
 from orchestrator.database import find_job
 from orchestrator.definition import gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
+from orchestrator.engines.several import FRESH
 from orchestrator.jobs import Status
 from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
@@ -88,7 +89,7 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
         )
     return {
         "engines": own_queues(controller.engine.names),
-        "hosts": [asdict(host) for host in controller.engine.capacity(names)],
+        "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
         "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
         "queues": queues,
@@ -104,7 +105,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
     needs = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
     with controller.database.session() as session:
-        hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]))
+        hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]), FRESH)
         queue = session.get(JobQueue, body.queue)
         if queue is None:
             raise ClientError(f"there is no queue {body.queue!r}")

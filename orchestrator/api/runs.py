@@ -13,6 +13,7 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.engines.several import FRESH
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.pools import queue_engines
@@ -114,6 +115,7 @@ def resume(
         if earlier := _resumed(Context(session, controller, idempotency_key), run):
             return earlier
     chosen = _choose(run, checkpoint)  # reads all of a checkpoint: before anybody has to wait for it
+    controller.engine.capacity(patience=FRESH)  # before the lock: whoever holds it waits for no engine
     with controller.writing, controller.database.session() as session:
         context = Context(session, controller, idempotency_key)
         if earlier := _resumed(context, run):

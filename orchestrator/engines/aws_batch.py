@@ -175,6 +175,11 @@ class AwsBatchEngine:
         while len(self._gangs) > _REMEMBERED and next(iter(self._gangs)) != facts["gang"]:
             del self._gangs[next(iter(self._gangs))]
 
+    def close(self) -> None:
+        """Jobs on AWS go on."""
+        for client in (self._batch, self._submitting, self._logs):
+            client.close()
+
     def _check_queue(self) -> None:
         """Later AWS may be away for a while, and a gang waits for it; what is wrong from the start would wait for ever."""
         queue, where = self.config.job_queue, self.config.endpoint_url or self.config.region

@@ -30,6 +30,14 @@ class NotYet(EngineError):
         self.unknown = unknown
 
 
+class Transient(NotYet):
+    """The operating system or a volume failed in a way that may pass: no descriptors, processes or space, a volume that is away."""
+
+
+class EngineFault(Transient):
+    """An engine raised what it should not raise: a bug, whose traceback belongs in the log."""
+
+
 @dataclass(frozen=True)
 class Host:
     """A machine (or what is free of it)."""
@@ -197,7 +205,17 @@ GangStatus = Sequence[NodeStatus]
 
 
 class Engine(Protocol):
-    """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart."""
+    """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart.
+
+    Threads: the controller gives each engine a thread of its own (:mod:`orchestrator.engines.runner`). :meth:`capacity`, :meth:`launch`
+    and :meth:`observe` are called on that thread alone, one at a time, so a call that takes long delays this engine's gangs only.
+    :meth:`stop` is called on another thread for each gang, at the same time as everything else, other stops included. :meth:`plan` is
+    called on any thread. What these share with the engine's thread must be guarded by a lock, or replaced as a whole and never
+    changed in place.
+
+    Errors: EngineError is final for a launch, NotYet and Transient are tried again. An OSError from the operating system or the
+    store may escape: the runner decides by its number which of the two it is. It must never be taken for the end of a process.
+    """
 
     name: str
     queues: bool
@@ -214,13 +232,18 @@ class Engine(Protocol):
         ...
 
     def plan(self, gang: Gang) -> Plan:
-        """What :meth:`launch` would do. Pure. Raises EngineError where the engine can't do what the gang asks for."""
+        """What :meth:`launch` would do. Pure, and quick. Raises EngineError where the engine can't do what the gang asks for."""
         ...
 
     def launch(self, plan: Plan) -> str:
         """Start the gang, the main node first; returns its handle.
 
-        Idempotent by (job, attempt, epoch): nodes that run already are found, not started twice. Raises EngineError.
+        Idempotent by (job, attempt, epoch): nodes that run already are found, not started twice. A launch that raises has ended
+        what it had started, unless it raises NotYet with ``unknown``.
+
+        Raises:
+            NotYet: It has to wait, or failed in a way that may pass.
+            EngineError: It is refused for good.
         """
         ...
 
@@ -229,5 +252,9 @@ class Engine(Protocol):
         ...
 
     def stop(self, handle: str, grace: float) -> None:
-        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left."""
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left. Raises EngineError."""
+        ...
+
+    def close(self) -> None:
+        """Release what the engine holds in this process; gangs go on. Called once, also where the engine was never used."""
         ...

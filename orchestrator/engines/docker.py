@@ -138,6 +138,11 @@ class DockerEngine:
                 del self._ended[next(iter(self._ended))]
             self._remove(facts["gang"])
 
+    def close(self) -> None:
+        """Containers go on."""
+        self._puller.shutdown(wait=False, cancel_futures=True)
+        self._client.close()
+
     def _gateway(self) -> str | None:
         """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
         try:

@@ -9,7 +9,7 @@ import requests
 import urllib3
 from docker.errors import APIError
 
-from orchestrator.engines.base import NotYet
+from orchestrator.engines.base import EngineError, NotYet
 
 
 class NoAnswer(NotYet):
@@ -21,16 +21,18 @@ class NoAnswer(NotYet):
 
 @contextmanager
 def answered() -> Iterator[None]:
-    """Around calls of Docker's client. Raises NoAnswer where it is not reached, or can't say what is asked of it (5xx).
+    """Around calls of Docker's client, all of whose errors are OSErrors, as those of the store are.
 
-    Its other errors pass: requests makes all of them OSErrors, which elsewhere are the store's.
+    Raises:
+        NoAnswer: Docker Engine is not reached, or can't answer (5xx).
+        EngineError: It refuses, in its own words.
     """
     try:
         yield
     except APIError as error:
-        if not error.is_server_error():
-            raise
         said = " ".join((error.explanation or str(error)).split())
+        if not error.is_server_error():
+            raise EngineError(f"Docker Engine refuses: {said}") from error
         raise NoAnswer(f"Docker Engine has no answer ({said}); see its log (journalctl -u docker)") from error
     except (requests.RequestException, urllib3.exceptions.HTTPError) as error:
         raise NoAnswer(unanswered(error)) from error

@@ -17,13 +17,26 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from orchestrator.engines.base import HERE, PRIVATE, EngineError, Gang, GangStatus, Host, NodeStatus, Plan, node_plans
+from orchestrator.engines.base import (
+    HERE,
+    PRIVATE,
+    EngineError,
+    Gang,
+    GangStatus,
+    Host,
+    NodeStatus,
+    Plan,
+    Transient,
+    node_plans,
+)
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
 from shared_store.layout import Store
 from shared_store.outcomes import read_outcome
 
 _FIRST_PORT = 29500
+_UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
+"""What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
 
 
 class LocalEngine:
@@ -69,18 +82,23 @@ class LocalEngine:
         port = found[0][2] if found else _free_port(master)
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
+        before = set(self._children)
         try:
             for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
                 ended = index not in running and read_outcome(run, gang.job, gang.attempt, index) is not None
                 pid = 0 if ended else running.get(index) or self._start(plan, index, port)
                 nodes[index] = {"pid": pid, "start": _start_time(pid), "address": plan.nodes[index].contract.address}
-        except BaseException:  # never half a gang
-            for node in nodes.values():
-                # by its pid: for a moment after it was started a process has no environment yet by which it would be found
-                if child := self._children.get(int(str(node["pid"]))):
-                    child.kill()
-                    child.wait()
-            _end(gang.name)
+        except BaseException as error:  # never half a gang
+            # by its pid: for a moment after it was started a process has no environment yet by which it would be found
+            for pid in self._children.keys() - before:
+                child = self._children.pop(pid)
+                child.kill()
+                child.wait()
+            try:
+                _end(gang.name)
+            except OSError as trouble:  # /proc can't be read now: the next try finds what may be left
+                said = f"can't start the gang now ({error}), nor look for what is left of it ({trouble}); trying again"
+                raise Transient(said, unknown=True) from error
             raise
         return json.dumps({"gang": gang.name, "nodes": [nodes[index] for index in range(len(nodes))]})
 
@@ -99,6 +117,9 @@ class LocalEngine:
             time.sleep(0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
         _end(state["gang"])
+
+    def close(self) -> None:
+        """Supervisors go on."""
 
     def _start(self, plan: Plan, index: int, port: int) -> int:
         node = plan.nodes[index]
@@ -164,19 +185,26 @@ def _free_port(address: str) -> int:
 
 
 def _start_time(pid: int) -> str:
-    """Start time of a process in clock ticks since boot (field 22 of ``/proc/<pid>/stat``); with the pid it names it for ever."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
-    except OSError:
-        return ""
+    """Start time of a process in clock ticks since boot, which tells it from a later one with its pid; empty if it is gone."""
+    fields = _stat(pid)
+    return fields[19] if fields else ""
 
 
 def _alive(pid: int, start: object) -> bool:
+    """Whether the process exists and is no zombie. Raises OSError where that can't be told now."""
+    fields = _stat(pid)
+    return fields is not None and fields[0] not in "ZX" and fields[19] == start
+
+
+def _stat(pid: int) -> list[str] | None:
+    """``/proc/<pid>/stat`` from the process's state (field 3) on; None where there is no such process.
+
+    Raises OSError where it can't be read now, without free descriptors for instance: that is not the death of a process.
+    """
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return False
-    return fields[0] not in "ZX" and fields[19] == start
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
 
 
 def _processes(gang: str) -> list[int]:
@@ -197,7 +225,7 @@ def _supervisors(gang: str) -> list[tuple[int, int, int]]:
     for pid, environment in _scan(gang):
         try:
             command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-        except OSError:
+        except _UNSEEN:
             continue
         index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0")  # a single-node job has none
         # its ranks are children of it; a supervisor that is still being given its mounts has another command in front
@@ -216,7 +244,7 @@ def _scan(gang: str) -> list[tuple[int, dict[bytes, bytes]]]:
             raw = Path(f"/proc/{entry}/environ").read_bytes()
             if wanted not in raw or not _alive(int(entry), _start_time(int(entry))):
                 continue
-        except OSError:
+        except _UNSEEN:
             continue
         environment = dict(item.split(b"=", 1) for item in raw.split(b"\0") if b"=" in item)
         if environment.get(b"MUSTER_GANG") == wanted:

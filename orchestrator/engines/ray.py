@@ -17,6 +17,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -74,8 +75,9 @@ class RayEngine:
         self._next_let_go = 0.0
         self._suspects: dict[str, float] = {}
         """Until when (monotonic [s]), by node id."""
+        self._lock = threading.Lock()
         self._grown: dict[str, Sequence[str]] = {}
-        """Hosts of the gangs for which machines were to be added."""
+        """Hosts of the gangs for which machines were to be added; guarded by the lock, since stops forget gangs."""
         self._clear_away()
 
     # -- the cluster --------------------------------------------------------------------------------------------------
@@ -115,7 +117,9 @@ class RayEngine:
     def _taken(self) -> dict[str, str]:
         """Names under which gangs hold machines that were added for them, by node id."""
         names = {}
-        for gang, hosts in self._grown.items():
+        with self._lock:
+            grown = list(self._grown.items())
+        for gang, hosts in grown:
             state = read_json(Folder.of(self.home, _job(gang)).state(gang)) or {}
             for host, node in zip(hosts, state.get("nodes", ()), strict=False):
                 if host.startswith(NEW) and node["ray_node"]:
@@ -150,10 +154,11 @@ class RayEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        self._note(facts)
         gang, count = str(facts["ray"]), len(facts["hosts"])
         folder = Folder.of(self.home, _job(gang))
         state = read_json(folder.state(gang))
+        if state is None or state["phase"] != "stopped":
+            self._note(facts)
         if state is None:
             if folder.plan(gang).exists():
                 driver = self._drivers.get(_job(gang))
@@ -199,7 +204,8 @@ class RayEngine:
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
             time.sleep(0.02)
-        self._grown.pop(gang, None)
+        with self._lock:
+            self._grown.pop(gang, None)
 
     def close(self) -> None:
         """End the watch; drivers go on."""
@@ -218,7 +224,8 @@ class RayEngine:
 
     def _note(self, facts: Mapping[str, Any]) -> None:
         if any(host.startswith(NEW) for host in facts["hosts"]):
-            self._grown[str(facts["ray"])] = facts["hosts"]
+            with self._lock:
+                self._grown[str(facts["ray"])] = facts["hosts"]
 
     def _document(self, plan: Plan) -> dict[str, Any]:
         """What the driver is told of a gang."""

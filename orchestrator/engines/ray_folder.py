@@ -64,12 +64,14 @@ class Folder:
         return True
 
     def is_driven(self) -> bool:
-        """Whether the job's driver is there."""
+        """Whether the job's driver is there. Raises OSError where that can't be told now."""
         try:
             os.close(os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK))
             return True
-        except OSError:
-            return False
+        except OSError as error:
+            if error.errno in (errno.ENXIO, errno.ENOENT):
+                return False
+            raise
 
     def plan(self, gang: str) -> Path:
         return self.path / f"{_file_name(gang)}.plan.json"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 
 from orchestrator.engines.base import (
@@ -17,8 +18,10 @@ from orchestrator.engines.base import (
     Plan,
     engine_of,
 )
+from orchestrator.engines.runner import Runner
 
-log = logging.getLogger("muster.engines")
+FRESH = 2.0
+"""Seconds that a request waits for the engines' newest hosts."""
 
 
 class NotServed(NotYet):
@@ -29,12 +32,20 @@ class NotServed(NotYet):
 
 
 class Several:
-    """Engines by their names; the first is the one that jobs of the queue ``default`` go to."""
+    """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
 
     def __init__(self, engines: Sequence[Engine]) -> None:
+        """Takes the engines over: :meth:`close` closes them."""
+        self.changed: Callable[[], None] = lambda: None
+        """Called (on an engine's thread) when an engine has something new to tell."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
-        self._known: dict[str, Sequence[Host]] = {}
-        self._troubles: dict[str, str] = {}
+        self._runners = {engine.name: Runner(engine, lambda: self.changed()) for engine in engines}
+
+    def close(self) -> None:
+        """Close every engine; gangs go on."""
+        with ExitStack() as stack:  # one that can't be closed does not keep the others open
+            for runner in self._runners.values():
+                stack.callback(runner.close)
 
     @property
     def names(self) -> Sequence[str]:
@@ -54,23 +65,22 @@ class Several:
         """Of this machine as the engines' nodes see it, beside loopback."""
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
-    def capacity(self, names: Iterable[str] | None = None) -> Sequence[Host]:
-        """The hosts of all engines, or of these. Those of one that does not answer are as they were when it last did."""
+    def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Sequence[Host]:
+        """The hosts of all engines, or of these, as each told them last.
+
+        ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
+        """
+        deadline = time.monotonic() + patience
         hosts: list[Host] = []
         for name in self.engines if names is None else names:
-            try:
-                self._known[name] = self.engines[name].capacity()
-                self._troubles.pop(name, None)
-            except EngineError as error:
-                if self._troubles.get(name) != str(error):  # said once, not at every pass
-                    log.warning("engine %s: %s", name, error)
-                self._troubles[name] = str(error)
-            hosts += self._known.get(name, [])
+            if runner := self._runners.get(name):
+                hosts += runner.capacity(max(0.0, deadline - time.monotonic()))
         return hosts
 
     def plan(self, gang: Gang) -> Plan:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
-        engine = self._engine(engine_of(gang.placements[0].host))
+        runner = self._runner(engine_of(gang.placements[0].host))
+        engine = runner.engine
         named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
         if named and not engine.images and gang.options.get("images") == "refuse":
             raise EngineError(
@@ -79,27 +89,36 @@ class Several:
             )
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
-        return engine.plan(gang)
+        return runner.plan(gang)
 
     def launch(self, plan: Plan) -> str:
+        """The gang's handle once it is started; does not wait. Raises NotYet until then, and EngineError."""
         name = engine_of(plan.gang.placements[0].host)
-        return f"{name} {len(plan.nodes)} {self._engine(name).launch(plan)}"
+        return f"{name} {len(plan.nodes)} {self._runner(name).launch(plan)}"
 
-    def observe(self, handle: str) -> GangStatus:
-        """Of a gang whose engine is not served now nothing is known: it counts as running."""
+    def observe(self, handle: str) -> GangStatus | None:
+        """The newest picture of a gang; None before the first. Does not wait, and raises nothing.
+
+        Of a gang whose engine is not served, or can't look now, nothing new is known: it counts as running.
+        """
         name, count, rest = handle.split(" ", 2)
         try:
-            return self._engine(name).observe(rest)
+            return self._runner(name).observe(rest, int(count))
         except NotServed as error:
             return [NodeStatus(True, "", waiting=str(error))] * int(count)
 
-    def stop(self, handle: str, grace: float) -> None:
-        """As the engine does it. Raises EngineError where it can't, or is not served now."""
+    def stop(self, handle: str, grace: float) -> GangStatus:
+        """Stop the gang, which may take long; returns how its nodes ended. Raises EngineError."""
         name, _, rest = handle.split(" ", 2)
-        self._engine(name).stop(rest, grace)
+        return self._runner(name).stop(rest, grace)
 
-    def _engine(self, name: str) -> Engine:
+    def forget(self, host: str, gang: str, handle: str | None) -> None:
+        """The gang, one of whose nodes was placed on ``host``, is over; ``handle``: None where it was never launched."""
+        if runner := self._runners.get(engine_of(host)):
+            runner.forget(gang, handle.split(" ", 2)[2] if handle else None)
+
+    def _runner(self, name: str) -> Runner:
         try:
-            return self.engines[name]
+            return self._runners[name]
         except KeyError:
             raise NotServed(f"engine {name} is not served now; start muster serve with --engine {name}") from None

@@ -146,6 +146,9 @@ class SlurmEngine:
                 pass  # a cluster that does not answer can't say that the job is over
             time.sleep(_LOOK)
 
+    def close(self) -> None:
+        """Slurm's jobs go on."""
+
     # -- jobs ---------------------------------------------------------------------------------------------------------
 
     def _begin(self, gang: Gang, facts: Mapping[str, Any], script: str) -> None:
@@ -161,8 +164,8 @@ class SlurmEngine:
             except BaseException as error:
                 pending.set_exception(error)
 
-        self._pending[gang.name] = pending
         threading.Thread(target=submit, name="sbatch", daemon=True).start()
+        self._pending[gang.name] = pending
 
     def _find(self, facts: Mapping[str, Any]) -> str | None:
         """The number of a gang that was submitted before: its controller died, or sbatch's answer was lost. Raises EngineError."""
@@ -207,10 +210,10 @@ def _cancel(*arguments: str) -> None:
 
 
 def _said(facts: Mapping[str, Any]) -> str:
-    """The job's output so far."""
+    """The job's output so far. Raises OSError where it can't be read now."""
     try:
         return Path(facts["output"]).read_text(errors="replace")
-    except OSError:
+    except FileNotFoundError:
         return ""
 
 

@@ -63,6 +63,8 @@ def call(*command: str, text: str | None = None) -> str:
             f"{command[0]} is not installed here: the slurm engine uses the cluster's own commands; "
             "start the controller on a login node, or install Slurm's client commands (Debian: slurm-client)"
         ) from None
+    except OSError as error:  # no process or descriptor to be had
+        raise Unreachable(f"can't run {command[0]} now: {error}") from None
     except subprocess.TimeoutExpired:
         raise Unreachable(
             f"slurmctld does not answer ({command[0]} waited {_LIMIT:g} s); see `scontrol ping`"

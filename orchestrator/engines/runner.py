@@ -1,0 +1,254 @@
+"""One thread for each engine: the controller asks, reads the newest answer, and never waits for an engine.
+
+An engine that hangs (a Docker daemon that accepts connections and does not answer, a cloud behind a broken route) delays its own gangs
+alone. Those keep the state that was seen last, and can still be timed out and asked to stop; gangs of other engines notice nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future, wait
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from queue import SimpleQueue
+from typing import TypeVar
+
+from orchestrator.backoff import Backoff
+from orchestrator.engines.base import (
+    Engine,
+    EngineError,
+    EngineFault,
+    Gang,
+    GangStatus,
+    Host,
+    NodeStatus,
+    NotYet,
+    Plan,
+    Transient,
+)
+from orchestrator.engines.transience import is_final
+
+log = logging.getLogger("muster.engines")
+
+OVERDUE = 10.0
+"""Seconds after which an engine whose call has not returned is said not to answer."""
+_CLOSING = 5.0
+"""Seconds that :meth:`Runner.close` gives the call that is being carried out."""
+
+T = TypeVar("T")
+
+
+class Underway(NotYet):
+    """The engine was asked to launch a gang and has not answered yet; the message is empty until it is overdue."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, unknown=True)
+
+
+class Runner:
+    """Carries out the calls of one engine, in their order, on a thread of its own. Any thread may ask."""
+
+    def __init__(self, engine: Engine, changed: Callable[[], None]) -> None:
+        """``changed`` is called, on the engine's thread, when an answer differs from the one before."""
+        self.engine, self._changed = engine, changed
+        self._lock = threading.Lock()
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._launches: dict[str, Future[str]] = {}
+        """By gang: launches whose end has not been collected."""
+        self._refused: dict[str, NotYet] = {}
+        """By gang: what its last launch has to wait for."""
+        self._looks: set[str] = set()
+        """Handles of the gangs that are being looked at."""
+        self._seen: dict[str, GangStatus] = {}
+        """By handle: the newest picture."""
+        self._telling: Future[Sequence[Host]] | None = None
+        self._hosts: Sequence[Host] = ()
+        self._backoff = Backoff(log)
+        self._since: float | None = None
+        """Since when the present call is being carried out (monotonic [s])."""
+        with suppress(EngineError):
+            self._hosts = self._tell_hosts()
+        self._thread = threading.Thread(target=self._run, name=f"engine {engine.name}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Give the present call a few seconds, then close the engine; its gangs go on."""
+        self._calls.put(None)
+        self._thread.join(_CLOSING)
+        self.engine.close()
+
+    @property
+    def silence(self) -> str | None:
+        """That the engine does not answer, and since when; None while it does."""
+        since = self._since
+        if since is None or (passed := time.monotonic() - since) < OVERDUE:
+            return None
+        if (said := self._backoff.said("silence")) is None:
+            began = datetime.fromtimestamp(time.time() - passed, UTC)
+            said = f"the {self.engine.name} engine has not answered since {began:%Y-%m-%d %H:%M:%S} UTC"
+            self._backoff.failed("silence", said)
+        return said
+
+    # -- what the controller asks -------------------------------------------------------------------------------------
+
+    def capacity(self, patience: float = 0.0) -> Sequence[Host]:
+        """The hosts that the engine told last. Asks for them again, and waits for that for ``patience`` seconds at most."""
+        with self._lock:
+            if self._telling is None or self._telling.done():
+                self._telling = self._submit(self._tell_hosts)
+            telling = self._telling
+        if patience and not self.silence:
+            wait([telling], patience)
+        return self._hosts
+
+    def plan(self, gang: Gang) -> Plan:
+        """As the engine plans it, on the caller's thread. Raises EngineError."""
+        return self._call("plan the gang", lambda: _lasting(lambda: self.engine.plan(gang)))
+
+    def launch(self, plan: Plan) -> str:
+        """The handle of the gang once it is started. Raises :class:`Underway` until then, NotYet and EngineError."""
+        gang = plan.gang.name
+        subject = ("launch", gang)
+        with self._lock:
+            launch = self._launches.get(gang)
+            if launch is None:
+                if self._backoff.waits(subject):
+                    raise self._refused[gang]
+                launch = self._launches[gang] = self._submit(lambda: self._start(plan))
+                launch.add_done_callback(lambda _: self._changed())
+            if not launch.done():
+                raise Underway(self.silence or "")
+            del self._launches[gang]
+        try:
+            return launch.result()
+        except NotYet as error:
+            self._refused[gang] = error
+            raise
+
+    def observe(self, handle: str, nodes: int) -> GangStatus | None:
+        """The newest picture of a gang of so many nodes, and a newer one is asked for; None before the first.
+
+        Nodes that were seen running, or not yet at all, have in ``waiting`` why there is no newer picture.
+        """
+        subject = ("look", handle)
+        with self._lock:
+            if handle not in self._looks and not self._backoff.waits(subject):
+                self._looks.add(handle)
+                self._submit(lambda: self._look(handle))
+        seen = self._seen.get(handle)
+        if trouble := self.silence or self._backoff.said(subject):
+            seen = seen or [NodeStatus(True, "")] * nodes
+            return [replace(node, waiting=trouble) if node.running else node for node in seen]
+        return seen
+
+    def stop(self, handle: str, grace: float) -> GangStatus:
+        """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
+        self._call("stop the gang", lambda: self.engine.stop(handle, grace))
+        return self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle))).result()
+
+    def forget(self, gang: str, handle: str | None) -> None:
+        """The gang is over; ``handle``: None where it was never launched."""
+        with self._lock:
+            self._refused.pop(gang, None)
+            if handle is not None:
+                self._looks.discard(handle)
+                self._seen.pop(handle, None)
+        self._backoff.worked(("launch", gang))
+        self._backoff.worked(("look", handle))
+
+    # -- on the engine's thread ---------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            self._since = time.monotonic()
+            call()
+            self._since = None
+            if self._backoff.worked("silence"):
+                log.warning("the %s engine answers again", self.engine.name)
+
+    def _submit(self, body: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+
+        def call() -> None:
+            try:
+                result = body()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        self._calls.put(call)
+        return future
+
+    def _call(self, what: str, body: Callable[[], T]) -> T:
+        """Carry out a call. Raises EngineError, whatever the engine raises; ``what``: for the message."""
+        name = self.engine.name
+        try:
+            return body()
+        except EngineError:
+            raise
+        except OSError as error:
+            raise Transient(f"the {name} engine can't {what} now ({error}); trying again") from error
+        except Exception as error:
+            said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+            raise EngineFault(
+                f"the {name} engine failed to {what} ({said}); the controller's log has the details; trying again"
+            ) from error
+
+    def _failed(self, subject: Hashable, error: EngineError) -> None:
+        self._backoff.failed(subject, str(error), error.__cause__ if isinstance(error, EngineFault) else None)
+
+    def _tell_hosts(self) -> Sequence[Host]:
+        try:
+            hosts = self._call("tell its hosts", self.engine.capacity)
+        except EngineError as error:
+            self._failed("hosts", error)
+            raise
+        self._backoff.worked("hosts")
+        if hosts != self._hosts:
+            self._hosts = hosts
+            self._changed()
+        return hosts
+
+    def _start(self, plan: Plan) -> str:
+        subject = ("launch", plan.gang.name)
+        try:
+            handle = self._call("start the gang", lambda: _lasting(lambda: self.engine.launch(plan)))
+        except Transient as error:
+            self._failed(subject, error)
+            raise
+        self._backoff.worked(subject)
+        return handle
+
+    def _look(self, handle: str) -> None:
+        subject = ("look", handle)
+        before = self._seen.get(handle), self._backoff.said(subject)
+        try:
+            status = self._call("look at the gang", lambda: self.engine.observe(handle))
+        except EngineError as error:
+            self._failed(subject, error)
+        else:
+            self._backoff.worked(subject)
+            with self._lock:
+                if handle in self._looks:  # else it was forgotten meanwhile
+                    self._seen[handle] = status
+        with self._lock:
+            self._looks.discard(handle)
+        if before != (self._seen.get(handle), self._backoff.said(subject)):
+            self._changed()
+
+
+def _lasting(body: Callable[[], T]) -> T:
+    """Carry out ``body``. Raises EngineError for what would fail again: see :func:`is_final`, and a zero byte in an argument."""
+    try:
+        return body()
+    except OSError as error:
+        if is_final(error):
+            raise EngineError(str(error)) from error
+        raise
+    except ValueError as error:
+        raise EngineError(str(error)) from error
