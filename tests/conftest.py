@@ -160,6 +160,7 @@ def submit_gang(
     cpus: str = "0.1",
     attempts: int = 1,
     timeout: int | None = None,
+    queue: str = "default",
 ) -> str:
     """Register and submit a Python script as a multi-node job; returns the job id."""
     container = {
@@ -175,9 +176,7 @@ def submit_gang(
     if timeout:
         definition["timeout"] = {"attemptDurationSeconds": timeout}
     registered = client.batch("RegisterJobDefinition", **definition)
-    submitted = client.batch(
-        "SubmitJob", jobName=name, jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
-    )
+    submitted = client.batch("SubmitJob", jobName=name, jobQueue=queue, jobDefinition=registered["jobDefinitionArn"])
     return str(submitted["jobId"])
 
 

@@ -1,0 +1,336 @@
+"""Engines that hang, fail and are full: each on its own thread, none in the way of another."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import http.server
+import json
+import logging
+import os
+import resource
+import socket
+import socketserver
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.client import Client
+from orchestrator.engines import runner
+from orchestrator.engines.base import (
+    EngineError,
+    Gang,
+    GangStatus,
+    Host,
+    NodeStatus,
+    NotYet,
+    Placement,
+    Plan,
+    Transient,
+)
+from orchestrator.engines.local import LocalEngine
+from orchestrator.engines.several import Several
+from orchestrator.engines.transience import is_final
+from orchestrator.server import Server
+from shared_store.layout import Store
+from tests.conftest import processes_of, submit_gang, wait_for
+
+HOST = "engine/host"
+
+
+def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "exec sleep 600", nodes: int = 1) -> Gang:
+    return Gang(
+        job=name,
+        attempt=1,
+        epoch=1,
+        job_epoch=1,
+        run="run",
+        store=str(directory / "store"),
+        queue="default",
+        pool="local",
+        main=0,
+        commands=[["sh", "-c", script]] * nodes,
+        environments=[{}] * nodes,
+        placements=[Placement(host, (), 0.1, 16)] * nodes,
+        grace=1.0,
+        directory=None,
+    )
+
+
+class Fake:
+    """An engine whose calls do what a test wants, and note on which thread they did."""
+
+    name, queues, elastic, images, address = "engine", False, False, False, None
+
+    def __init__(self) -> None:
+        self.free, self.threads, self.closed = threading.Event(), set[str](), 0
+        self.free.set()
+        self.error: Exception | None = None
+
+    def _do(self) -> None:
+        self.threads.add(threading.current_thread().name)
+        self.free.wait()
+        if self.error is not None:
+            raise self.error
+
+    def capacity(self) -> Sequence[Host]:
+        self._do()
+        return [Host(HOST, 4, (), 1024)]
+
+    def plan(self, gang: Gang) -> Plan:
+        return Plan(gang, [])
+
+    def launch(self, plan: Plan) -> str:
+        self._do()
+        return plan.gang.name
+
+    def observe(self, handle: str) -> GangStatus:
+        self._do()
+        return [NodeStatus(True, "here")]
+
+    def stop(self, handle: str, grace: float) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@contextlib.contextmanager
+def engines(*made: Any) -> Iterator[Several]:
+    several = Several(made)
+    try:
+        yield several
+    finally:
+        several.close()
+
+
+def launched(several: Several, what: Gang) -> str:
+    def ask() -> str | None:
+        try:
+            return several.launch(several.plan(what))
+        except NotYet:
+            return None
+
+    handle: str = wait_for(ask, 10, "the launch")
+    return handle
+
+
+@pytest.mark.parametrize(
+    ("number", "final"),
+    [
+        *((name, False) for name in ("EMFILE", "ENFILE", "EAGAIN", "ENOMEM", "ESTALE", "ENOSPC", "EIO", "EDQUOT")),
+        *((name, False) for name in ("EROFS", "ETIMEDOUT", "ECONNREFUSED", "EBUSY", "EINTR")),
+        *((name, True) for name in ("ENOENT", "ENOTDIR", "EACCES", "EPERM", "E2BIG", "ENAMETOOLONG", "ENOEXEC")),
+    ],
+)
+def test_what_may_pass_is_tried_again_and_what_may_not_is_final(number: str, final: bool) -> None:
+    assert is_final(OSError(getattr(errno, number), number)) is final
+
+
+def test_an_error_without_a_number_is_not_final() -> None:
+    assert not is_final(OSError("a library's own"))
+
+
+def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(runner, "OVERDUE", 0.2)
+    fake = Fake()
+    with engines(fake) as several:
+        handle = launched(several, gang(tmp_path))
+        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        fake.free.clear()
+        before = time.monotonic()
+
+        def says() -> str:
+            [node] = several.observe(handle) or []
+            assert node.running and node.address == "here"
+            return node.waiting
+
+        said = wait_for(says, 10, "that it does not answer")
+        assert said.startswith("the engine engine has not answered since "), said
+        assert several.capacity(patience=60) == [Host(HOST, 4, (), 1024)], "what it told last"
+        with pytest.raises(NotYet, match="has not answered since") as wait:
+            several.launch(several.plan(gang(tmp_path, "other")))
+        assert wait.value.unknown, "it may have been started"
+        assert time.monotonic() - before < 30
+        fake.free.set()
+        wait_for(lambda: not says(), 10, "that it answers again")
+        launched(several, gang(tmp_path, "other"))
+    assert [record.getMessage() for record in caplog.records] == [said, "the engine engine answers again"]
+    assert fake.threads == {"MainThread", "engine engine"}, "the first look at its hosts comes before the thread"
+    assert fake.closed == 1
+
+
+def test_an_engine_that_fails_is_logged_once_and_its_gangs_count_as_running(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fake = Fake()
+    with engines(fake) as several:
+        handle = launched(several, gang(tmp_path))
+        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        for error, said in (
+            (
+                OSError(errno.EMFILE, "Too many open files"),
+                "can't look at the gang now ([Errno 24] Too many open files)",
+            ),
+            (RuntimeError("no\nwords"), "failed to look at the gang (RuntimeError: no words)"),
+        ):
+            fake.error = error
+            [node] = wait_for(
+                lambda said=said: (s := several.observe(handle)) and said in s[0].waiting and s,  # type: ignore[misc]
+                20,
+                said,
+            )
+            assert node.running
+            with pytest.raises(EngineError, match="trying again"):
+                several.stop(handle, 0)
+        fake.error = None
+        wait_for(lambda: (s := several.observe(handle)) and not s[0].waiting, 20, "that it is seen again")
+        assert several.stop(handle, 0) == [NodeStatus(True, "here")]
+    looks = [record for record in caplog.records if "look at the gang" in record.getMessage()]
+    assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
+
+
+def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_started(tmp_path: Path) -> None:
+    Store(tmp_path / "store").open()
+    engine = LocalEngine(tmp_path, cpus=4)
+    with engines(engine) as several:
+        handle = launched(several, gang(tmp_path, "running", "localhost"))
+        wait_for(lambda: several.observe(handle), 10, "the first picture")
+        taken = []
+        before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 20, before[1]))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.open("/dev/null", os.O_RDONLY))
+            with pytest.raises(OSError, match="Too many open files"):
+                engine.observe(handle.split(" ", 2)[2])
+            for spare in range(12):  # wherever it runs out of them
+                for descriptor in taken[-spare:] if spare else []:
+                    os.close(descriptor)
+                del taken[len(taken) - spare :]
+                try:
+                    engine.launch(engine.plan(gang(tmp_path, f"half-{spare}", "localhost", nodes=2)))
+                    break
+                except (OSError, Transient):
+                    pass
+                with contextlib.suppress(OSError):
+                    while True:
+                        taken.append(os.open("/dev/null", os.O_RDONLY))
+        finally:
+            for descriptor in taken:
+                os.close(descriptor)
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        try:
+            [node] = wait_for(lambda: (s := several.observe(handle)) and not s[0].waiting and s, 60, "that it is seen")
+            assert node.running
+            names = {_gang_of(pid) for pid in processes_of(tmp_path)}
+            assert names <= {"running/1/1", f"half-{spare}/1/1"} and spare > 2, (names, spare)
+        finally:
+            several.stop(handle, 0)
+            for name in range(spare + 1):
+                engine.stop(json.dumps({"gang": f"half-{name}/1/1", "nodes": []}), 0)
+    assert processes_of(tmp_path) == []
+
+
+def _gang_of(pid: int) -> str:
+    environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    return next((item[12:].decode() for item in environment if item.startswith(b"MUSTER_GANG=")), "")
+
+
+class HungDocker(socketserver.ThreadingUnixStreamServer):
+    """A Docker daemon that says what it is, and from then on takes every request and answers none."""
+
+    daemon_threads = True
+    answers = {
+        "/version": {"ApiVersion": "1.41", "Version": "20.10"},
+        "/info": {"NCPU": 4, "MemTotal": 2**33, "Name": socket.gethostname()},
+    }
+
+    def __init__(self, path: Path) -> None:
+        self.over = threading.Event()
+        self.asked: list[str] = []
+        server = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                for suffix, answer in server.answers.items():
+                    if self.path.endswith(suffix):
+                        body = json.dumps(answer).encode()
+                        self.send_response(200)
+                        self.send_header("Content-Type", "application/json")
+                        self.send_header("Content-Length", str(len(body)))
+                        self.end_headers()
+                        self.wfile.write(body)
+                        return
+                if self.path.endswith("/networks/bridge"):
+                    self.send_error(404)
+                    return
+                server.asked.append(self.path)
+                server.over.wait()
+                self.close_connection = True
+
+            do_POST = do_GET
+
+            def address_string(self) -> str:
+                return "unix"
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        super().__init__(str(path), Handler)
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+
+
+def test_a_docker_daemon_that_hangs_delays_no_gang_of_another_engine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("docker")
+    monkeypatch.setattr(runner, "OVERDUE", 1.0)
+    daemon = HungDocker(tmp_path / "docker.sock")
+    monkeypatch.setenv("DOCKER_HOST", f"unix://{tmp_path}/docker.sock")
+    server = Server(tmp_path, port=0, cpus=2, engines=("local", "docker"))
+    server.start()
+    try:
+        with Client(server.url) as client:
+
+            def detail(job: str) -> dict[str, Any]:
+                found: dict[str, Any] = client.get(f"/api/jobs/{job}")
+                return found
+
+            def status(job: str, wanted: str) -> None:
+                wait_for(lambda: detail(job)["status"] == wanted, 30, f"{job} {wanted}")
+
+            running = submit_gang(client, "import time; time.sleep(600)")
+            status(running, "RUNNING")
+            hung = submit_gang(client, "pass", queue="docker")
+            wait_for(lambda: daemon.asked, 30, "a request that is not answered")
+            said = "the docker engine has not answered since "
+            wait_for(lambda: detail(hung)["statusReason"].startswith(said), 30, "the reason")
+            # all of this while one call to Docker is in the air
+            status(submit_gang(client, "print('here')"), "SUCCEEDED")
+            status(submit_gang(client, "import time; time.sleep(600)", timeout=60), "RUNNING")
+            assert [host["name"].partition("/")[0] for host in client.get("/api/capacity")["hosts"]] == [
+                "localhost",
+                "docker",
+            ]
+            client.batch("TerminateJob", jobId=running, reason="enough")
+            status(running, "FAILED")
+            assert detail(hung)["status"] == "STARTING" and len(daemon.asked) == 1
+    finally:
+        daemon.over.set()
+        server.close()
+        daemon.shutdown()
+        daemon.server_close()
+        for pid in processes_of(tmp_path):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, 9)
+    assert sum(said in record.getMessage() for record in caplog.records) == 1
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR and record.exc_info] == []
