@@ -22,7 +22,7 @@ from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
 from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
 from orchestrator.definition import GangNeeds, gang_needs
-from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, engine_of
+from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, Plan, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
 from orchestrator.peers import Peers
@@ -110,10 +110,12 @@ class Gangs:
         )
 
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
-        needs = gang_needs(job.node_properties)
+        def plan() -> Plan:
+            return self.engine.plan(self.gang(session, job, attempt, gang_needs(job.node_properties)))
+
         self.bus.expect(job.id, attempt.number)
         try:
-            attempt.handle = self.engine.launch(self.engine.plan(self.gang(session, job, attempt, needs)))
+            attempt.handle = self.engine.launch(_name(attempt), [str(node["host"]) for node in attempt.nodes], plan)
         except NotYet as wait:
             if job.stop_reason is not None and not wait.unknown:  # nothing of it was started: there is nothing to stop
                 self._close(session, job, attempt, Verdict(Ending.STOPPED, job.stop_reason), [])
@@ -318,8 +320,7 @@ class Gangs:
         self.bus.forget(*key)
         with suppress(OSError):  # while this controller lives, another one may then say that the run is written
             close_claim(self.store.run(job.run), attempt.epoch)
-        name = f"{job.id}/{attempt.number}/{attempt.epoch}"
-        self.engine.forget(str(attempt.nodes[0]["host"]), name, attempt.handle)
+        self.engine.forget(str(attempt.nodes[0]["host"]), _name(attempt), attempt.handle)
 
     def _close_attempt(
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
@@ -372,6 +373,11 @@ class Gangs:
     def _progress(self, job: Job) -> str:
         checkpoints = list_checkpoints(self.store.run(job.run))
         return f"; last checkpoint: iteration {checkpoints[-1].iteration}" if checkpoints else ""
+
+
+def _name(attempt: Attempt) -> str:
+    """Its gang's, as in :attr:`orchestrator.engines.base.Gang.name`."""
+    return f"{attempt.job_id}/{attempt.number}/{attempt.epoch}"
 
 
 def _is_native(job: Job) -> bool:

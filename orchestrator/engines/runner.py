@@ -109,20 +109,21 @@ class Runner:
         """As the engine plans it, on the caller's thread. Raises EngineError."""
         return self._call("plan the gang", lambda: _lasting(lambda: self.engine.plan(gang)))
 
-    def launch(self, plan: Plan) -> str:
-        """The handle of the gang once it is started. Raises :class:`Underway` until then, NotYet and EngineError."""
-        gang = plan.gang.name
-        subject = ("launch", gang)
-        with self._lock:
-            launch = self._launches.get(gang)
-            if launch is None:
-                if self._backoff.waits(subject):
-                    raise self._refused[gang]
-                launch = self._launches[gang] = self._submit(lambda: self._start(plan))
-                launch.add_done_callback(lambda _: self._changed())
-            if not launch.done():
-                raise Underway(self.silence or "")
-            del self._launches[gang]
+    def launch(self, gang: str, plan: Callable[[], Plan]) -> str:
+        """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
+
+        ``plan`` is called, on the caller's thread, where the gang's launch is not under way. One thread launches.
+        """
+        launch = self._launches.get(gang)
+        if launch is None:
+            if self._backoff.waits(("launch", gang)):
+                raise self._refused[gang]
+            planned = plan()
+            launch = self._launches[gang] = self._submit(lambda: self._start(planned))
+            launch.add_done_callback(lambda _: self._changed())
+        if not launch.done():
+            raise Underway(self.silence or "")
+        del self._launches[gang]
         try:
             return launch.result()
         except NotYet as error:

@@ -91,10 +91,16 @@ class Several:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)
 
-    def launch(self, plan: Plan) -> str:
-        """The gang's handle once it is started; does not wait. Raises NotYet until then, and EngineError."""
-        name = engine_of(plan.gang.placements[0].host)
-        return f"{name} {len(plan.nodes)} {self._runner(name).launch(plan)}"
+    def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan]) -> str:
+        """The handle of a gang once it is started; does not wait. Raises NotYet until then, and EngineError.
+
+        Args:
+            gang: Its name.
+            hosts: Where its nodes are placed.
+            plan: Makes its plan, where it has not been handed to the engine yet.
+        """
+        name = engine_of(hosts[0])
+        return f"{name} {len(hosts)} {self._runner(name).launch(gang, plan)}"
 
     def observe(self, handle: str) -> GangStatus | None:
         """The newest picture of a gang; None before the first. Does not wait, and raises nothing.

@@ -112,7 +112,7 @@ def engines(*made: Any) -> Iterator[Several]:
 def launched(several: Several, what: Gang) -> str:
     def ask() -> str | None:
         try:
-            return several.launch(several.plan(what))
+            return several.launch(what.name, [each.host for each in what.placements], lambda: several.plan(what))
         except NotYet:
             return None
 
@@ -156,7 +156,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
         assert said.startswith("the engine engine has not answered since "), said
         assert several.capacity(patience=60) == [Host(HOST, 4, (), 1024)], "what it told last"
         with pytest.raises(NotYet, match="has not answered since") as wait:
-            several.launch(several.plan(gang(tmp_path, "other")))
+            several.launch("other/1/1", [HOST], lambda: several.plan(gang(tmp_path, "other")))
         assert wait.value.unknown, "it may have been started"
         assert time.monotonic() - before < 30
         fake.free.set()
