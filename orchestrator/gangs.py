@@ -81,7 +81,10 @@ class Gangs:
                 raise StoreError("it was deleted from the store while the job ran")
             self._describe(run, job)
             epoch = take_epoch(run, max(known, default=0), Claim(self.peers.id, job.id, len(job.attempts) + 1))
-        except (OSError, StaleEpoch) as error:  # a volume that is full or away may come back; another controller was faster
+        except (
+            OSError,
+            StaleEpoch,
+        ) as error:  # a volume that is full or away may come back; another controller was faster
             said = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
             raise StoreUnavailable(said) from error
         except (StoreError, ValueError) as error:
