@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.bus import LARGEST_MESSAGE, LARGEST_PROGRESS, Credential, Node, node_of, prefix, presence_key
-from shared_store.files import read_json, write_atomic, write_json
+from shared_store.files import DamagedFile, json_object, read_json, write_atomic, write_json
 
 log = logging.getLogger("muster.bus")
 
@@ -264,10 +264,9 @@ class Bus:
 def _message(payload: bytes) -> dict[str, Any]:
     """The JSON object in a message; empty where there is none."""
     try:
-        value = json.loads(payload)
-    except (ValueError, RecursionError):
+        return json_object(payload, "message")
+    except DamagedFile:
         return {}
-    return value if isinstance(value, dict) else {}
 
 
 def _free_port() -> int:

@@ -83,15 +83,23 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
         data = _read_regular(path, largest)
     except (FileNotFoundError, NotADirectoryError):
         return None
+    return json_object(data, str(path))
+
+
+def json_object(data: bytes | str, name: str) -> dict[str, Any]:
+    """The JSON object in ``data``, nested at most :data:`DEEPEST_JSON` levels, with text and numbers that JSON can repeat.
+
+    NaN and Infinity are read as None. Raises DamagedFile, with ``name`` in front, where it is anything else.
+    """
     try:
         value = json.loads(data, parse_constant=lambda _: None)
-        _check_plain(value, data)
+        _check_plain(value, data if isinstance(data, bytes) else data.encode())
     except RecursionError:
-        raise DamagedFile(f"{path}: nested too deep") from None
+        raise DamagedFile(f"{name}: nested too deep") from None
     except ValueError as error:
-        raise DamagedFile(f"{path}: not JSON ({error})") from None
+        raise DamagedFile(f"{name}: not JSON ({error})") from None
     if not isinstance(value, dict):
-        raise DamagedFile(f"{path}: not a JSON object")
+        raise DamagedFile(f"{name}: not a JSON object")
     return value
 
 

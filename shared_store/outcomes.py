@@ -12,7 +12,10 @@ from shared_store.files import read_json, write_json
 from shared_store.layout import Run
 
 LONGEST_TEXT = 16 << 10
-"""Characters that are read of a reason, a message or a traceback."""
+"""Characters of a reason, a message or a traceback; what is longer is cut where it is written, and again where it is read, since
+a job can write the file itself."""
+_LATEST = 2.0**40
+"""Unix times [s] in an outcome are smaller."""
 _NUMBER = int | float
 EX_TEMPFAIL = 75
 """Exit code for "checkpointed and left on request: start me again, and don't count it as a failure" (sysexits.h)."""
@@ -46,8 +49,8 @@ class Outcome:
 
 
 def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
-    """Commit ``outcome``. Raises OSError where the store can't be written."""
-    write_json(run.outcome(job, attempt, outcome.node), asdict(outcome))
+    """Commit ``outcome``, its texts bounded. Raises OSError where the store can't be written."""
+    write_json(run.outcome(job, attempt, outcome.node), asdict(bounded(outcome)))
 
 
 def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
@@ -64,15 +67,34 @@ def parse_outcome(value: dict[str, Any]) -> Outcome:
     error = FirstError(**value["error"]) if value.get("error") else None
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
+    if not 0 <= outcome.exit_code <= 255:
+        raise TypeError("exit_code is not one of a process")
     if error is not None:
         _check(error, rank=int, message=str, traceback=str, time=_NUMBER)
-        message, traceback = error.message[:LONGEST_TEXT], error.traceback[:LONGEST_TEXT]
-        outcome = replace(outcome, error=replace(error, message=message, traceback=traceback))
-    return replace(outcome, reason=outcome.reason[:LONGEST_TEXT])
+    if not all(0 <= time < _LATEST for time in (outcome.started, outcome.ended, error.time if error else 0)):
+        raise TypeError("a time is out of range")
+    return bounded(outcome)
+
+
+def bounded(outcome: Outcome) -> Outcome:
+    """The outcome with at most :data:`LONGEST_TEXT` characters in each of its texts: the end of a traceback, the start of others."""
+    error = outcome.error
+    if error is not None:
+        error = replace(error, message=_cut(error.message), traceback=_cut(error.traceback, keep_end=True))
+    signal = None if outcome.signal is None else outcome.signal[:32]
+    return replace(outcome, signal=signal, reason=_cut(outcome.reason), error=error)
+
+
+def _cut(text: str, keep_end: bool = False) -> str:
+    if len(text) <= LONGEST_TEXT:
+        return text
+    note = f"({len(text) - LONGEST_TEXT + 64} characters left out)"
+    kept = LONGEST_TEXT - 64
+    return f"{note} …\n{text[-kept:]}" if keep_end else f"{text[:kept]} … {note}"
 
 
 def _check(value: object, **kinds: Any) -> None:
     for name, kind in kinds.items():
         found = getattr(value, name)
-        if not isinstance(found, kind) or (isinstance(found, int) and abs(found) >= 2**63):
+        if not isinstance(found, kind) or isinstance(found, bool) or (isinstance(found, int) and abs(found) >= 2**63):
             raise TypeError(f"{name} is of the wrong type or too large")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.bus import LARGEST_PROGRESS, Credential, prefix, presence_key
 from shared_store.contract import NodeContract
+from shared_store.files import json_object
 
 if TYPE_CHECKING:
     import zenoh
@@ -118,9 +119,9 @@ class NodeBus:
         """Take a command that the controller has proved to be its own; drop any other."""
         key = str(query.key_expr)
         try:
-            request = json.loads(query.payload.to_bytes())
+            request = json_object(query.payload.to_bytes(), "command")
             number, proof = request["id"], request["proof"]
-        except (AttributeError, ValueError, KeyError, TypeError, RecursionError):
+        except (AttributeError, ValueError, KeyError):  # AttributeError: no payload
             number, proof = "", None
         known = not isinstance(number, str) or number in self._heard
         if known or not self._credential.proves(proof, "command", key, number):

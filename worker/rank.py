@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import signal
@@ -14,11 +13,23 @@ from pathlib import Path
 from typing import IO, Any
 
 from shared_store.contract import NodeContract
+from shared_store.files import DamagedFile, json_object, read_json
 from shared_store.outcomes import FirstError
 from shared_store.tied import tied
 
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""
+_LONGEST_MESSAGE = 65536
+"""Bytes of a message on the progress pipe; a longer one is dropped."""
+_LONGEST_VALUE = 1024
+"""Characters of a text in such a message; the rest is cut."""
+_TOO_LONG = b"\0"
+"""Stands for the beginning of a message that is too long, until its end comes; no JSON begins with it."""
+_MOST_VALUES = 100
+"""Names that a rank may report in all; further ones are dropped."""
+_LARGEST_NUMBER = 2**63
+_LARGEST_ERROR_FILE = 2**20
+"""Bytes; of a larger error file nothing is read."""
 
 
 class Rank:
@@ -121,27 +132,45 @@ class Rank:
         return [self._keep(stream, line) for line in whole]
 
     def listen(self) -> list[str] | None:
-        """What it said of saves since the last call; notes its progress. None at the end of its messages."""
+        """What it said of saves since the last call; notes its progress. None at the end of its messages.
+
+        The program itself may write here: what is no message of scalars is dropped.
+        """
         chunk = os.read(self.beacon, 65536)
         if not chunk:
             os.close(self.beacon)
             return None
         *lines, self._beacon = (self._beacon + chunk).split(b"\n")
+        if len(self._beacon) > _LONGEST_MESSAGE:
+            self._beacon = _TOO_LONG
         said = []
         self.spoke = time.monotonic()
         for line in lines:
+            if line.startswith(_TOO_LONG) or len(line) > _LONGEST_MESSAGE:
+                continue
             try:
-                message = json.loads(line)
+                message = json_object(line, "message")
             except ValueError:
                 continue
-            if "iteration" in message:
+            iteration = message.get("iteration")
+            if type(iteration) is int and 0 <= iteration < _LARGEST_NUMBER:
                 self.heard = time.monotonic()
+            else:
+                message.pop("iteration", None)
             if message.get("done"):
                 self.heard = None
             if "said" in message:
-                said.append(str(message.pop("said")))
-            self.progress |= message
+                said.append(str(message.pop("said"))[:_LONGEST_VALUE])
+            self._note(message)
         return said
+
+    def _note(self, message: dict[str, Any]) -> None:
+        for name, value in message.items():
+            known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
+            if known and isinstance(value, str):
+                self.progress[name] = value[:_LONGEST_VALUE]
+            elif known and (value is None or (isinstance(value, int | float) and abs(value) < _LARGEST_NUMBER)):
+                self.progress[name] = value
 
     def rest(self, stream: str) -> str:
         """What was printed after the last newline."""
@@ -168,13 +197,16 @@ class Rank:
     def first_error(self) -> FirstError | None:
         """From the error file that ``@record`` or our own commands write, else the last traceback on standard error."""
         try:
-            message = json.loads(self.error_file.read_bytes())["message"]
+            message = (read_json(self.error_file, _LARGEST_ERROR_FILE) or {})["message"]
             if isinstance(message, str):
                 return FirstError(self.number, message, "", self.ended)
             extra = message["extraInfo"]
             when = float(extra.get("time") or extra.get("timestamp", self.ended))
+            when = when if 0 <= when <= self.ended else self.ended
             return FirstError(self.number, str(message["message"]), str(extra.get("py_callstack", "")), when)
-        except (OSError, ValueError, KeyError, TypeError):
+        except DamagedFile as error:
+            return self._traceback() or FirstError(self.number, str(error), "", self.ended)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return self._traceback()
 
     def _traceback(self) -> FirstError | None:

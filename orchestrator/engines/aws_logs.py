@@ -5,7 +5,6 @@ For a controller whose store is not the volume of the nodes, and for images with
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 from botocore.parsers import ResponseParserError
 
+from shared_store.files import json_object
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import Outcome, parse_outcome
 
@@ -83,8 +83,8 @@ class NodeLog:
 def read_outcome_line(text: str) -> Outcome | None:
     """The outcome that a supervisor printed; None where it is damaged."""
     try:
-        return parse_outcome(json.loads(text.removeprefix(OUTCOME_LINE)))
-    except (ValueError, TypeError, AttributeError):
+        return parse_outcome(json_object(text.removeprefix(OUTCOME_LINE), "outcome"))
+    except (ValueError, TypeError):
         return None
 
 

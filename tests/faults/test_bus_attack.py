@@ -233,7 +233,7 @@ def test_reports_that_are_too_large_too_deep_or_no_object_are_dropped(bus: Bus) 
     session, key = attacker(bus), "muster/mallory/1/0/progress"
     settled(bus, session)
     before = bus.progress("mallory", 1, 0)
-    for text in ("[1]", "1", "null", '"x"', "{", "[" * 60_000, json.dumps({"fill": "x" * 70_000})):
+    for text in ("[1]", "1", "null", '{"reward": 1e999}', '"x"', "{", "[" * 60_000, json.dumps({"fill": "x" * 70_000})):
         session.put(key, text, attachment=own(bus).prove("progress", key, text))
     victim_key = "muster/mallory/1/1/progress"
     session.put(victim_key, "{}", attachment=own(bus).prove("progress", victim_key, "{}"))

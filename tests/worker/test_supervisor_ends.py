@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from shared_store.epoch import raise_epoch
+from shared_store.outcomes import LONGEST_TEXT
 from tests.conftest import alive, wait_for
 from tests.worker.node import Nodes, gone
 
@@ -68,6 +69,9 @@ def test_a_silent_failure_is_told_by_its_code(node: Nodes) -> None:
         ({"message": {"message": "m", "extraInfo": {"timestamp": "soon"}}}, "on stderr", "", None),
         ([], "on stderr", "", None),
         ("", "on stderr", "", None),
+        ({"message": {"message": "m", "extraInfo": [1]}}, "on stderr", "", None),
+        ({"message": {"message": "m", "extraInfo": {"time": -1e300}}}, "m", "", None),
+        ({"message": "x" * 100_000}, "x" * (LONGEST_TEXT - 64) + " … (83680 characters left out)", "", None),
     ],
 )
 def test_the_error_file_of_torchrun_is_honoured_if_it_holds_an_error(
@@ -81,6 +85,54 @@ def test_the_error_file_of_torchrun_is_honoured_if_it_holds_an_error(
     assert error
     assert (error.message, error.traceback) == (message, traceback)
     assert error.time == when if when else abs(error.time - time.time()) < 20
+
+
+@pytest.mark.parametrize(
+    ("write", "problem"),
+    [
+        ("file.write('[' * 200_000)", "nested too deep"),
+        ("file.write('x' * 60_000_000)", "more than 1048576 bytes"),
+        ("file.close(); os.remove(path); os.mkfifo(path)", "not a regular file"),
+    ],
+)
+def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time(
+    node: Nodes, write: str, problem: str
+) -> None:
+    n = node()
+    begin = "import os, sys; path = os.environ['TORCHELASTIC_ERROR_FILE']; file = open(path, 'w'); "
+    assert n.python(f"{begin}{write}; sys.exit(7)") == 7
+    ended = n.ended()
+    assert ended.error and ended.error.message.endswith(f"error-0.json: {problem}")
+    assert ended.reason == f"rank 0 exited with code 7: {ended.error.message}"
+
+
+def test_what_a_program_writes_to_the_progress_pipe_never_ends_its_supervisor(node: Nodes) -> None:
+    n = node(stall_timeout=600.0)
+    lines = [
+        "[1]",
+        "1",
+        "null",
+        '"x"',
+        "{",
+        "[" * 50_000,
+        '{"iteration": []}',
+        '{"iteration": 1e400}',
+        '{"said": {"a": 1}}',
+    ]
+    script = (
+        "import os, resource\nfd = int(os.environ['MUSTER_PROGRESS_FD'])\nos.set_blocking(fd, True)\n"
+        "def say(text):\n"
+        "    data = text.encode()\n"
+        "    while data: data = data[os.write(fd, data):]\n"
+        f"for line in {lines!r}: say(line + '\\n')\n"
+        "for name in range(100_000): say('{\"%d\": 1}\\n' % name)\n"
+        "for _ in range(200): say('x' * 1_000_000)\n"
+        "say('\\n{\"iteration\": 3}\\n')\n"
+        "peak = [l for l in open(f'/proc/{os.getppid()}/status') if l.startswith('VmHWM')][0].split()[1]\n"
+        "print(int(peak) < 100_000, peak)"
+    )
+    assert n.python(script) == 0
+    assert n.output()[0].startswith("True"), n.output()
 
 
 def test_torch_s_own_record_decorator_reports_through_the_supervisor(node: Nodes, tmp_path: Path) -> None:

@@ -1,0 +1,56 @@
+"""An outcome file may have been written by the job itself: what is read of it is typed and bounded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.layout import Run
+from shared_store.outcomes import LONGEST_TEXT, FirstError, Outcome, bounded, read_outcome, write_outcome
+
+ERROR = FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
+OUTCOME = Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
+
+
+def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(tmp_path: Path) -> None:
+    run, long = Run(tmp_path), "begin " + "x" * 10_000_000 + " end"
+    error = replace(ERROR, message=long, traceback=long)
+    write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
+    assert run.outcome("job", 1, 0).stat().st_size < 4 * LONGEST_TEXT
+    outcome = read_outcome(run, "job", 1, 0)
+    assert outcome and outcome.error and outcome == bounded(outcome)
+    assert outcome.reason == outcome.error.message
+    assert outcome.reason.startswith("begin x") and outcome.reason.endswith("x … (9983690 characters left out)")
+    assert outcome.error.traceback.startswith("(9983690 characters left out) …") and outcome.error.traceback.endswith(
+        " end"
+    )
+    assert max(len(outcome.reason), len(outcome.error.traceback)) <= LONGEST_TEXT
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exit_code": 10**30},
+        {"exit_code": -1},
+        {"exit_code": 256},
+        {"exit_code": "1"},
+        {"exit_code": True},
+        {"ended": -1e300},
+        {"ended": 1e300},
+        {"started": None},
+        {"reason": ["x"]},
+        {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
+        {"error": [1]},
+        {"error": "x"},
+        {"other": 1},
+    ],
+)
+def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = Run(tmp_path).outcome("job", 1, 0)
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({**asdict(OUTCOME), **change}))
+    assert read_outcome(Run(tmp_path), "job", 1, 0) is None
