@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 from orchestrator.api import batch, logs, native
 from orchestrator.api.auth import Access, Guard, error_response, kind_of
 from orchestrator.api.errors import ClientError
-from orchestrator.api.limits import RateLimit
+from orchestrator.api.limits import RateLimit, parse
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError
 from shared_store import __version__
@@ -92,7 +92,7 @@ async def _body(request: Request) -> Any:
     """The request's JSON; its size is bounded by the guard."""
     try:
         text = (await request.body()).decode()
-        value = json.loads(text or "{}")
+        value = parse(text or "{}")
         if "\\u" in text:  # JSON can say half of a character, which no answer and no log could repeat
             json.dumps(value, ensure_ascii=False).encode()
         return value

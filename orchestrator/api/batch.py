@@ -15,7 +15,7 @@ from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from orchestrator.api import auth, definitions, environments, jobs, queues, submission, tags
+from orchestrator.api import auth, definitions, environments, jobs, limits, queues, submission, tags
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
@@ -79,6 +79,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     """The request, checked against AWS's model. Raises ClientError with what is wrong, in one line."""
     if not isinstance(request, dict):
         raise ClientError(f"{operation}: expected a JSON object")
+    limits.check_size(operation, request)
     report = ParamValidator().validate(request, _model().operation_model(operation).input_shape)
     if report.has_errors():
         message = " ".join(report.generate_report().split())

@@ -47,8 +47,6 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
 def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeJobDefinitions by names or ARNs, by name and status, or all; the newest revision first."""
     listed = request.get("jobDefinitions") or []
-    if len(listed) > 100:
-        raise ClientError("DescribeJobDefinitions takes at most 100 job definitions")
     query = select(JobDefinition).order_by(JobDefinition.name, JobDefinition.revision.desc())
     if listed:
         wanted = [plain_name(each, "job-definition").partition(":") for each in listed]

@@ -108,8 +108,6 @@ def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
 
 def describe_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeSchedulingPolicies by ARNs; unknown ones are passed over."""
-    if len(request["arns"]) > 100:
-        raise ClientError("DescribeSchedulingPolicies takes at most 100 ARNs")
     found = [context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy")) for arn in request["arns"]]
     return {
         "schedulingPolicies": [

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive
@@ -13,12 +17,78 @@ LARGEST_BODY = 1 << 20
 """Bytes of any request's body."""
 LARGEST = {"submitjob": 30 << 10, "registerjobdefinition": 24 << 10}
 """Bytes of the body of these operations (lower case), as on AWS."""
+MOST_VALUES = 10_000
+"""Texts, numbers, lists and objects of a request."""
+DEEPEST = 50
+"""Levels of lists and objects of a request."""
+LARGEST_NUMBER = 2**63 - 1
+MOST = {
+    ("DescribeJobs", "jobs"): 100,
+    ("TerminateJobs", "jobs"): 50,
+    ("CancelJobs", "jobs"): 50,
+    ("DescribeJobDefinitions", "jobDefinitions"): 100,
+    ("DescribeJobQueues", "jobQueues"): 100,
+    ("DescribeComputeEnvironments", "computeEnvironments"): 100,
+    ("DescribeSchedulingPolicies", "arns"): 100,
+    ("UntagResource", "tagKeys"): 50,
+}
+"""Entries of these lists of a request, as on AWS."""
 RATE = 1000
 """Requests per second that one client may send for long, unless the server is told otherwise."""
 _FULL = 2.0
 """Seconds after which a bucket that nobody took from is full again, and need not be kept."""
 _SWEEP = 10.0
 """Seconds between two looks for such buckets."""
+
+
+def parse(text: str) -> Any:
+    """The value of a request's JSON. Raises ClientError where it is not JSON or beyond a limit."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ClientError(f"the request is nested deeper than {DEEPEST} levels") from None
+    except ValueError:
+        raise ClientError("the request is not JSON") from None
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > 20 or abs(int(digits)) > LARGEST_NUMBER:
+        raise ClientError(f"a number of the request ({digits[:30]}…) is larger than {LARGEST_NUMBER}")
+    return int(digits)
+
+
+def check_size(operation: str, request: Mapping[str, Any]) -> None:
+    """Refuse a request beyond a limit before anything else is done with it: to look at its size costs next to nothing.
+
+    Raises ClientError, naming the limit.
+    """
+    for (limited, member), most in MOST.items():
+        given = request.get(member) if limited == operation else None
+        if isinstance(given, list) and len(given) > most:
+            raise ClientError(f"{operation} takes at most {most} {member}, not {len(given)}")
+    count, level = 0, [request]
+    for _ in range(DEEPEST):
+        count += len(level)
+        if count > MOST_VALUES:
+            raise ClientError(f"{operation}: the request has more than {MOST_VALUES} values")
+        if any(isinstance(each, float) and not math.isfinite(each) for each in level):
+            raise ClientError(f"{operation}: a number of the request is too large")
+        nested = [each for each in level if isinstance(each, dict | list)]
+        if not nested:
+            return
+        level = [inner for each in nested for inner in (each.values() if isinstance(each, dict) else each)]
+    raise ClientError(f"{operation}: the request is nested deeper than {DEEPEST} levels")
+
+
+def check_document(operation: str, request: Mapping[str, Any]) -> None:
+    """The same limit of bytes for a request that was made here as for one that comes over the network. Raises ClientError."""
+    if len(json.dumps(request).encode()) > LARGEST[operation.lower()]:
+        raise _too_large(operation.lower(), LARGEST[operation.lower()])
+
+
+def _too_large(operation: str, limit: int) -> ClientError:
+    shorten = "; shorten its environment and commands" if operation in LARGEST else ""
+    return ClientError(f"{operation}: the request has more than {limit} bytes{shorten}", 413)
 
 
 class Body:
@@ -36,7 +106,7 @@ class Body:
         if self._whole is None:
             length = self._declared or ""
             if length.isascii() and length.isdigit() and (len(length) > 9 or int(length) > self._limit):
-                raise self._too_large()
+                raise _too_large(self._operation, self._limit)
             parts: list[bytes] = []
             size = 0
             more = True
@@ -47,7 +117,7 @@ class Body:
                 parts.append(message.get("body", b""))
                 size += len(parts[-1])
                 if size > self._limit:
-                    raise self._too_large()
+                    raise _too_large(self._operation, self._limit)
                 more = message.get("more_body", False)
             self._whole = b"".join(parts)
         return self._whole
@@ -58,10 +128,6 @@ class Body:
             return await self._receive()
         self._given = True
         return {"type": "http.request", "body": self._whole, "more_body": False}
-
-    def _too_large(self) -> ClientError:
-        shorten = "; shorten its environment and commands" if self._operation in LARGEST else ""
-        return ClientError(f"{self._operation}: the request has more than {self._limit} bytes{shorten}", 413)
 
 
 class RateLimit:

@@ -26,6 +26,7 @@ from orchestrator.api import log_filter
 from orchestrator.api.arns import ACCOUNT, REGION
 from orchestrator.api.auth import error_response
 from orchestrator.api.errors import ClientError
+from orchestrator.api.limits import check_size
 from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
 from orchestrator.api.log_streams import Stream, find_stream, newest_streams
@@ -111,6 +112,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     """The request, checked against AWS's model. Raises LogsError with what is wrong, in one line."""
     if not isinstance(request, dict):
         raise invalid(f"{operation}: expected a JSON object")
+    check_size(operation, request)
     try:
         if "\\u0000" in json.dumps(request, ensure_ascii=False).encode().decode():
             raise invalid(f"{operation}: zero bytes are not allowed")

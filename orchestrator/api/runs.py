@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import batch, definitions, submission
+from orchestrator.api import batch, definitions, limits, submission
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.controller import Controller
@@ -143,6 +143,7 @@ def resume(
         hosts, elastic = controller.engine.capacity(engines), controller.engine.is_elastic(engines)
         if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts, elastic):
             raise ClientError(f"run {run.name}: {impossible}")
+        limits.check_document("RegisterJobDefinition", definition)
         registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
         if chosen and checkpoint is not None:
             environment["MUSTER_CHECKPOINT"] = chosen.name

@@ -335,8 +335,8 @@ def test_many_jobs_are_ended_at_once_each_with_its_own_result(batch: Batch, queu
     for job in (waiting[2], running):
         detail = batch.wait(job)
         assert (detail["status"], detail["statusReason"], detail["isTerminated"]) == ("FAILED", "all of it", True)
-    for jobs in ([], [running] * 51):
-        with refused("takes 1 to 50 jobs"):
+    for jobs, said in (([], "takes at least one job"), ([running] * 51, "takes at most 50 jobs, not 51")):
+        with refused(said):
             batch.api.terminate_jobs(jobs=jobs, reason="x")
 
 

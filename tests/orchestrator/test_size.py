@@ -12,6 +12,17 @@ from orchestrator.server import Server
 from orchestrator.tables import Job
 from tests.conftest import wait_for
 
+OVERSIZED = {
+    "takes at most 100 jobs, not 400000": ("describejobs", '{"jobs": [%s1]}' % ("1," * 399_999)),
+    "takes at most 50 tagKeys": ("untagresource", '{"resourceArn": "a", "tagKeys": [%s"a"]}' % ('"a",' * 50)),
+    "more than 10000 values": ("listjobs", '{"jobQueue": [%s1]}' % ("1," * 400_000)),
+    "nested deeper than 50 levels": ("listjobs", '{"jobQueue": ' + "[" * 60 + "]" * 60 + "}"),
+    "is nested deeper than 50": ("listjobs", "[" * 100_000),
+    f"({'9' * 30}…) is larger than {2**63 - 1}": ("createjobqueue", '{"priority": %s}' % ("9" * 100_000)),
+    f"is larger than {2**63 - 1}": ("createjobqueue", '{"priority": -9223372036854775809}'),
+    "a number of the request is too large": ("createschedulingpolicy", '{"name": "a", "fairsharePolicy": 1e999}'),
+}
+"""Operation and body by what is said of them."""
 RESOURCES = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
 LARGE = [{"name": f"A{number}", "value": "x" * 200} for number in range(90)]
 
@@ -84,3 +95,14 @@ def test_the_children_of_an_array_wait_for_each_other_and_for_others_as_asked(
     assert waits(f"{second}:2") == [(f"{first}:2", "N_TO_N")]
     for job in (first, second):
         call(http, "TerminateJob", jobId=job, reason="done with")
+
+
+@pytest.mark.parametrize("said", OVERSIZED)
+def test_a_request_beyond_a_limit_is_refused_by_the_limits_name(http: httpx.Client, said: str) -> None:
+    operation, body = OVERSIZED[said]
+    answer = http.post(f"/v1/{operation}", content=body)
+    assert answer.status_code == 400 and said in answer.json()["message"] and len(answer.text) < 500
+    if operation == "listjobs":
+        target = {"X-Amz-Target": "Logs_20140328.GetLogEvents", "Content-Type": "application/x-amz-json-1.1"}
+        answer = http.post("/", content=body, headers=target)
+        assert answer.status_code == 400 and said in answer.json()["message"] and len(answer.text) < 500
