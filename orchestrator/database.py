@@ -273,18 +273,21 @@ def _tune_sqlite(connection: Any, _record: object) -> None:
     cursor.close()
 
 
-def find_job(session: Session, reference: str) -> Job | None:
-    """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one)."""
+def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
+    """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one).
+
+    ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
+    """
     job = session.get(Job, reference)
     if job:
         return job
-    named = session.scalars(
-        select(Job).where(Job.name == reference, Job.parent.is_(None)).order_by(Job.created_at.desc())
-    ).first()
+    among = select(Job).where(Job.parent.is_(None))
+    if queues is not None:
+        among = among.where(Job.queue.in_(queues))
+    named = session.scalars(among.where(Job.name == reference).order_by(Job.created_at.desc())).first()
     if named:
         return named
     if len(reference) < 4:
         return None
-    own = select(Job).where(Job.id.startswith(reference, autoescape=True), Job.parent.is_(None))
-    prefixed = session.scalars(own.limit(2)).all()
+    prefixed = session.scalars(among.where(Job.id.startswith(reference, autoescape=True)).limit(2)).all()
     return prefixed[0] if len(prefixed) == 1 else None

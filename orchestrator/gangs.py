@@ -25,6 +25,7 @@ from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, Plan, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.ownership import record_owner
 from orchestrator.peers import Peers
 from orchestrator.pools import engine_options
 from orchestrator.retry import retries
@@ -79,7 +80,7 @@ class Gangs:
                 raise StoreError(f"it is being written by {writer}; stop that job first")
             if job.first_epoch is not None and run.description() is None:
                 raise StoreError("it was deleted from the store while the job ran")
-            self._describe(run, job)
+            self._describe(session, run, job)
             epoch = take_epoch(run, max(known, default=0), Claim(self.peers.id, job.id, len(job.attempts) + 1))
         except (
             OSError,
@@ -99,8 +100,8 @@ class Gangs:
         session.commit()
         self._launch(session, job, attempt)
 
-    def _describe(self, run: Run, job: Job) -> None:
-        needs = gang_needs(job.node_properties)
+    def _describe(self, session: Session, run: Run, job: Job) -> None:
+        needs, record = gang_needs(job.node_properties), record_owner(session, run, job)
         run.create(
             {
                 "run": run.name,
@@ -109,6 +110,8 @@ class Gangs:
                 "version": __version__,
                 "spec": needs.spec,
                 "name": job.name,
+                "owner": record.owner,
+                "queue": record.queue,
             }
         )
 

@@ -1,4 +1,4 @@
-"""The tables of the database: definitions, queues, compute environments, policies, jobs, attempts.
+"""The tables of the database: definitions, queues, compute environments, policies, jobs, attempts, runs.
 
 Times are Unix milliseconds, as in the Batch API. A change here needs a migration (``orchestrator/migrations``); a test compares.
 """
@@ -123,6 +123,8 @@ class Job(Base):
     """A UUID; of an array's child ``<parent>:<index>``."""
     name: Mapped[str] = mapped_column(index=True)
     queue: Mapped[str]
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Who submitted it: the name of a key, of a user, or MUSTER_TOKEN."""
     definition: Mapped[str]
     """ARN with revision."""
     kind: Mapped[str] = mapped_column(default="multinode")
@@ -199,6 +201,18 @@ class Job(Base):
             self.stopped_at = now()
         if reason is not None:
             self.status_reason = reason
+
+
+class RunRecord(Base):
+    """Whose a run is. The run itself, with all that it holds, is in the store."""
+
+    __tablename__ = "runs"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Who submitted the job that created it; None where that is not known."""
+    queue: Mapped[str]
+    """Of that job: keys of this queue may read and continue the run."""
+    created_at: Mapped[int] = mapped_column(default=now)
 
 
 class Dependency(Base):

@@ -14,7 +14,6 @@ import re
 import secrets
 import uuid
 from collections.abc import Mapping
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -28,62 +27,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from orchestrator.api import elsewhere
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import Body, RateLimit
+from orchestrator.api.permissions import BY_LOWER_NAME, THIS_PROCESS, Identity, Refusal, current_identity
 from orchestrator.excerpts import LONGEST_ERROR, excerpt
 from orchestrator.keys import Key, KeyStore
 
 SKEW = 15 * 60
 """Seconds that a signature's time may differ from the server's."""
 _ALGORITHM = "AWS4-HMAC-SHA256"
-_READS = ("describe", "list", "get", "filter", "startlivetail")
-"""How operations begin (lower case) that change nothing."""
 _LOGS_TARGET = "Logs_20140328."
-
-
-class Refusal(ClientError):
-    """A request that is not let in; ``kind`` is AWS's name for why."""
-
-    def __init__(self, kind: str, message: str, status: int = 403) -> None:
-        super().__init__(message, status)
-        self.kind = kind
-
-
-@dataclass(frozen=True)
-class Identity:
-    """Who sends a request, and what they may do. ``queues``: names; None means all."""
-
-    name: str
-    queues: frozenset[str] | None = None
-    read_only: bool = False
-
-    def check_queue(self, queue: str) -> None:
-        """Raise :class:`Refusal` (403, AccessDeniedException) where it may not use this queue, given by name or ARN."""
-        name = queue.rpartition("/")[2]
-        if self.queues is not None and name not in self.queues:
-            raise Refusal(
-                "AccessDeniedException",
-                f"{self.name} may not use job queue {name}; it may use {', '.join(sorted(self.queues)) or 'none'}",
-            )
-
-    def check_all_queues(self, operation: str) -> None:
-        """Raise :class:`Refusal` (403, AccessDeniedException) where it is kept to some queues, and ``operation`` concerns all."""
-        if self.queues is not None:
-            raise Refusal(
-                "AccessDeniedException",
-                f"{self.name} may use job queue {', '.join(sorted(self.queues)) or 'none'} only: {operation} is refused, since "
-                "it concerns other queues too",
-            )
-
-    def check_write(self, operation: str) -> None:
-        """Raise :class:`Refusal` (403, AccessDeniedException) where it may only look."""
-        if self.read_only:
-            raise Refusal(
-                "AccessDeniedException", f"{self.name} is read-only: {operation} is refused; use a key that may write"
-            )
-
-
-THIS_PROCESS = Identity("this process")
-current_identity: ContextVar[Identity] = ContextVar("current_identity", default=THIS_PROCESS)
-"""Who sent the request that is being carried out; outside of one the controller itself, which may do everything."""
 
 
 @dataclass
@@ -159,8 +110,11 @@ class Guard:
                 self._count(identity, "")  # or a weak token could be guessed at any speed
                 raise
         self._count(identity, request.operation)
-        if not request.reads:
-            identity.check_write(f"{request.method} {request.path}")
+        if identity.read_only and not request.reads:
+            raise Refusal(
+                "AccessDeniedException",
+                f"{identity.name} is read-only: {request.method} {request.path} is refused; use a key that may write",
+            )
         return identity
 
     def _count(self, identity: Identity, operation: str) -> None:
@@ -226,8 +180,9 @@ class _Request:
         plain = name.isascii() and name.isalnum()
         self.operation = name.lower() if plain else f"{self.method} {self.path}"
         """The AWS operation in lower case, else method and path."""
-        self.reads = self.method in ("GET", "HEAD", "OPTIONS") or (plain and self.operation.startswith(_READS))
-        """Whether it changes nothing."""
+        known = BY_LOWER_NAME.get(self.operation)
+        self.reads = self.method in ("GET", "HEAD", "OPTIONS") or (known is not None and known.reads)
+        """Whether it changes nothing; what is not known may change something."""
 
     def first(self, name: str) -> str | None:
         """The header, the first where it was sent twice (as the application reads it)."""

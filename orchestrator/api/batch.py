@@ -15,9 +15,10 @@ from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from orchestrator.api import auth, definitions, environments, jobs, limits, queues, submission, tags
+from orchestrator.api import definitions, environments, jobs, limits, permissions, queues, submission, tags
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
 from orchestrator.controller import Controller
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
@@ -56,12 +57,6 @@ _INSTEAD = {
     "ConsumableResource": "a job queue with its own compute environment, whose size limits what runs at once",
 }
 """What to use for operations that are not here, by a part of their names."""
-_READS = ("Describe", "List", "Get")
-_FOR_ALL_QUEUES = (
-    *("CreateComputeEnvironment", "UpdateComputeEnvironment", "DeleteComputeEnvironment"),
-    *("CreateSchedulingPolicy", "UpdateSchedulingPolicy", "DeleteSchedulingPolicy"),
-)
-"""Not for a key that may use some queues only."""
 
 
 @cache
@@ -98,15 +93,16 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
             f"{operation[:100]} {'is not supported here' if known else 'is not an operation of AWS Batch'}; {hint}"
         )
     checked = validate(operation, request)
-    if operation.startswith(_READS):
+    permitted = Operation(operation)
+    permissions.check(permitted)
+    if permitted.reads:
         with controller.database.session() as session:
-            return handler(Context(session, controller), checked)
+            answer: dict[str, Any] = permissions.shown(handler(Context(session, controller), checked))
+            return answer
 
     def carry_out(session: Session) -> dict[str, Any]:
         return handler(Context(session, controller, idempotency_key), checked)
 
-    if operation in _FOR_ALL_QUEUES:
-        auth.current_identity.get().check_all_queues(operation)
     try:
         if operation == "SubmitJob":
             response = controller.submissions.call(carry_out)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass
+from itertools import islice
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.arns import plain_name
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation, check, is_visible, visible_queues
 from orchestrator.controller import Controller
 from orchestrator.jobs import Status
-from orchestrator.tables import Job, JobDefinition, JobQueue
-from shared_store.layout import Run, StoreError
+from orchestrator.ownership import owner_of
+from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
+from shared_store.layout import Run, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,13 @@ class Context:
         name, _, revision = plain_name(job.definition, "job-definition").partition(":")
         return self.session.get_one(JobDefinition, (name, int(revision)))
 
+    def run(self, name: str) -> Run:
+        """The run of that name, whether it exists or not. Raises ClientError where no run can have it."""
+        try:
+            return self.controller.store.run(name)
+        except StoreError as error:
+            raise ClientError(str(error)) from None
+
     def reason(self, job: Job) -> str | None:
         """Why a job waits just now; None where it does not wait for room."""
         return self.controller.reason(job.id) if job.status == "RUNNABLE" else None
@@ -67,13 +77,30 @@ def find_run(controller: Controller, name: str) -> Run:
         with controller.database.session() as session:
             query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
             job = session.scalars(query.limit(1)).first()
-            if job is not None:
+            if job is not None and is_visible(job):
                 over = Status(job.status).is_terminal
                 what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
                 raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
-        runs = [each.name for each in controller.store.runs()]
+            runs = [each.name for each in visible_runs(session, controller.store)]
         nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
         others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"
         hint = f"; did you mean {nearest[0]}?" if nearest else others
         raise ClientError(f"run {name} does not exist in {controller.store.path}{hint}", 404)
     return run
+
+
+def permitted_run(controller: Controller, name: str, operation: Operation) -> Run:
+    """The run called ``name``, where the caller may do this to it. Raises ClientError."""
+    run = find_run(controller, name)
+    with controller.database.session() as session:
+        check(operation, owner_of(session, run) or RunRecord(name=name, queue=""))
+    return run
+
+
+def visible_runs(session: Session, store: Store, after: str = "", most: int | None = None) -> list[Run]:
+    """The runs of the store that the caller may see, by name: those behind ``after``, at most so many."""
+    if visible_queues() is None:
+        return store.runs(after, most)
+    recorded = {record.name: record for record in session.scalars(select(RunRecord))}
+    owned = ((run, recorded.get(run.name) or owner_of(session, run)) for run in store.runs(after))
+    return list(islice((run for run, owner in owned if owner is not None and is_visible(owner)), most))

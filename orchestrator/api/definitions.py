@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 
-from orchestrator.api import auth, rules
+from orchestrator.api import permissions, rules
 from orchestrator.api.arns import definition_arn, plain_name
 from orchestrator.api.context import Context
 from orchestrator.api.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
+from orchestrator.api.permissions import Operation
 from orchestrator.tables import JobDefinition
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
@@ -33,10 +34,12 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     if len(given) != 1 or given[0] not in wanted:
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
     rules.check_nodes(rules.node_properties(request), kind)
-    _check_owner(context, name, "RegisterJobDefinition")
-    newest = context.session.scalar(select(func.max(JobDefinition.revision)).where(JobDefinition.name == name))
-    revision = (newest or 0) + 1
-    owner = auth.current_identity.get().name
+    _check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
+    query = select(JobDefinition.revision, JobDefinition.owner).where(JobDefinition.name == name)
+    newest = context.session.execute(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
+    revision = newest.revision + 1 if newest else 1
+    # the name stays its owner's when a key with all queues adds a revision
+    owner = (newest.owner if newest else None) or permissions.current_identity.get().name
     document = {key: value for key, value in request.items() if key != "tags"}
     context.session.add(
         JobDefinition(name=name, revision=revision, document=document, owner=owner, tags=request.get("tags") or {})
@@ -74,23 +77,24 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
         raise ClientError(
             f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"
         )
-    _check_owner(context, name, "DeregisterJobDefinition")
+    _check_owner(context, name, Operation.DEREGISTER_JOB_DEFINITION)
     definition = context.session.get(JobDefinition, (name, int(revision)))
     if definition is not None:  # AWS answers the same for one that is not there
         definition.status = "INACTIVE"
     return {}
 
 
-def _check_owner(context: Context, name: str, operation: str) -> None:
-    """A key that is kept to some queues changes only what it has registered itself: others submit by the bare name."""
-    identity = auth.current_identity.get()
-    owners = set(context.session.scalars(select(JobDefinition.owner).where(JobDefinition.name == name).distinct()))
-    if owners - {identity.name}:
-        identity.check_all_queues(f"{operation} of {name}, which others have registered,")
+def _check_owner(context: Context, name: str, operation: Operation) -> None:
+    """Refuse a name of which another key has registered a revision: jobs are submitted by the bare name."""
+    caller = permissions.current_identity.get().name
+    foreign = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.owner.is_distinct_from(caller))
+    permissions.check(operation, *context.session.scalars(foreign.limit(1)))
 
 
 def _describe(definition: JobDefinition) -> dict[str, Any]:
     document = definition.document
+    if not permissions.is_visible(definition):
+        document = permissions.without_values(document)
     shown = {
         "containerOrchestrationType": "ECS",
         "platformCapabilities": ["EC2"],

@@ -9,11 +9,12 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api import rules
+from orchestrator.api import permissions, rules
 from orchestrator.api.arns import ACCOUNT, REGION, environment_arn, plain_name, policy_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
+from orchestrator.api.permissions import Operation, Shared
 from orchestrator.pools import is_built_in
 from orchestrator.tables import ComputeEnvironment, JobQueue, SchedulingPolicy
 
@@ -23,6 +24,7 @@ _SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
 
 def create_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateComputeEnvironment. Subnets, instance types and the like are kept and shown, and mean nothing to the engine."""
+    permissions.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
     name = request["computeEnvironmentName"]
     rules.check_name("computeEnvironmentName", name)
     rules.check_tags(request.get("tags") or {})
@@ -57,6 +59,7 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
 def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
     environment = _environment(context, request["computeEnvironment"])
+    permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, environment)
     if (state := request.get("state")) is not None:
         environment.state = _state(state)
     if changes := request.get("computeResources"):
@@ -73,6 +76,7 @@ def update_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
+    permissions.check(Operation.DELETE_COMPUTE_ENVIRONMENT, Shared())
     environment = context.session.get(
         ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment")
     )
@@ -91,6 +95,7 @@ def delete_compute_environment(context: Context, request: dict[str, Any]) -> dic
 
 def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateSchedulingPolicy with a fairsharePolicy."""
+    permissions.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
     name = request["name"]
     rules.check_name("name", name)
     rules.check_tags(request.get("tags") or {})
@@ -128,6 +133,7 @@ def list_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[
 def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateSchedulingPolicy: the fairsharePolicy is replaced."""
     policy = _policy(context, request["arn"])
+    permissions.check(Operation.UPDATE_SCHEDULING_POLICY, policy)
     if request.get("quotaSharePolicy"):
         raise ClientError(f"Scheduling policy {policy.name} has a fairsharePolicy; its kind can't change")
     if (fairshare := request.get("fairsharePolicy")) is not None:
@@ -139,6 +145,7 @@ def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
 def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteSchedulingPolicy of one that no queue uses."""
     policy = _policy(context, request["arn"])
+    permissions.check(Operation.DELETE_SCHEDULING_POLICY, policy)
     user = context.session.scalars(select(JobQueue).where(JobQueue.policy == policy.name).limit(1)).first()
     if user is not None:
         raise ClientError(f"Scheduling policy {policy.name} is used by job queue {user.name}; delete that first")

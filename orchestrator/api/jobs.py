@@ -8,12 +8,13 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import selectinload
 
-from orchestrator.api import auth
+from orchestrator.api import permissions
 from orchestrator.api.arns import definition_arn, split_reference
 from orchestrator.api.context import Context
 from orchestrator.api.describe import array_properties, describe_job, summarize
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import decode, encode, page, page_size
+from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.database import ask_to_end
 from orchestrator.excerpts import LONGEST_REASON
 from orchestrator.jobs import Status
@@ -30,9 +31,9 @@ def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     for reference in request["jobs"]:
         job_id, node = split_reference(reference)
         job = context.session.get(Job, job_id)
-        if job is None or not (
-            node is None or (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"])
-        ):
+        if job is None or not permissions.is_visible(job):
+            continue
+        if node is not None and not (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"]):
             continue
         detail = describe_job(job, context.definition_of(job), node, context.reason(job))
         if (array := array_properties(job, _count_children(context, job))) is not None:
@@ -55,6 +56,8 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         return _list_nodes(context, request)
     if array := request.get("arrayJobId"):
         job_id, _ = split_reference(array)
+        if (parent := context.session.get(Job, job_id)) is not None:
+            permissions.check(Operation.LIST_JOBS, parent)
         status = request.get("jobStatus", Status.RUNNING)
         query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
         query = query.options(selectinload(Job.attempts))
@@ -63,6 +66,7 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         )
     else:
         queue = context.queue(request["jobQueue"], deleting=True)
+        permissions.check(Operation.LIST_JOBS, JobsOf(queue.name))
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
         query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
@@ -76,6 +80,7 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     job = context.session.get(Job, split_reference(request["multiNodeJobId"])[0])
     if job is None or job.kind != "multinode":
         return {"jobSummaryList": []}
+    permissions.check(Operation.LIST_JOBS, job)
     summaries = [summarize(job, context.reason(job), node) for node in range(int(job.node_properties["numNodes"]))]
     wanted = request.get("jobStatus", Status.RUNNING)
     summaries = [summary for summary in summaries if summary["status"] == wanted]
@@ -131,32 +136,32 @@ def _by_definition(value: str) -> Any:
 
 def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; a job that does not run yet is cancelled; one that is over stays so."""
-    _check_reason(request, "TerminateJob")
-    _terminate(context, _target(context, request["jobId"], "TerminateJob"), request["reason"])
+    _check_reason(request, Operation.TERMINATE_JOB)
+    _terminate(context, _target(context, request["jobId"], Operation.TERMINATE_JOB), request["reason"])
     return {}
 
 
 def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
-    _check_reason(request, "CancelJob")
-    _cancel(context, _target(context, request["jobId"], "CancelJob"), request["reason"])
+    _check_reason(request, Operation.CANCEL_JOB)
+    _cancel(context, _target(context, request["jobId"], Operation.CANCEL_JOB), request["reason"])
     return {}
 
 
 def terminate_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """TerminateJobs: TerminateJob for up to 50 jobs, each with its own result."""
-    return _each(context, request, "TerminateJobs", _terminate)
+    return _each(context, request, Operation.TERMINATE_JOBS, _terminate)
 
 
 def cancel_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CancelJobs: CancelJob for up to 50 jobs, each with its own result."""
-    return _each(context, request, "CancelJobs", _cancel)
+    return _each(context, request, Operation.CANCEL_JOBS, _cancel)
 
 
 def _each(
     context: Context,
     request: Mapping[str, Any],
-    operation: str,
+    operation: Operation,
     end: Callable[[Context, ColumnElement[bool], str], None],
 ) -> dict[str, Any]:
     """What became of each job; as on AWS, one that does not exist counts as ended."""
@@ -190,12 +195,12 @@ class UnknownJob(ClientError):
     """There is no job of this id."""
 
 
-def _check_reason(request: Mapping[str, Any], operation: str) -> None:
+def _check_reason(request: Mapping[str, Any], operation: Operation) -> None:
     if len(request["reason"]) > LONGEST_REASON:
         raise ClientError(f"{operation}: the reason is longer than {LONGEST_REASON} characters")
 
 
-def _target(context: Context, reference: str, operation: str) -> ColumnElement[bool]:
+def _target(context: Context, reference: str, operation: Operation) -> ColumnElement[bool]:
     """The row of the job; of an array those of its children too. Raises ClientError, UnknownJob."""
     job_id, node = split_reference(reference)
     if node is not None:
@@ -203,7 +208,7 @@ def _target(context: Context, reference: str, operation: str) -> ColumnElement[b
     job = context.session.get(Job, job_id)
     if job is None:
         raise UnknownJob(f"Job {reference[:300]} does not exist")
-    auth.current_identity.get().check_queue(job.queue)
+    permissions.check(operation, job)
     return or_(Job.id == job.id, Job.parent == job.id) if job.kind == "array" else Job.id == job.id
 
 

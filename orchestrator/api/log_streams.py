@@ -10,8 +10,10 @@ from pathlib import Path
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session, load_only
 
+from orchestrator.api import permissions
 from orchestrator.api.describe import stream_name
 from orchestrator.api.log_events import LogFile, log_file
+from orchestrator.api.permissions import Operation
 from orchestrator.database import Attempt, Job
 from shared_store.layout import Store
 
@@ -37,18 +39,19 @@ class Stream:
         return log_file(self.path, self.name)
 
 
-def find_stream(session: Session, store: Store, name: str) -> Stream | None:
-    """The stream of that name; None where no such job, attempt or node exists."""
+def find_stream(session: Session, store: Store, name: str, operation: Operation) -> Stream | None:
+    """The stream of that name; None where no such job, attempt or node exists. Raises Refusal where it is not the caller's."""
     match = _NAME.fullmatch(name)
     job = session.get(Job, match[1].replace(".", ":")) if match else None
     attempt = session.get(Attempt, (job.id, int(match[2]))) if match and job else None
     if not job or not attempt:
         return None
+    permissions.check(operation, job)
     return next((stream for stream in _streams(store, job, attempt) if stream.name == name), None)
 
 
 def newest_streams(session: Session, store: Store, prefix: str = "", since: int = 0) -> list[Stream]:
-    """Up to MOST_STREAMS streams whose names begin with ``prefix``, of the newest jobs.
+    """Up to MOST_STREAMS streams whose names begin with ``prefix``, of the newest jobs that the caller may see.
 
     Args:
         session: On the database.
@@ -64,6 +67,8 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
         .order_by(Attempt.stopped_at.is_(None).desc(), Job.created_at.desc(), Job.id, Attempt.number)
         .limit(MOST_STREAMS)
     )
+    if (queues := permissions.visible_queues()) is not None:
+        query = query.where(Job.queue.in_(queues))
     name, slash, rest = prefix.partition("/")
     if slash:
         query = query.where(

@@ -30,6 +30,7 @@ from orchestrator.api.limits import check_size
 from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
 from orchestrator.api.log_streams import Stream, find_stream, newest_streams
+from orchestrator.api.permissions import Operation, Refusal, check
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, Job, now
 
@@ -87,6 +88,7 @@ async def answer(
         if operation not in (*OPERATIONS, "StartLiveTail"):
             names = ", ".join([*OPERATIONS, "StartLiveTail"])
             raise invalid(f"{operation or f'X-Amz-Target {target!r}'} is not supported; supported are {names}")
+        check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
             return await run_in_threadpool(start_live_tail, controller, closing, request)
@@ -95,6 +97,8 @@ async def answer(
         )
     except LogsError as error:
         return error.response()
+    except Refusal as error:
+        return LogsError(error.kind, str(error), error.status).response()
     except ClientError as error:
         return LogsError("InvalidParameterException", str(error), error.status).response()
     except DatabaseError as error:
@@ -138,7 +142,7 @@ def get_log_events(controller: Controller, request: dict[str, Any]) -> dict[str,
     """GetLogEvents: a page of one stream, from either end or from a token. Tokens are positions: they never expire."""
     _check_group(request)
     with controller.database.session() as session:
-        stream = _named(controller, session, request["logStreamName"])
+        stream = _named(controller, session, request["logStreamName"], Operation.GET_LOG_EVENTS)
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
@@ -309,8 +313,8 @@ def _check_group(request: dict[str, Any]) -> None:
         raise _no_group(given[0])
 
 
-def _named(controller: Controller, session: Any, name: str) -> Stream:
-    stream = find_stream(session, controller.store, name)
+def _named(controller: Controller, session: Any, name: str, operation: Operation) -> Stream:
+    stream = find_stream(session, controller.store, name, operation)
     if stream is None:
         raise LogsError("ResourceNotFoundException", f"The specified log stream does not exist: {name}")
     return stream
@@ -323,7 +327,7 @@ def _searched(controller: Controller, request: dict[str, Any], since: int) -> li
         raise invalid("Only one of logStreamNames and logStreamNamePrefix can be used.")
     with controller.database.session() as session:
         if names:
-            return [_named(controller, session, name) for name in dict.fromkeys(names)]
+            return [_named(controller, session, name, Operation.FILTER_LOG_EVENTS) for name in dict.fromkeys(names)]
         return newest_streams(session, controller.store, prefix or "", since - _LATE)
 
 

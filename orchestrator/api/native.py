@@ -18,10 +18,11 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.admission import node_records
-from orchestrator.api import auth, rules, runs
+from orchestrator.api import permissions, rules, runs
 from orchestrator.api.batch import validate
-from orchestrator.api.context import find_run
+from orchestrator.api.context import permitted_run
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import find_job
@@ -29,6 +30,7 @@ from orchestrator.definition import gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.engines.several import FRESH
 from orchestrator.jobs import Status
+from orchestrator.ownership import owner_of
 from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.tables import Attempt, Job, JobQueue
@@ -69,16 +71,21 @@ def _controller(request: Request) -> Controller:
     return controller
 
 
-def _job(session: Session, reference: str) -> Job:
-    job = find_job(session, reference)
+def _job(session: Session, reference: str, operation: Operation) -> Job:
+    """The job, where the caller may do this to it. Raises ClientError."""
+    job = find_job(session, reference, permissions.visible_queues())
     if job is None:
         raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
+    permissions.check(operation, job)
     return job
 
 
 @router.get("/capacity")
 def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
-    """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone."""
+    """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone.
+
+    ``queues``: those whose jobs the caller may see.
+    """
     controller = _controller(request)
     names = controller.engine.names
     with controller.database.session() as session:
@@ -92,7 +99,7 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
         "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
         "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
-        "queues": queues,
+        "queues": [name for name in queues if permissions.is_visible(JobsOf(name))],
     }
 
 
@@ -109,6 +116,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         queue = session.get(JobQueue, body.queue)
         if queue is None:
             raise ClientError(f"there is no queue {body.queue!r}")
+        permissions.check(Operation.PLAN, JobsOf(queue.name))
         placements = place(needs.shape, hosts)
         if placements is None:
             raise ClientError(str(never_fits(needs.shape, hosts)))
@@ -149,18 +157,21 @@ def _planned(controller: Controller, gang: Gang) -> Plan:
 
 
 @router.get("/jobs/{reference}")
-def job_detail(request: Request, reference: str) -> dict[str, Any]:
+def job_detail(request: Request, reference: str) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
     controller = _controller(request)
     with controller.database.session() as session:
-        job = _job(session, reference)
+        job = _job(session, reference, Operation.READ_JOB)
         run = controller.store.run(job.run)
         attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
-        described = runs.describe_run(controller, session, run) if run.description() else None
+        owner = owner_of(session, run)
+        is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
+        described = runs.describe_run(controller, session, run) if is_visible and run.description() else None
         needs = gang_needs(job.node_properties)
-        return {
+        detail = {
             "id": job.id,
             "name": job.name,
+            "owner": job.owner,
             "run": job.run,
             "kind": next(
                 (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
@@ -177,8 +188,9 @@ def job_detail(request: Request, reference: str) -> dict[str, Any]:
             "attemptsAllowed": job.attempts_allowed,
             "spec": needs.spec,
             "results": described,
-            "progress": runs.last_metrics(run),
+            "progress": runs.last_metrics(run) if is_visible else None,
         }
+    return permissions.shown(detail)
 
 
 @router.get("/jobs/{reference}/logs")
@@ -197,7 +209,7 @@ def job_logs(
     """
     controller = _controller(request)
     with controller.database.session() as session:
-        job = _job(session, reference)
+        job = _job(session, reference, Operation.READ_JOB_LOGS)
         count = int(job.node_properties["numNodes"])
         if node is not None and not 0 <= node < count:
             raise ClientError(
@@ -226,8 +238,7 @@ def _positions(text: str) -> dict[str, int]:
 def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
     controller = _controller(request)
-    job, attempt, nodes = _running(controller, reference)
-    _check_queue(controller, job)
+    job, attempt, nodes = _running(controller, reference, Operation.CHECKPOINT_JOB)
     return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
 
 
@@ -235,14 +246,14 @@ def save_now(request: Request, reference: str) -> dict[str, str]:
 def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
     """The Python and native stacks of every rank, node by node."""
     controller = _controller(request)
-    job, attempt, nodes = _running(controller, reference)
+    job, attempt, nodes = _running(controller, reference, Operation.READ_JOB_STACKS)
     return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
 
 
-def _running(controller: Controller, reference: str) -> tuple[str, int, list[int]]:
+def _running(controller: Controller, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
     """Id, attempt and nodes of a running job. Raises ClientError."""
     with controller.database.session() as session:
-        job = _job(session, reference)
+        job = _job(session, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
             raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", runs.CONFLICT)
@@ -252,12 +263,6 @@ def _running(controller: Controller, reference: str) -> tuple[str, int, list[int
             attempt.number,
             sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main),
         )
-
-
-def _check_queue(controller: Controller, job_id: str) -> None:
-    """Raises ClientError where the caller may not use the job's queue."""
-    with controller.database.session() as session:
-        auth.current_identity.get().check_queue(session.get_one(Job, job_id).queue)
 
 
 def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
@@ -273,35 +278,36 @@ def list_runs(
     response: Response,
     after: str = Query(default="", max_length=128, description="name of the last run of the page before"),
     most: int = Query(default=RUNS_A_PAGE, ge=1, le=RUNS_A_PAGE, alias="max"),
-) -> list[dict[str, Any]]:
-    """The runs of the store by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
+) -> Any:
+    """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
     controller = _controller(request)
     with controller.database.session() as session:
         found = runs.list_runs(controller, session, after, most)
     if len(found) == most:
         response.headers["Link"] = f'</api/runs?max={most}&after={found[-1]["run"]}>; rel="next"'
-    return found
+    return permissions.shown(found)
 
 
 @router.get("/runs/{name}")
-def run_detail(request: Request, name: str) -> dict[str, Any]:
+def run_detail(request: Request, name: str) -> Any:
     """One run."""
     controller = _controller(request)
+    run = permitted_run(controller, name, Operation.READ_RUN)
     with controller.database.session() as session:
-        return runs.describe_run(controller, session, find_run(controller, name))
+        return permissions.shown(runs.describe_run(controller, session, run))
 
 
 @router.get("/runs/{name}/checkpoints")
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = find_run(_controller(request), name)
+    run = permitted_run(_controller(request), name, Operation.READ_CHECKPOINTS)
     return [runs.describe_checkpoint(checkpoint, verify) for checkpoint in list_checkpoints(run)]
 
 
 @router.get("/runs/{name}/metrics")
 def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for iterations greater than ``after``."""
-    return read_metrics(find_run(_controller(request), name), after)
+    return read_metrics(permitted_run(_controller(request), name, Operation.READ_METRICS), after)
 
 
 @router.post("/runs/{name}/resume")
@@ -313,7 +319,7 @@ def resume_run(
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
     controller = _controller(request)
-    run = find_run(controller, name)
+    run = permitted_run(controller, name, Operation.RESUME_RUN)
     return runs.resume(
         controller, run, body.checkpoint, body.set, body.directory, body.nodes, idempotency_key=idempotency_key
     )

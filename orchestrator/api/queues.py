@@ -7,11 +7,12 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api import auth, rules
+from orchestrator.api import permissions, rules
 from orchestrator.api.arns import environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
+from orchestrator.api.permissions import JobsOf, Operation, Shared
 from orchestrator.tables import ComputeEnvironment, JobQueue, SchedulingPolicy, now
 
 _MOST_ENVIRONMENTS, _MOST_QUEUES = 3, 50
@@ -27,7 +28,7 @@ def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
     name = request["jobQueueName"]
     rules.check_name("jobQueueName", name)
     rules.check_tags(request.get("tags") or {})
-    auth.current_identity.get().check_queue(name)
+    permissions.check(Operation.CREATE_JOB_QUEUE, Shared())
     if context.session.get(JobQueue, name):
         raise ClientError(f"Job queue {name} exists already; UpdateJobQueue changes it")
     if len(context.session.scalars(select(JobQueue.name)).all()) >= _MOST_QUEUES:
@@ -55,7 +56,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
 def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateJobQueue; a scheduling policy can be replaced, but neither added nor removed, as on AWS."""
     queue = context.queue(request["jobQueue"])
-    auth.current_identity.get().check_queue(queue.name)
+    permissions.check(Operation.UPDATE_JOB_QUEUE, queue)
     if (policy := request.get("schedulingPolicyArn")) is not None:
         if queue.policy is None:
             raise ClientError(
@@ -69,10 +70,10 @@ def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 
 def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteJobQueue of a queue that is DISABLED: its jobs are ended, and with the last one it is gone."""
+    permissions.check(Operation.DELETE_JOB_QUEUE, Shared())
     queue = context.session.get(JobQueue, plain_name(request["jobQueue"], "job-queue"))
     if queue is None or queue.deleting:
         return {}
-    auth.current_identity.get().check_queue(queue.name)
     if queue.state != "DISABLED":
         raise ClientError(f"Job queue {queue.name} is ENABLED; disable it first: UpdateJobQueue with state DISABLED")
     queue.deleting = True
@@ -83,6 +84,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
 def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and what is in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
+    permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
     order, times = context.controller.front(queue.name, 100)
     jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
     return {

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import batch, definitions, limits, submission
-from orchestrator.api.context import Context
+from orchestrator.api.context import Context, visible_runs
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import visible_queues
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.several import FRESH
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
+from orchestrator.ownership import owner_of
 from orchestrator.pools import queue_engines
 from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
@@ -30,9 +32,9 @@ CONFLICT = 409
 
 
 def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
-    """The first ``most`` runs behind the name ``after``; one that can't be read has a ``problem`` instead of its facts."""
+    """The first ``most`` runs behind the name ``after`` that the caller may see; one that can't be read has a ``problem`` instead of its facts."""
     found = []
-    for run in controller.store.runs(after, most):
+    for run in visible_runs(session, controller.store, after, most):
         try:
             found.append(describe_run(controller, session, run))
         except (DamagedFile, OSError) as error:
@@ -44,9 +46,8 @@ def list_runs(controller: Controller, session: Session, after: str, most: int) -
 def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     description = run.description() or {}
-    jobs = session.execute(
-        select(Job.id, Job.name, Job.status).where(Job.run == run.name).order_by(Job.created_at)
-    ).all()
+    owner = owner_of(session, run)
+    jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
     checkpoints = list_checkpoints(run)
     evaluation = _newest_evaluation(run, checkpoints)
     plot = run.metrics / "reward.png"
@@ -54,6 +55,8 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
         "run": run.name,
         "path": str(run.path),
         "created": description.get("created"),
+        "owner": owner.owner if owner else None,
+        "queue": owner.queue if owner else None,
         "spec": spec_of(session, run),
         "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
         "checkpoints": len(checkpoints),
@@ -294,7 +297,13 @@ def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | No
 
 
 def _newest_job(session: Session, run: Run) -> Job | None:
-    return session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at.desc()).limit(1)).first()
+    return session.scalars(select(Job).where(*_of_run(run)).order_by(Job.created_at.desc()).limit(1)).first()
+
+
+def _of_run(run: Run) -> list[ColumnElement[bool]]:
+    """Those of the run's jobs that the caller may see: a key with all queues may have continued it in another queue."""
+    queues = visible_queues()
+    return [Job.run == run.name, *([] if queues is None else [Job.queue.in_(queues)])]
 
 
 def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import BigInteger, ColumnElement, String, cast, insert, literal, select
 from sqlalchemy.orm import Session
 
-from orchestrator.api import auth, rules
+from orchestrator.api import permissions, rules
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
 from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.members import check_consumables
+from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.database import note_changed
-from orchestrator.definition import gang_needs
+from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.jobs import Status
-from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, now
+from orchestrator.ownership import owner_of
+from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, RunRecord, now
 from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
@@ -42,6 +45,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     rules.check_tags(request.get("tags") or {})
     queue = _queue(context, request)
     definition = context.definition(request["jobDefinition"])
+    permissions.check(Operation.SUBMIT_JOB, definition)
     job = _job(context, request, queue, definition)
     job.idempotency_key = _scoped(context.idempotency_key)
     if request.get("arrayProperties"):
@@ -70,12 +74,12 @@ def _scoped(key: str | None) -> str | None:
         return None
     if not _KEY.fullmatch(key):
         raise ClientError("the idempotency key: 1 to 128 printable characters without spaces")
-    return f"{auth.current_identity.get().name}/{key}"
+    return f"{permissions.current_identity.get().name}/{key}"
 
 
 def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
     queue = context.queue(request["jobQueue"])
-    auth.current_identity.get().check_queue(queue.name)
+    permissions.check(Operation.SUBMIT_JOB, JobsOf(queue.name))
     if queue.state != "ENABLED":
         raise ClientError(f"Job queue {queue.name} is DISABLED and takes no jobs")
     share, priority = request.get("shareIdentifier"), request.get("schedulingPriorityOverride")
@@ -105,12 +109,12 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     named = needs.setting("MUSTER_RUN")
     run = named or f"{name[:110]}-{job_id[:8]}"
     _check_run(context, run, bool(named))
-    if not request.get("dependsOn"):
-        _check_source(context, needs.spec)
+    _check_sources(context, needs, is_waiting=bool(request.get("dependsOn")))
     return Job(
         id=job_id,
         name=name,
         queue=queue.name,
+        owner=permissions.current_identity.get().name,
         definition=definition_arn(definition.name, definition.revision),
         kind="array" if is_array else document["type"],
         request=request,
@@ -145,9 +149,15 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
 
 
 def _check_run(context: Context, run: str, named: bool) -> None:
-    """``named``: the caller chose the name. Raises ClientError where it can't be a run's, or where a job writes that run now."""
+    """``named``: the caller chose the name.
+
+    Raises ClientError where it can't be a run's, where the run is not the caller's, or where a job writes it now.
+    """
     if not NAME.fullmatch(run):
         raise ClientError(f"MUSTER_RUN {run[:100]!r}: a run is named with letters, digits, '.', '_' and '-'")
+    restricted = named and permissions.visible_queues() is not None
+    if restricted and (owner := owner_of(context.session, context.run(run))):
+        permissions.check(Operation.SUBMIT_JOB, owner)
     over = [Status.SUCCEEDED, Status.FAILED]
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(over)).limit(1)).first()
     if holder:
@@ -159,12 +169,30 @@ def _check_run(context: Context, run: str, named: bool) -> None:
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
 
 
-def _check_source(context: Context, spec: Mapping[str, Any] | None) -> None:
-    """The run that a job from YAML evaluates or exports is there, unless it waits for a job that makes it."""
+def _check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> None:
+    """The runs that a job from YAML evaluates or exports are there, unless it waits for a job that makes them.
+
+    The caller may read them. Each node reads the spec of its own environment, so all of them are looked at.
+    """
+    specs = {node.environment.get("MUSTER_SPEC", "") for node in needs.nodes}
+    for source in sorted({run for text in specs for run in _sources(text)}):
+        if not is_waiting:
+            find_run(context.controller, source)
+        if permissions.visible_queues() is not None:
+            nobodys = RunRecord(name=source, queue="")
+            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source)) or nobodys)
+
+
+def _sources(spec: str) -> Iterator[str]:
+    """Names of the runs that a spec evaluates or exports."""
+    try:
+        document = json.loads(spec or "{}")
+    except (ValueError, RecursionError):
+        return  # refused where it is read
     for kind in ("evaluate", "export"):
-        section = (spec or {}).get(kind)
+        section = document.get(kind) if isinstance(document, dict) else None
         if isinstance(section, dict) and isinstance(section.get("run"), str):
-            find_run(context.controller, section["run"])
+            yield section["run"]
 
 
 def _release(job: Job) -> None:
@@ -200,7 +228,7 @@ def _insert_children(session: Session, parent: Job, indices: range, state: Mappi
     if not indices:
         return
     index = _numbers(indices)
-    copied = ("name", "queue", "definition", "attempts_allowed", "timeout", "share", "priority", "array_size")
+    copied = ("name", "queue", "owner", "definition", "attempts_allowed", "timeout", "share", "priority", "array_size")
     same = {
         **{name: getattr(parent, name) for name in copied},
         **{
@@ -264,6 +292,7 @@ def _dependencies(context: Context, request: Mapping[str, Any], size: int | None
         job = context.session.get(Job, on_id)
         if job is None or node is not None:
             raise ClientError(f"dependsOn: Job {reference[:200]} does not exist")
+        permissions.check(Operation.SUBMIT_JOB, job)
         if kind == "N_TO_N" and job.array_size != size:
             raise ClientError(f"dependsOn N_TO_N: {reference[:200]} is not an array of the same size ({size})")
         found[on_id] = Dependency(on_id=on_id, kind=kind if kind == "N_TO_N" else None)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api import auth, rules
+from orchestrator.api import permissions, rules
 from orchestrator.api.arns import split_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
 from orchestrator.tables import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 
 _TABLES = {
@@ -20,7 +21,7 @@ _TABLES = {
 
 def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Add tags, or replace their values."""
-    resource = _changeable(context, request["resourceArn"], "TagResource")
+    resource = _resource(context, request["resourceArn"], Operation.TAG_RESOURCE)
     tags = {**resource.tags, **request["tags"]}
     rules.check_tags(tags)
     resource.tags = tags
@@ -29,29 +30,24 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def untag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Remove tags; those that are not there are passed over."""
-    resource = _changeable(context, request["resourceArn"], "UntagResource")
+    resource = _resource(context, request["resourceArn"], Operation.UNTAG_RESOURCE)
     resource.tags = {key: value for key, value in resource.tags.items() if key not in request["tagKeys"]}
     return {}
 
 
 def list_tags_for_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """The resource's tags."""
-    return {"tags": _resource(context, request["resourceArn"]).tags}
+    return {"tags": _resource(context, request["resourceArn"], Operation.LIST_TAGS_FOR_RESOURCE).tags}
 
 
-def _changeable(context: Context, arn: str, operation: str) -> Any:
-    """The resource, where the caller may change it. Raises ClientError."""
-    resource, identity = _resource(context, arn), auth.current_identity.get()
-    if isinstance(resource, Job):
-        identity.check_queue(resource.queue)
-    elif isinstance(resource, JobQueue):
-        identity.check_queue(resource.name)
-    else:
-        identity.check_all_queues(operation)
+def _resource(context: Context, arn: str, operation: Operation) -> Any:
+    """The resource, where the caller may do this to it. Raises ClientError."""
+    resource = _find(context, arn)
+    permissions.check(operation, resource)
     return resource
 
 
-def _resource(context: Context, arn: str) -> Any:
+def _find(context: Context, arn: str) -> Any:
     """The row that an ARN names; the nodes of a job and the children of an array have no tags of their own, as on AWS."""
     kind, name = split_arn(arn)
     found: Any

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.client import Client
+from orchestrator.client import ApiError, Client
 
 
 def register(app: typer.Typer) -> None:
@@ -34,8 +34,7 @@ def queues(
         found = client.batch("DescribeJobQueues", **({"jobQueues": [name]} if name else {}))["jobQueues"]
         if name and not found:
             client.batch("GetJobQueueSnapshot", jobQueue=name)  # refused with the names that there are
-        for queue in found:
-            queue["snapshot"] = client.batch("GetJobQueueSnapshot", jobQueue=queue["jobQueueName"])
+        found = [queue for queue in found if _take_snapshot(client, queue, is_named=name is not None)]
         front = _front(client, found[0]) if name else []
     if as_json:
         typer.echo(json.dumps(found, indent=1))
@@ -44,6 +43,16 @@ def queues(
     console.print(_table(found))
     if name:
         console.print(_waiting(front) if front else "no job waits")
+
+
+def _take_snapshot(client: Client, queue: dict[str, Any], is_named: bool) -> bool:
+    """Add the queue's snapshot to it; False for a queue of others in a list of all, of which a key may not see the jobs."""
+    try:
+        queue["snapshot"] = client.batch("GetJobQueueSnapshot", jobQueue=queue["jobQueueName"])
+    except ApiError as error:
+        if error.status != 403 or is_named:
+            raise
+    return "snapshot" in queue
 
 
 def _front(client: Client, queue: dict[str, Any]) -> list[dict[str, Any]]:

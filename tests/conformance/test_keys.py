@@ -16,8 +16,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from orchestrator.api.auth import Access, Guard, Identity, Refusal, current_identity
+from orchestrator.api.auth import Access, Guard
 from orchestrator.api.limits import RateLimit
+from orchestrator.api.permissions import current_identity
 from orchestrator.keys import KeyStore
 from tests.conformance.test_security import client, refused
 from tests.conftest import Serving, run_muster
@@ -140,19 +141,6 @@ def test_the_rate_counts_each_client_and_submissions_apart(monkeypatch: pytest.M
     limit.refusal("c", "")
     assert len(limit._buckets) == 1
     assert not any(RateLimit(rate=0).refusal("a", "submitjob") for _ in range(5000))
-
-
-def test_a_key_is_held_to_its_queues() -> None:
-    identity = Identity("key a", frozenset({"robots"}))
-    identity.check_queue("robots")
-    identity.check_queue("arn:aws:batch:us-east-1:000000000000:job-queue/robots")
-    for queue in ("default", "robots/default", "", "arn:aws:batch:us-east-1:000000000000:job-queue/default"):
-        with pytest.raises(Refusal, match="it may use robots") as caught:
-            identity.check_queue(queue)
-        assert (caught.value.status, caught.value.kind) == (403, "AccessDeniedException")
-    Identity("key b").check_queue("anything")
-    with pytest.raises(Refusal, match="key r is read-only: SubmitJob is refused"):
-        Identity("key r", read_only=True).check_write("SubmitJob")
 
 
 def test_the_application_sees_who_asks(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from orchestrator.accounting import add_usage, charge, forget_before, resource_s
 from orchestrator.client import ApiError
 from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
 from orchestrator.roster import Roster
-from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, now
+from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
 from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.orchestrator import postgres
@@ -134,6 +134,35 @@ def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_defin
     with engine.connect() as connection:
         assert connection.scalar(text("SELECT count(*) FROM jobs WHERE node_properties IS NULL")) == 0
     engine.dispose()
+
+
+def test_runs_of_an_older_database_belong_to_the_queue_and_owner_of_their_first_job(
+    url: str, opened: Callable[[], Database]
+) -> None:
+    _migrate(url, "upgrade", "0004")
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for number, (run, queue, key, epoch) in enumerate(
+            [
+                ("a", "lab", "key x/1/2", 1),
+                ("a", "default", None, 2),
+                ("b", "default", None, 1),
+                ("c", "lab", None, None),
+            ]
+        ):
+            connection.execute(
+                text(
+                    "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
+                    "attempts_allowed, idempotency_key, first_epoch) "
+                    "VALUES (:id, 'j', :queue, 'arn', '{}', '{}', :run, 'FAILED', :at, 1, :key, :epoch)"
+                ),
+                {"id": f"j{number}", "at": number, "run": run, "queue": queue, "key": key, "epoch": epoch},
+            )
+    engine.dispose()
+    with opened().session() as session:
+        runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}
+        assert runs == {"a": ("lab", "key x"), "b": ("default", None)}  # c never started: there is no run of it
+        assert session.get_one(Job, "j0").owner == "key x"
 
 
 def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:

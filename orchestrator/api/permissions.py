@@ -1,0 +1,213 @@
+"""Who may do what to what: every operation of the API is decided here, for every kind of key and every object.
+
+A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
+(a job; a run, to the queue of the job that created it), to the key that registered it (a job definition), or to all queues (a
+queue itself, a compute environment, a scheduling policy).
+
+================================  ===========================  ============================================================
+object                            key with all queues          key with some queues
+================================  ===========================  ============================================================
+job, run of one of its queues     reads, writes                reads, writes
+job, run of another queue         reads, writes                nothing; it is left out of lists
+run of no known queue             reads, writes                nothing
+job definition of its own         reads, writes, submits       reads, writes, submits
+another's, tagged for its queue   reads, writes, submits       reads, submits
+another's                         reads, writes, submits       reads, without the values of environment variables
+what all queues share             reads, writes                reads
+================================  ===========================  ============================================================
+
+A read-only key reads what the same key could read without ``--read-only``, without the values of environment variables, since
+these hold secrets. The token in ``MUSTER_TOKEN`` and the controller's own user on loopback are keys with all queues.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from orchestrator.api.errors import ClientError
+from orchestrator.tables import ComputeEnvironment, Job, JobDefinition, JobQueue, RunRecord, SchedulingPolicy
+
+HIDDEN = "(hidden)"
+"""Stands for the value of an environment variable that the caller may not read."""
+QUEUES_TAG = "muster:queues"
+"""Tag of a job definition: names of the queues, separated by spaces, whose keys may read it and submit with it; ``*`` for all."""
+
+
+class Refusal(ClientError):
+    """A request that is not let in; ``kind`` is AWS's name for why."""
+
+    def __init__(self, kind: str, message: str, status: int = 403) -> None:
+        super().__init__(message, status)
+        self.kind = kind
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who sends a request. ``queues``: names of those that it may use; None means all."""
+
+    name: str
+    queues: frozenset[str] | None = None
+    read_only: bool = False
+
+
+THIS_PROCESS = Identity("this process")
+current_identity: ContextVar[Identity] = ContextVar("current_identity", default=THIS_PROCESS)
+"""Who sent the request that is being carried out; outside of one the controller itself, which may do everything."""
+
+
+class Operation(StrEnum):
+    """Every operation: AWS's by their names, the native ones by method and path."""
+
+    REGISTER_JOB_DEFINITION = "RegisterJobDefinition"
+    DESCRIBE_JOB_DEFINITIONS = "DescribeJobDefinitions"
+    DEREGISTER_JOB_DEFINITION = "DeregisterJobDefinition"
+    SUBMIT_JOB = "SubmitJob"
+    DESCRIBE_JOBS = "DescribeJobs"
+    LIST_JOBS = "ListJobs"
+    TERMINATE_JOB = "TerminateJob"
+    CANCEL_JOB = "CancelJob"
+    TERMINATE_JOBS = "TerminateJobs"
+    CANCEL_JOBS = "CancelJobs"
+    CREATE_JOB_QUEUE = "CreateJobQueue"
+    DESCRIBE_JOB_QUEUES = "DescribeJobQueues"
+    UPDATE_JOB_QUEUE = "UpdateJobQueue"
+    DELETE_JOB_QUEUE = "DeleteJobQueue"
+    GET_JOB_QUEUE_SNAPSHOT = "GetJobQueueSnapshot"
+    CREATE_COMPUTE_ENVIRONMENT = "CreateComputeEnvironment"
+    DESCRIBE_COMPUTE_ENVIRONMENTS = "DescribeComputeEnvironments"
+    UPDATE_COMPUTE_ENVIRONMENT = "UpdateComputeEnvironment"
+    DELETE_COMPUTE_ENVIRONMENT = "DeleteComputeEnvironment"
+    CREATE_SCHEDULING_POLICY = "CreateSchedulingPolicy"
+    DESCRIBE_SCHEDULING_POLICIES = "DescribeSchedulingPolicies"
+    LIST_SCHEDULING_POLICIES = "ListSchedulingPolicies"
+    UPDATE_SCHEDULING_POLICY = "UpdateSchedulingPolicy"
+    DELETE_SCHEDULING_POLICY = "DeleteSchedulingPolicy"
+    TAG_RESOURCE = "TagResource"
+    UNTAG_RESOURCE = "UntagResource"
+    LIST_TAGS_FOR_RESOURCE = "ListTagsForResource"
+    GET_LOG_EVENTS = "GetLogEvents"
+    FILTER_LOG_EVENTS = "FilterLogEvents"
+    DESCRIBE_LOG_STREAMS = "DescribeLogStreams"
+    DESCRIBE_LOG_GROUPS = "DescribeLogGroups"
+    START_LIVE_TAIL = "StartLiveTail"
+    READ_HEALTH = "GET /healthz"
+    READ_FRONT_PAGE = "GET /"
+    READ_CAPACITY = "GET /api/capacity"
+    PLAN = "POST /api/plan"
+    READ_JOB = "GET /api/jobs/{reference}"
+    READ_JOB_LOGS = "GET /api/jobs/{reference}/logs"
+    CHECKPOINT_JOB = "POST /api/jobs/{reference}/checkpoint"
+    READ_JOB_STACKS = "GET /api/jobs/{reference}/stacks"
+    LIST_RUNS = "GET /api/runs"
+    READ_RUN = "GET /api/runs/{name}"
+    READ_CHECKPOINTS = "GET /api/runs/{name}/checkpoints"
+    READ_METRICS = "GET /api/runs/{name}/metrics"
+    RESUME_RUN = "POST /api/runs/{name}/resume"
+
+    @property
+    def reads(self) -> bool:
+        """Whether it changes nothing, so that a read-only key may send it."""
+        return self.value.startswith(("GET ", "Describe", "List", "Get", "Filter", "StartLiveTail"))
+
+
+BY_LOWER_NAME = {operation.lower(): operation for operation in Operation}
+
+
+@dataclass(frozen=True)
+class JobsOf:
+    """The jobs of a queue as a whole: to submit there, to list them, to see their order."""
+
+    queue: str
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Something of all queues that has no row yet."""
+
+
+Object = Job | RunRecord | JobsOf | JobDefinition | JobQueue | ComputeEnvironment | SchedulingPolicy | Shared
+
+
+def check(operation: Operation, *objects: Object) -> None:
+    """Raise Refusal (403, AccessDeniedException) where the caller may not do this to all of these objects."""
+    identity = current_identity.get()
+    if identity.read_only and not operation.reads:
+        raise Refusal(
+            "AccessDeniedException", f"{identity.name} is read-only: {operation} is refused; use a key that may write"
+        )
+    for each in objects:
+        if not _allowed(identity, operation, each):
+            queues = ", ".join(sorted(identity.queues or ())) or "none"
+            raise Refusal(
+                "AccessDeniedException",
+                f"{identity.name} may use job queue {queues} only: {operation} is refused, since {_whose(each)}",
+            )
+
+
+def is_visible(thing: Object) -> bool:
+    """Whether the caller may read all of it; what is not visible is left out of lists."""
+    return _allowed(current_identity.get(), Operation.LIST_JOBS, thing)
+
+
+def visible_queues() -> frozenset[str] | None:
+    """Names of the queues whose jobs and runs the caller may see; None: all."""
+    return current_identity.get().queues
+
+
+def shown(answer: Any) -> Any:
+    """An answer as the caller may see it: to a read-only key without the values of environment variables."""
+    return without_values(answer) if current_identity.get().read_only else answer
+
+
+def without_values(document: Any) -> Any:
+    """A copy of a JSON document in which every ``environment`` has its names, but not its values."""
+    if isinstance(document, list | tuple):
+        return [without_values(each) for each in document]
+    if not isinstance(document, Mapping):
+        return document
+    return {key: _hidden(value) if key == "environment" else without_values(value) for key, value in document.items()}
+
+
+def _hidden(environment: Any) -> Any:
+    """The two forms of an environment: AWS's list of names and values, and the mapping of our YAML."""
+    if isinstance(environment, Mapping):
+        return dict.fromkeys(environment, HIDDEN)
+    if isinstance(environment, list):
+        return [{**each, "value": HIDDEN} if isinstance(each, Mapping) else HIDDEN for each in environment]
+    return environment
+
+
+def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
+    queues = identity.queues
+    if queues is None:
+        return True
+    match thing:
+        case Job() | RunRecord() | JobsOf():
+            return thing.queue in queues
+        case JobDefinition():
+            shared = thing.tags.get(QUEUES_TAG, "").split()
+            tagged = "*" in shared or not queues.isdisjoint(shared)
+            return thing.owner == identity.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
+        case _:
+            return operation.reads
+
+
+def _whose(thing: Object) -> str:
+    match thing:
+        case Job():
+            return f"job {thing.name} ({thing.id[:8]}) belongs to job queue {thing.queue}"
+        case RunRecord():
+            return f"run {thing.name} belongs to {f'job queue {thing.queue}' if thing.queue else 'no known job queue'}"
+        case JobsOf():
+            return f"it concerns job queue {thing.queue}"
+        case JobDefinition():
+            return (
+                f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register one under another "
+                f"name, or have it tagged {QUEUES_TAG} with the names of the queues whose keys may submit it"
+            )
+        case _:
+            return "it concerns other queues too"
