@@ -117,7 +117,8 @@ class Gangs:
 
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         def plan() -> Plan:
-            return self.engine.plan(self.gang(session, job, attempt, gang_needs(job.node_properties)))
+            plan = self.engine.plan(self.gang(session, job, attempt, gang_needs(job.node_properties)))
+            return self.engine.with_secrets(plan)
 
         self.bus.expect(job.id, attempt.number)
         try:

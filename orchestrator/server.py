@@ -20,6 +20,7 @@ from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.several import Several
 from orchestrator.home import HomeLock, ServerError
+from orchestrator.job_secrets import Secrets, SecretsError
 from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
@@ -44,12 +45,14 @@ class Server:
         database: str | None = None,
         retention: float | None = None,
         engines: Sequence[str] = ("local",),
+        secrets: str | None = None,
     ) -> None:
         """Take the lock, the port, the store, the database and the engines, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
         jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
+        ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.job_secrets.Secrets`); None: jobs get none.
 
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
@@ -67,9 +70,10 @@ class Server:
                 stack.callback(found.close)
                 nodes = _make_engines(engines, home, cpus, gpus)
                 stack.callback(nodes.close)
+                nodes.secrets = Secrets(secrets)
                 with found.session() as session:
                     ensure_pools(session, nodes.names)
-            except (DatabaseError, EngineError) as error:
+            except (DatabaseError, EngineError, SecretsError) as error:
                 raise ServerError(str(error)) from None
             self.bus = Bus(home, nodes.addresses)
             stack.callback(self.bus.close)

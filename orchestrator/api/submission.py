@@ -20,8 +20,10 @@ from orchestrator.api.members import check_consumables
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.database import note_changed
 from orchestrator.definition import GangNeeds, gang_needs
+from orchestrator.job_secrets import SecretsError
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
+from orchestrator.pools import queue_engines
 from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, RunRecord, now
 from shared_store.layout import NAME
 
@@ -102,6 +104,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
     needs = rules.check_nodes(properties, document["type"], complete=True)
+    _check_secrets(context, queue, needs)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
     timeout = request.get("timeout") or document.get("timeout") or {}
     job_id = str(uuid.uuid4())
@@ -129,6 +132,16 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
         tags=request.get("tags") or {},
         created_at=now(),
     )
+
+
+def _check_secrets(context: Context, queue: JobQueue, needs: GangNeeds) -> None:
+    containers = [node.container for node in needs.nodes if node.container.get("secrets")]
+    if containers:
+        engines = queue_engines(context.session, queue.name, context.controller.engine.names[0])
+        try:
+            context.controller.engine.check_secrets(engines, containers)
+        except SecretsError as error:
+            raise ClientError(str(error)) from None
 
 
 def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:

@@ -96,6 +96,13 @@ def serve(
     submit_rate_limit: Annotated[
         int, typer.Option(min=0, help="SubmitJob requests per second that each key may send (AWS: 50); 0: any number.")
     ] = 0,
+    secrets: Annotated[
+        str | None,
+        typer.Option(
+            help="Give jobs the secrets that their definitions name: a JSON file of names and values, or env for the variables "
+            "MUSTER_SECRET_<name>. Jobs that name secrets are refused by default."
+        ),
+    ] = None,
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next one finds them."""
     from orchestrator.server import Server  # imports what only a controller needs
@@ -112,6 +119,7 @@ def serve(
         submit_rate_limit=submit_rate_limit,
         database=database,
         retention=seconds_of("--retention", retention),
+        secrets=secrets,
     )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 from orchestrator.engines.base import (
     Engine,
@@ -19,9 +20,15 @@ from orchestrator.engines.base import (
     engine_of,
 )
 from orchestrator.engines.runner import Runner
+from orchestrator.job_secrets import Secrets, SecretsError
 
 FRESH = 2.0
 """Seconds that a request waits for the engines' newest hosts."""
+
+_GIVEN = ("local", "docker")
+"""Engines that hand the controller's secrets to their nodes."""
+_PASSED_ON = ("aws-batch",)
+"""Engines that are sent the job's ``secrets`` as they are: AWS has its own."""
 
 
 class NotServed(NotYet):
@@ -36,6 +43,8 @@ class Several:
 
     def __init__(self, engines: Sequence[Engine]) -> None:
         """Takes the engines over: :meth:`close` closes them."""
+        self.secrets = Secrets()
+        """Where the secrets come from that jobs are given; at first nowhere."""
         self.changed: Callable[[], None] = lambda: None
         """Called (on an engine's thread) when an engine has something new to tell."""
         self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
@@ -87,9 +96,33 @@ class Several:
                 f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
                 f"{gang.pool} refuses other images (tag muster:images)"
             )
+        if any(container.get("secrets") for container in gang.containers) and engine.name not in (*_GIVEN, *_PASSED_ON):
+            raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)
+
+    def with_secrets(self, plan: Plan) -> Plan:
+        """The plan with the values of the job's secrets in its nodes' environments: to be launched, not to be shown. Raises EngineError."""
+        containers = plan.gang.containers
+        if not any(container.get("secrets") for container in containers):
+            return plan
+        if engine_of(plan.gang.placements[0].host) in _PASSED_ON:
+            return plan
+        try:
+            given = [self.secrets.of(container) for container in containers]
+        except SecretsError as error:
+            raise EngineError(str(error)) from None
+        nodes = [
+            replace(node, environment={**node.environment, **more})
+            for node, more in zip(plan.nodes, given, strict=True)
+        ]
+        return replace(plan, nodes=nodes)
+
+    def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]]) -> None:
+        """Raises SecretsError where a job of one of these engines could not be given the secrets that it asks for."""
+        if any(name not in _PASSED_ON for name in names):
+            self.secrets.check(containers)
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan]) -> str:
         """The handle of a gang once it is started; does not wait. Raises NotYet until then, and EngineError.
