@@ -104,5 +104,5 @@ def _names(reference: str) -> list[str]:
     if match := _MANAGER.fullmatch(reference):
         return [reference, match[1], reference.split(":")[6]]
     if match := _PARAMETER.fullmatch(reference):
-        return [reference, match[1], match[1].rpartition("/")[2]]
+        return [reference, match[1], match[1][1:], match[1].rpartition("/")[2]]
     return [reference]
