@@ -7,8 +7,13 @@ iteration twice, none from a past that was given up.
 from __future__ import annotations
 
 import json
+import os
 import re
-from collections.abc import Mapping
+import threading
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +21,10 @@ from typing import Any
 from shared_store.layout import Run
 
 _NAME = re.compile(r"metrics-e(\d+)\.jsonl")
+_BLOCK = 16 << 10
+"""Bytes between two marks."""
+_IDENTITY = 256
+"""Bytes of a file's beginning that tell it from another one."""
 
 
 class MetricsWriter:
@@ -45,18 +54,114 @@ class MetricsWriter:
 
 
 def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:
-    """The run's history: one record an iteration, in order, for iterations greater than ``after``.
+    """The run's history: one record an iteration, in order, for iterations greater than ``after``. Raises OSError.
 
     For an iteration seen twice the later epoch counts. A last line that a crash cut short is passed over.
     """
-    history: dict[int, dict[str, Any]] = {}
-    for _, path in sorted(_files(run)):
-        for record in _records(path):
-            if "resumed_from" in record:
-                history = {i: r for i, r in history.items() if i <= record["resumed_from"]}
-            elif isinstance(record.get("iteration"), int):
-                history[record["iteration"]] = record
-    return [history[i] for i in sorted(history) if i > after]
+    return MetricsHistory(run).after(after)
+
+
+@lru_cache(maxsize=256)
+def history_of(run: Run) -> MetricsHistory:
+    """The run's history, with what is known of it from earlier looks: for whoever asks again and again."""
+    return MetricsHistory(run)
+
+
+@dataclass
+class _Section:
+    """Records of one file whose iterations rise."""
+
+    resumed_from: int | None
+    """What came before it counts up to this iteration; None: all of it."""
+    end: int
+    """Byte after its last record."""
+    last: int = 0
+    """Its last iteration."""
+    marks: list[tuple[int, int]] = field(default_factory=list)
+    """Of a record every 16 KiB: iteration and byte at which it begins."""
+
+
+@dataclass
+class _File:
+    path: Path
+    end: int = 0
+    """Bytes of whole lines that are known."""
+    identity: bytes = b""
+    sections: list[_Section] = field(default_factory=list)
+
+    def refresh(self) -> None:
+        """Take up what was added."""
+        with open(self.path, "rb") as file:
+            head = file.read(_IDENTITY)
+            if os.fstat(file.fileno()).st_size < self.end or not head.startswith(self.identity):
+                self.end, self.sections = 0, []
+            file.seek(self.end)
+            for line in file:
+                if not line.endswith(b"\n"):
+                    break
+                self._note(_record(line), len(line))
+            self.identity = head[: self.end]
+
+    def _note(self, record: Mapping[str, Any], size: int) -> None:
+        start, self.end = self.end, self.end + size
+        iteration = record.get("iteration")
+        if isinstance(before := record.get("resumed_from"), int):
+            self.sections.append(_Section(before, self.end))
+        elif isinstance(iteration, int):
+            if not self.sections or (self.sections[-1].marks and iteration <= self.sections[-1].last):
+                self.sections.append(_Section(None, self.end))
+            section = self.sections[-1]
+            if not section.marks or start - section.marks[-1][1] >= _BLOCK:
+                section.marks.append((iteration, start))
+            section.last, section.end = iteration, self.end
+
+    def read(self, section: _Section, after: int) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The section's records from the last mark before ``after`` on, by iteration."""
+        place = max(0, bisect_right(section.marks, after, key=lambda mark: mark[0]) - 1)
+        with open(self.path, "rb") as file:
+            file.seek(section.marks[place][1])
+            for line in file.read(section.end - section.marks[place][1]).split(b"\n"):
+                record = _record(line)
+                if isinstance(iteration := record.get("iteration"), int):
+                    yield iteration, record
+
+
+class MetricsHistory:
+    """A run's history, read from where it was read before. Safe to use from many threads."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._lock = threading.Lock()
+        self._known: dict[Path, _File] = {}
+
+    def after(self, iteration: int = 0) -> list[dict[str, Any]]:
+        """As :func:`read_metrics`; reads no more than 16 KiB and what is asked for. Raises OSError."""
+        with self._lock:
+            sections = self._refresh()
+            found: dict[int, dict[str, Any]] = {}
+            for place, (file, section) in enumerate(sections):
+                later = [each.resumed_from for _, each in sections[place + 1 :] if each.resumed_from is not None]
+                limit = min(later, default=section.last)
+                if section.marks and min(section.last, limit) > iteration:
+                    found |= {i: record for i, record in file.read(section, iteration) if iteration < i <= limit}
+        return [found[i] for i in sorted(found)]
+
+    def last(self) -> dict[str, Any] | None:
+        """The newest record; None where there is none. Raises OSError."""
+        with self._lock:
+            newest = 0
+            for _, section in self._refresh():
+                newest = newest if section.resumed_from is None else min(newest, section.resumed_from)
+                newest = max(newest, section.last)
+        records = self.after(newest - 1) or self.after()
+        return records[-1] if records else None
+
+    def _refresh(self) -> list[tuple[_File, _Section]]:
+        paths = [path for _, path in sorted(_files(self._run))]
+        self._known = {path: self._known.get(path) or _File(path) for path in paths}
+        for file in self._known.values():
+            file.refresh()
+        return [(file, section) for file in self._known.values() for section in file.sections]
 
 
 def _files(run: Run) -> list[tuple[int, Path]]:
@@ -67,13 +172,10 @@ def _files(run: Run) -> list[tuple[int, Path]]:
     return [(int(match[1]), path) for path in entries if (match := _NAME.fullmatch(path.name))]
 
 
-def _records(path: Path) -> list[dict[str, Any]]:
-    records = []
-    for line in path.read_bytes().split(b"\n")[:-1]:
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict):
-            records.append(record)
-    return records
+def _record(line: bytes) -> dict[str, Any]:
+    """The record of a line; empty where it is damaged."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}

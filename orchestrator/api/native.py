@@ -36,7 +36,7 @@ from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower, LogLine
-from shared_store.metrics import read_metrics
+from shared_store.metrics import history_of
 
 router = APIRouter(prefix="/api")
 
@@ -307,7 +307,7 @@ def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[d
 @router.get("/runs/{name}/metrics")
 def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for iterations greater than ``after``."""
-    return read_metrics(permitted_run(_controller(request), name, Operation.READ_METRICS), after)
+    return history_of(permitted_run(_controller(request), name, Operation.READ_METRICS)).after(after)
 
 
 @router.post("/runs/{name}/resume")

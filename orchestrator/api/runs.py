@@ -25,7 +25,7 @@ from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import DamagedFile, read_json
 from shared_store.layout import LARGEST_DESCRIPTION, Run
-from shared_store.metrics import read_metrics
+from shared_store.metrics import history_of
 
 CONFLICT = 409
 """The request is well formed, but the state of things refuses it."""
@@ -175,8 +175,7 @@ def _resumed(context: Context, run: Run) -> dict[str, Any] | None:
 
 def last_metrics(run: Run) -> dict[str, Any] | None:
     """The newest record of the run's metrics."""
-    history = read_metrics(run)
-    return history[-1] if history else None
+    return history_of(run).last()
 
 
 NETWORK = (

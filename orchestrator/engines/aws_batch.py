@@ -26,6 +26,7 @@ from orchestrator.engines.aws_logs import GangLogs, NodeLog
 from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
 from shared_store.layout import Store
+from shared_store.log_files import LIMIT
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
 
 _OVER = ("SUCCEEDED", "FAILED")
@@ -62,6 +63,8 @@ class _Watched:
     ended: dict[int, float] = field(default_factory=dict)
     """By node: when it was first seen to have ended (monotonic [s])."""
     logs: GangLogs | None = None
+    stopped: bool = False
+    """It was stopped: nothing of it runs, and nothing copies its logs."""
 
     @property
     def straggled(self) -> bool:
@@ -134,7 +137,7 @@ class AwsBatchEngine:
         except (BotoCoreError, ResponseParserError) as error:
             raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
         facts = {
-            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main")},
+            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main", "log_limit")},
             "gang": gang.name,
             "aws": job,
             "queue": config.job_queue,
@@ -145,7 +148,8 @@ class AwsBatchEngine:
 
     def observe(self, handle: str) -> GangStatus:
         facts = json.loads(handle)
-        watched = self._gangs.setdefault(facts["gang"], _Watched())
+        with self._lock:
+            watched = self._gangs.setdefault(facts["gang"], _Watched())
         over = watched.status is not None and not any(node.running for node in watched.status)
         if watched.status is None or (not over and time.monotonic() >= watched.next):
             return self._look_again(facts, watched)
@@ -154,7 +158,8 @@ class AwsBatchEngine:
     def stop(self, handle: str, grace: float) -> None:
         """AWS's own grace is 30 s, whatever ``grace`` says. Waits for as long as AWS says that something of it runs."""
         facts = json.loads(handle)
-        watched = self._gangs.setdefault(facts["gang"], _Watched())
+        with self._lock:
+            watched = self._gangs.setdefault(facts["gang"], _Watched())
         asked = False
         while True:
             try:
@@ -172,8 +177,11 @@ class AwsBatchEngine:
             time.sleep(self.config.poll)
         if watched.logs is not None:
             watched.logs.finish()
-        while len(self._gangs) > _REMEMBERED and next(iter(self._gangs)) != facts["gang"]:
-            del self._gangs[next(iter(self._gangs))]
+        with self._lock:
+            watched.stopped = True
+            over = [name for name, each in self._gangs.items() if each.stopped]
+            for name in over[: max(0, len(over) - _REMEMBERED)]:
+                del self._gangs[name]
 
     def close(self) -> None:
         """Jobs on AWS go on."""
@@ -312,7 +320,12 @@ class AwsBatchEngine:
         """The copies of a gang's logs, begun."""
         run, shared = Store(facts["store"]).run(facts["run"]), self._is_shared(facts["store"])
         nodes = [
-            NodeLog(run.log(facts["job"], facts["attempt"], index), supervised, copied=not (supervised and shared))
+            NodeLog(
+                run.log(facts["job"], facts["attempt"], index),
+                supervised,
+                copied=not (supervised and shared),
+                limit=facts.get("log_limit", LIMIT),
+            )
             for index, supervised in enumerate(facts["supervised"])
         ]
         logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)

@@ -16,6 +16,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from botocore.parsers import ResponseParserError
 
 from shared_store.files import json_object
+from shared_store.log_files import LIMIT, LogWriter
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import Outcome, parse_outcome
 
@@ -34,11 +35,15 @@ class NodeLog:
     supervised: bool
     copied: bool = True
     """False where the supervisor writes it to the store that is here, too."""
+    limit: int = LIMIT
+    """Bytes of the copy that are kept."""
     stream: str | None = None
     """Name of the stream; None until the node has one."""
     token: str | None = None
     skip: int = 0
     """Lines that are in the copy already: a controller before this one wrote them."""
+    pending: bytes = b""
+    """Lines that came and are not in the copy yet: the volume has no room."""
     ended: float | None = None
     """When the node was first seen to have ended (monotonic [s])."""
     heard: float = 0.0
@@ -46,21 +51,45 @@ class NodeLog:
     outcome: Outcome | None = None
     whole: bool = False
     """Nothing more will come."""
+    _writer: LogWriter | None = None
+
+    def open(self) -> None:
+        """Go on with the copy. Raises OSError."""
+        if self._writer is None:
+            writer = LogWriter(self.path, self.limit)
+            self.skip, self._writer = writer.lines, writer
+        self._write()
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def take(self, events: list[Mapping[str, Any]]) -> None:
-        """Append what came; the outcome is the last line of a supervised node."""
-        with open(self.path, "a", encoding="utf-8", errors="backslashreplace") as file:
-            for event in events:
-                if self.outcome is not None:
-                    return
-                self.heard = time.monotonic()
-                line = self._line(str(event["message"]), float(event["timestamp"]) / 1000)
-                if line is None:
-                    continue
-                if self.skip:
-                    self.skip -= 1
-                else:
-                    file.write(line)
+        """Append what came; the outcome is the last line of a supervised node.
+
+        Raises OSError where the volume has no room; :meth:`open` tries again.
+        """
+        lines = []
+        for event in events:
+            if self.outcome is not None:
+                break
+            self.heard = time.monotonic()
+            line = self._line(str(event["message"]), float(event["timestamp"]) / 1000)
+            if line is None:
+                continue
+            if self.skip:
+                self.skip -= 1
+            else:
+                lines.append(line)
+        self.pending += "".join(lines).encode(errors="backslashreplace")
+        self._write()
+
+    def _write(self) -> None:
+        assert self._writer is not None
+        self.pending = self.pending[self._writer.append(self.pending) :]
+        if self.pending:
+            raise self._writer.error or OSError(f"{self.path}: not written")
 
     def _line(self, message: str, seconds: float) -> str | None:
         """As it belongs into the run's log; None for the outcome, which is kept."""
@@ -77,7 +106,7 @@ class NodeLog:
     def settle(self, quiet: float) -> None:
         """Whether all is there: the outcome has come, or nothing has for ``quiet`` seconds after the end."""
         silent = self.ended is not None and time.monotonic() - max(self.ended, self.heard) > quiet
-        self.whole = self.outcome is not None or silent
+        self.whole = not self.pending and (self.outcome is not None or silent)
 
 
 def read_outcome_line(text: str) -> Outcome | None:
@@ -102,15 +131,13 @@ class GangLogs:
     """Seconds without a line after which an ended node's log is whole."""
     _wake: threading.Event = field(default_factory=threading.Event)
     _closed: bool = False
+    _thread: threading.Thread | None = None
 
     def start(self, name: str) -> None:
         for node in self.nodes:
-            if not node.copied:
-                node.whole = True
-                continue
-            node.path.parent.mkdir(parents=True, exist_ok=True)
-            node.skip = node.path.read_bytes().count(b"\n") if node.path.exists() else 0
-        threading.Thread(target=self._follow, name=f"log {name}", daemon=True).start()
+            node.whole = not node.copied
+        self._thread = threading.Thread(target=self._follow, name=f"log {name}", daemon=True)
+        self._thread.start()
 
     def saw(self, index: int, stream: str | None, ended: bool) -> NodeLog:
         """What AWS says of a node: the name of its stream, and whether it has ended."""
@@ -122,13 +149,18 @@ class GangLogs:
         return node
 
     def finish(self) -> None:
-        """All nodes have ended: wait until their logs are whole, for a while, and copy no more."""
+        """All nodes have ended: wait until their logs are whole, for a while, and copy no more.
+
+        When it returns nothing here writes the logs any more.
+        """
         deadline = time.monotonic() + _LAST_WAIT
         while not all(node.whole or node.stream is None for node in self.nodes) and time.monotonic() < deadline:
             self._wake.set()
             time.sleep(0.1)
         self._closed = True
         self._wake.set()
+        if self._thread is not None:
+            self._thread.join()
 
     def _follow(self) -> None:
         while not self._closed and not all(node.whole for node in self.nodes):
@@ -137,19 +169,23 @@ class GangLogs:
                     self._copy(node)
             self._wake.wait(self.poll)
             self._wake.clear()
+        for node in self.nodes:
+            node.close()
 
     def _copy(self, node: NodeLog) -> None:
         """All that has come since the last look."""
         try:
+            if node.stream is not None:
+                node.open()
             while node.stream is not None and not self._closed:
                 request = {"logGroupName": self.group, "logStreamName": node.stream, "startFromHead": True}
                 if node.token:
                     request["nextToken"] = node.token
                 page = self.client.get_log_events(**request, limit=_PAGE)
+                before, node.token = node.token, page["nextForwardToken"]
                 node.take(page["events"])
-                if node.token == page["nextForwardToken"]:  # AWS's sign for: that is all for now
+                if before == node.token:  # AWS's sign for: that is all for now
                     break
-                node.token = page["nextForwardToken"]
                 time.sleep(_PACE)
         except (ClientError, BotoCoreError, ResponseParserError, OSError):
             pass  # not there yet, throttled, away, or the disk is full: the next round

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import socket
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -46,6 +47,7 @@ from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store import __version__
 from shared_store.layout import Store
+from shared_store.log_files import LIMIT
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
 
 log = logging.getLogger("muster.engines")
@@ -98,6 +100,8 @@ class DockerEngine:
         self._pulls: dict[str, Future[Image]] = {}
         self._puller = ThreadPoolExecutor(2, thread_name_prefix="pull")
         self._copies: dict[str, LogCopy] = {}
+        self._copying = threading.Lock()
+        """Held where a copy is looked for and begun: a log has one writer."""
         self._ended: dict[str, dict[int, NodeStatus]] = {}
         self._away = False
 
@@ -316,14 +320,17 @@ class DockerEngine:
 
     def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""
-        key = f"{facts['gang']}/{index}"
-        before = self._copies.get(key)
-        if not container.labels.get("muster.plain") or (before is not None and not before.is_due_again):
+        if not container.labels.get("muster.plain"):
             return
-        run = Store(facts["store"]).run(facts["run"])
-        if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
-            return
-        self._copies[key] = LogCopy(container, run.log(facts["job"], facts["attempt"], index), before)
+        key, run = f"{facts['gang']}/{index}", Store(facts["store"]).run(facts["run"])
+        with self._copying:  # a gang that is being stopped is looked at by two threads
+            before = self._copies.get(key)
+            if before is not None and not before.is_due_again:
+                return
+            if read_outcome(run, facts["job"], facts["attempt"], index) is not None:
+                return
+            path, limit = run.log(facts["job"], facts["attempt"], index), facts.get("log_limit", LIMIT)
+            self._copies[key] = LogCopy(container, path, limit, before)
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():
@@ -336,8 +343,9 @@ class DockerEngine:
                 network.remove()
             except APIError:
                 pass  # a container that is still going; the next stop removes it
-        for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
-            del self._copies[key]
+        with self._copying:
+            for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
+                del self._copies[key]
 
 
 def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
@@ -374,6 +382,7 @@ def _facts(gang: Gang) -> dict[str, Any]:
         "epoch": gang.epoch,
         "run": gang.run,
         "store": gang.store,
+        "log_limit": gang.log_limit,
     }
 
 

@@ -15,6 +15,7 @@ import requests
 from docker.models.containers import Container
 from urllib3.exceptions import HTTPError
 
+from shared_store.log_files import LogWriter
 from shared_store.logs import format_line
 
 _TIME = re.compile(rb"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?Z) ")
@@ -29,11 +30,16 @@ log = logging.getLogger("muster.engines")
 class LogCopy:
     """Appends what a container prints to a log until it ends, in a thread. What is there already is not copied twice."""
 
-    def __init__(self, container: Container, path: Path, before: LogCopy | None) -> None:
-        """``before``: the copy that failed, and that this one goes on from."""
+    def __init__(self, container: Container, path: Path, limit: int, before: LogCopy | None) -> None:
+        """Args:
+        container: What prints.
+        path: The log; nothing else may write it.
+        limit: Bytes of it that are kept.
+        before: The copy that failed, and that this one goes on from.
+        """
         self.trouble: Exception | None = None
         """Why it ended before its container: a store that is full, a Docker Engine that went away."""
-        self._container, self._path, self._ended = container, path, 0.0
+        self._container, self._path, self._limit, self._ended = container, path, limit, 0.0
         self._known = str(before.trouble) if before is not None else ""
         self._thread = threading.Thread(target=self._run, name=f"log {container.name}", daemon=True)
         self._thread.start()
@@ -48,7 +54,7 @@ class LogCopy:
 
     def _run(self) -> None:
         try:
-            _copy(self._container, self._path)
+            _copy(self._container, self._path, self._limit)
             self._check_ended()
         except Exception as error:
             if isinstance(error, struct.error):  # half a frame's head
@@ -70,20 +76,21 @@ class LogCopy:
             time.sleep(0.05)
 
 
-def _copy(container: Container, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "ab+") as file:
-        file.seek(0)
-        there = file.read()
-        copied = there.count(b"\n")
-        file.truncate(there.rfind(b"\n") + 1)  # half a line, where the disk was full
-        for number, (at, line) in enumerate(_lines(container)):
-            if number >= copied:
-                file.write(format_line(at, 0, "o", line).encode(errors="backslashreplace"))
-                file.flush()
+def _copy(container: Container, path: Path, limit: int) -> None:
+    """Raises OSError where the log can't be written."""
+    writer = LogWriter(path, limit)
+    try:
+        copied = writer.lines
+        for lines in _lines(container):
+            fresh, copied = lines[copied:], max(0, copied - len(lines))
+            data = "".join(format_line(at, 0, "o", line) for at, line in fresh).encode(errors="backslashreplace")
+            if writer.append(data) < len(data):
+                raise writer.error or OSError(f"{path}: not written")
+    finally:
+        writer.close()
 
 
-def _lines(container: Container) -> Iterator[tuple[float, str]]:
+def _lines(container: Container) -> Iterator[list[tuple[float, str]]]:
     """Every line and when it was printed [Unix s], which Docker remembers: a line is never dated anew."""
     rest, at = b"", 0.0
     for chunk in container.logs(stream=True, follow=True, timestamps=True):
@@ -94,8 +101,8 @@ def _lines(container: Container) -> Iterator[tuple[float, str]]:
             began = time.time()
         at = at if rest else began
         *whole, rest = (rest + chunk).split(b"\n")
-        for line in whole:
-            yield at, line.decode(errors="backslashreplace")
-            at = began
+        times = [at, *[began] * len(whole)]
+        yield [(when, line.decode(errors="backslashreplace")) for when, line in zip(times, whole, strict=False)]
+        at = began if whole else at
     if rest:
-        yield at, rest.decode(errors="backslashreplace")
+        yield [(at, rest.decode(errors="backslashreplace"))]

@@ -15,6 +15,7 @@ from typing import Any
 import boto3
 import pytest
 
+from orchestrator.engines import aws_batch
 from orchestrator.engines.aws_batch import AwsBatchEngine
 from orchestrator.engines.aws_config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
@@ -287,6 +288,25 @@ def test_an_image_without_muster_runs_as_it_is(bench: Bench) -> None:
     assert node.exit_code == 4
     wait_for(lambda: "plain hello 0" in bench.log(), 10, "its log")
     assert bench.outcome(0).exit_code == 4
+
+
+def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
+    script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
+    running = bench.launch(bench.gang(script, 1, native=False))
+    wait_for(lambda: bench.engine.observe(running) and "tick 1" in bench.log(), 20, "its first line")
+    for attempt in (2, 3):
+        short = bench.launch(bench.gang("true", 1, native=False, attempt=attempt))
+        bench.ended(short)
+        bench.engine.stop(short, 1.0)
+    bench.ended(running)
+    bench.engine.stop(running, 1.0)
+    ticks = [line for line in bench.log() if line.startswith("tick")]
+    assert ticks == [f"tick {i}" for i in range(1, 101)]
+    assert [node.exit_code for node in bench.ended(running)] == [0], "it is remembered, or asked for anew"
+    assert bench.log().count("tick 100") == 1
 
 
 def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workstation: Bench) -> None:

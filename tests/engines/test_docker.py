@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from orchestrator.engines import docker as docker_engine
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
 from shared_store import __version__
 from shared_store.epoch import raise_epoch
@@ -43,7 +45,11 @@ class Bench:
         return DockerEngine(self.home / "home", gpus=[])
 
     def gang(self, script: str = WAIT, nodes: int = 2, image: str = PLAIN, **container: Any) -> Gang:
-        changes = {name: container.pop(name) for name in ("attempt", "is_gang", "memory", "main") if name in container}
+        changes = {
+            name: container.pop(name)
+            for name in ("attempt", "is_gang", "memory", "main", "log_limit")
+            if name in container
+        }
         memory = changes.pop("memory", 256)
         return Gang(
             job=JOB,
@@ -193,6 +199,36 @@ def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_p
     bench.ended(handle, bench.another())
     lines = log.read_text()
     assert lines.startswith(early) and bench.log() == ["early", "late"], lines
+
+
+def test_two_threads_that_look_at_once_copy_a_log_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    genuine = docker_engine.read_outcome
+
+    def slow(*arguments: Any) -> Any:
+        time.sleep(0.3)  # a volume far away
+        return genuine(*arguments)
+
+    handle = bench.launch(bench.gang("for i in 1 2 3; do echo line $i; sleep 0.5; done", 1))
+    successor = bench.another()  # as after a restart: the controller's thread and that of a stop look first
+    monkeypatch.setattr(docker_engine, "read_outcome", slow)
+    before = threading.active_count()
+    looks = [threading.Thread(target=successor.observe, args=(handle,)) for _ in range(2)]
+    for look in looks:
+        look.start()
+    for look in looks:
+        look.join()
+    copies = [thread for thread in threading.enumerate() if thread.name.startswith("log muster-")]
+    assert len(copies) <= 2, "one of the first controller, one of its successor"
+    assert threading.active_count() <= before + 1
+    bench.ended(handle)
+
+
+def test_a_long_log_keeps_its_head_and_its_tail(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("seq 100000 160000; echo the error; exit 1", 1, log_limit=1 << 20))
+    bench.ended(handle)
+    log = bench.log()
+    assert log[0] == "100000" and log[-2:] == ["160000", "the error"]
+    assert len(log) < 40_000 and sum("left out" in line for line in log) == 1
 
 
 def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> None:

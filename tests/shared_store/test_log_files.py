@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -219,6 +220,20 @@ def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
     for first in range(12_000, 40_000, 500):
         writer.append(lines_of(first, 500))
     assert numbers([event.text for event in view.forward()])[:3500] == list(range(3500))
+
+
+def test_counting_the_lines_of_a_log_takes_no_memory_of_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "node-0.log"
+    with open(path, "wb") as file:
+        file.write(b"one\n")
+        file.seek(200 << 20)
+        file.write(b"\ntwo\n")
+    tracemalloc.start()
+    try:
+        assert LogWriter(path, 1 << 30).lines == 3
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_files_of_other_names_are_no_part_of_a_log(tmp_path: Path) -> None:

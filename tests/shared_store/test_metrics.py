@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shared_store import metrics
 from shared_store.layout import Run
-from shared_store.metrics import MetricsWriter, read_metrics
+from shared_store.metrics import MetricsHistory, MetricsWriter, read_metrics
 
 
 def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
@@ -101,3 +103,56 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
                 with open(run.metrics / f"metrics-e{epoch}.jsonl", "ab") as file:
                     file.write(b'{"iteration": 1, "epo')
         assert history(run) == expected
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
+def test_a_history_that_is_kept_says_what_a_fresh_one_does_whatever_was_added(
+    attempts: list[tuple[int, int, bool]],
+) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        run = Run(Path(directory))
+        kept, expected = MetricsHistory(run), dict[int, int]()
+        for epoch, (resumed_from, count, look) in enumerate(attempts, 1):
+            attempt(run, epoch, resumed_from, resumed_from + count)
+            expected = {i: e for i, e in expected.items() if i <= resumed_from}
+            expected |= dict.fromkeys(range(resumed_from + 1, resumed_from + count + 1), epoch)
+            if look:
+                kept.last()
+            for after in (0, resumed_from, resumed_from + count - 1):
+                found = [(record["iteration"], record["epoch"]) for record in kept.after(after)]
+                assert found == sorted(item for item in expected.items() if item[0] > after)
+        last = kept.last()
+        assert (last and (last["iteration"], last["epoch"])) == max(expected.items(), default=None)
+
+
+def test_the_newest_record_of_a_long_history_is_read_without_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, parsed = Run(tmp_path), []
+    genuine = metrics._record
+
+    def counting(line: bytes) -> dict[str, Any]:
+        parsed.append(line)
+        return genuine(line)
+
+    attempt(run, 1, 0, 20_000)
+    history = MetricsHistory(run)
+    assert len(history.after()) == 20_000
+    monkeypatch.setattr(metrics, "_record", counting)
+    with open(run.metrics / "metrics-e1.jsonl", "a") as file:
+        file.write('{"iteration": 20001, "epoch": 1}\n{"iteration": 20002, "epo')
+    assert [record["iteration"] for record in history.after(20_000)] == [20_001]
+    last = history.last()
+    assert last is not None and last["iteration"] == 20_001
+    assert len(parsed) < 2000
+
+
+def test_a_history_whose_file_was_replaced_is_read_anew(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 5)
+    history = MetricsHistory(run)
+    assert len(history.after()) == 5
+    (run.metrics / "metrics-e1.jsonl").unlink()
+    attempt(run, 1, 2, 9)
+    assert [record["iteration"] for record in history.after()] == list(range(3, 10))
