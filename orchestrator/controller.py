@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
 from sqlalchemy import func, select, update
@@ -79,7 +79,7 @@ class Controller:
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
         self._backoff = Backoff(log)
-        """By job, what goes wrong with it; ``("start", job)`` where it is its start."""
+        """What goes wrong, by a part of the pass, or by what was tried of a job and the job's id."""
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
         with database.session() as session:
             self.roster.load(session)
@@ -116,15 +116,15 @@ class Controller:
         with self.database.session() as session:
             self.roster.take_dependents(session)
         taken = self.roster.take_due(_SETTLED_A_TICK)
-        due = [job_id for job_id in taken if not self._backoff.waits(job_id)]
-        self.roster.look_again(job_id for job_id in taken if self._backoff.waits(job_id))
+        due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
+        self.roster.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
             self.wake()  # the rest comes after a look at the gangs that run
         for start in range(0, len(due), _SETTLED_AT_ONCE):
-            self._guarded(due[start : start + _SETTLED_AT_ONCE], self._settle)
+            self.roster.look_again(self._guarded("settle", due[start : start + _SETTLED_AT_ONCE], self._settle))
         for job_id in self.roster.active():
-            if not self._backoff.waits(job_id):
-                self._guarded([job_id], self._advance)
+            if not self._backoff.waits(("advance", job_id)):
+                self._guarded("advance", [job_id], self._advance)
         self._isolated("scheduling", self._admit)
         self._isolated("clearing away", self._sweep)
 
@@ -152,22 +152,24 @@ class Controller:
         except Exception as error:
             self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
-    def _guarded(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
-        """Look at these jobs in one commit; where that fails, at each by itself, and later again at those that fail."""
+    def _guarded(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
+        """Do something to these jobs in one commit; where that fails, to each by itself. Returns those that it failed for.
+
+        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        Raises DatabaseError.
+        """
         try:
             self._carried_out(ids, body)
         except DatabaseError:
             raise
         except Exception as error:
             if len(ids) > 1:
-                for job_id in ids:
-                    self._guarded([job_id], body)
-                return
-            self._failed(ids[0], ids[0], error)
-            self.roster.look_again(ids)
-            return
+                return [failed for job_id in ids for failed in self._guarded(what, [job_id], body)]
+            self._failed(what, ids[0], error)
+            return ids
         for job_id in ids:
-            self._backoff.worked(job_id)
+            self._backoff.worked((what, job_id))
+        return []
 
     def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
         with self.database.session() as session:
@@ -177,11 +179,11 @@ class Controller:
                 if job_id in jobs:
                     body(session, jobs[job_id])
 
-    def _failed(self, subject: Hashable, job_id: str, error: Exception) -> None:
+    def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
         expected = isinstance(error, StoreUnavailable)
         reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
-        if self._backoff.failed(subject, f"job {job_id}: {reason}", None if expected else error):
+        if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", None if expected else error):
             with self.database.session() as session:  # by its id alone: its row may be what is damaged
                 over = [Status.SUCCEEDED, Status.FAILED]
                 told = update(Job).where(Job.id == job_id, Job.status.not_in(over)).values(status_reason=reason[:1024])
@@ -201,8 +203,8 @@ class Controller:
     def _look_again(self, ids: Collection[str]) -> None:
         """Requests have changed these jobs: what failed of them is tried at once."""
         for job_id in ids:
-            self._backoff.hurry(job_id)
-            self._backoff.hurry(("start", job_id))
+            for what in ("settle", "advance", "start"):
+                self._backoff.hurry((what, job_id))
         self.roster.look_again(ids)
 
     # -- jobs without a gang ------------------------------------------------------------------------------------------
@@ -282,21 +284,11 @@ class Controller:
     def _carry_out(self, decisions: Decisions) -> None:
         """Each decision by itself: one that fails does not stop the others."""
         for cancel in decisions.cancels:
-            self._decided(cancel.job, partial(self._cancel, cancel))
+            self._guarded("cancel", [cancel.job], partial(self._cancel, cancel))
         for preempt in decisions.preempts:
-            self._decided(preempt.job, partial(self._preempt, preempt))
+            self._guarded("preempt", [preempt.job], partial(self._preempt, preempt))
         for start in decisions.starts:
-            self._decided(start.job, partial(self._start, start))
-
-    def _decided(self, job_id: str, body: Callable[[Session, Job], None]) -> None:
-        subject = ("start", job_id)
-        try:
-            self._carried_out([job_id], body)
-            self._backoff.worked(subject)
-        except DatabaseError:
-            raise
-        except Exception as error:
-            self._failed(subject, job_id, error)
+            self._guarded("start", [start.job], partial(self._start, start))
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:

@@ -1,0 +1,222 @@
+"""What goes wrong under a running controller: damaged rows, starts that fail, a database that goes away. The rest goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from orchestrator.client import ApiError, Client
+from orchestrator.database import Database, DatabaseError
+from orchestrator.engines.local import LocalEngine
+from orchestrator.engines.ray import RayEngine
+from orchestrator.home import HomeLock, ServerError
+from orchestrator.server import Server
+from orchestrator.tables import Job
+from tests.conftest import processes_of, submit_gang, wait_for
+from tests.orchestrator.test_database import job
+
+FOREVER = "import time; time.sleep(600)"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    """A home directory; whatever still runs for it at the end is killed."""
+    yield tmp_path
+    for pid in processes_of(tmp_path):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def serving(home: Path) -> Iterator[Client]:
+    server = Server(home, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            yield client
+    finally:
+        server.close()
+
+
+def detail(client: Client, job_id: str) -> dict[str, Any]:
+    found: dict[str, Any] = client.get(f"/api/jobs/{job_id}")
+    return found
+
+
+def await_status(client: Client, job_id: str, *wanted: str) -> dict[str, Any]:
+    def there() -> dict[str, Any] | None:
+        found = detail(client, job_id)
+        return found if found["status"] in wanted else None
+
+    found: dict[str, Any] = wait_for(there, 30, f"job {job_id} {wanted}")
+    return found
+
+
+def change(home: Path, statement: str, *values: str) -> list[Any]:
+    """Run a statement on the database behind the controller's back."""
+    with contextlib.closing(sqlite3.connect(home / "muster.db", timeout=30)) as database, database:
+        return list(database.execute(statement, values))
+
+
+def test_a_damaged_row_is_named_once_and_stops_no_other_job_also_after_a_restart(
+    home: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with serving(home) as client:
+        running = submit_gang(client, FOREVER, name="running")
+        await_status(client, running, "RUNNING")
+        waiting = submit_gang(client, "pass", name="waiting", cpus="64")
+        wait_for(lambda: "each node needs 64 CPUs" in detail(client, waiting)["statusReason"], 30, "that it waits")
+        [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", running)
+        change(home, "UPDATE jobs SET node_properties = '{broken' WHERE id IN (?, ?)", running, waiting)
+        said = "the controller failed on this job (ValueError: nodeProperties are empty: the job's row in the database is damaged)"
+        reason = wait_for(lambda: said in (r := status_reason(home, running)) and r, 30, "the reason")
+        assert reason == f"{said}; trying again"
+        await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == [f"job {running}: {reason}"]
+    caplog.clear()
+    with serving(home) as client:
+        await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
+        wait_for(lambda: said in status_reason(home, waiting), 30, "the reason")
+        change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, running)
+        client.batch("TerminateJob", jobId=running, reason="enough")
+        assert await_status(client, running, "FAILED")["statusReason"] == "enough"
+        client.batch("TerminateJob", jobId=waiting, reason="never mind")
+        wait_for(lambda: status_reason(home, waiting) == "never mind", 30, "its end")
+    failed = [record.getMessage().partition(":")[0] for record in caplog.records if record.exc_info]
+    assert sorted(failed) == sorted([f"job {running}", f"job {waiting}"])
+
+
+def status_reason(home: Path, job_id: str) -> str:
+    [[reason]] = change(home, "SELECT status_reason FROM jobs WHERE id = ?", job_id)
+    return str(reason)
+
+
+def test_a_start_that_fails_stops_no_other_start_and_is_tried_again(
+    home: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with serving(home) as client:
+        blocked = home / "store" / "runs" / "blocked"
+        blocked.parent.mkdir(exist_ok=True)
+        blocked.write_text("a file where the run's directory belongs")
+        first = submit_gang(client, "print('here')", env={"MUSTER_RUN": "blocked"})
+        said = f"store {home / 'store'}: can't prepare run blocked now ([Errno 20] Not a directory"
+        wait_for(lambda: status_reason(home, first).startswith(said), 30, "the reason")
+        await_status(client, submit_gang(client, "print('here')", cpus="2"), "SUCCEEDED")
+        blocked.unlink()
+        done = await_status(client, first, "SUCCEEDED", "FAILED")
+        assert (done["status"], len(done["attempts"])) == ("SUCCEEDED", 1), done["statusReason"]
+    assert [r.getMessage().startswith(f"job {first}: {said}") for r in caplog.records if r.levelname == "ERROR"] == [
+        True
+    ]
+
+
+@pytest.mark.parametrize("how", ["moved away", "replaced"])
+def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_it_is_back(
+    home: Path, caplog: pytest.LogCaptureFixture, how: str
+) -> None:
+    database, away = home / "muster.db", home / "away.db"
+    with serving(home) as client:
+        url = str(client._http.base_url)
+        running = submit_gang(client, FOREVER)
+        await_status(client, running, "RUNNING")
+        before = processes_of(home)
+        database.rename(away)
+        said = f"database {database} was deleted while the controller runs; put that file back"
+        if how == "replaced":
+            shutil.copy(away, database)
+            said = (
+                f"database {database} was replaced by another file while the controller runs; put the former one back, or restart "
+                "the controller to use this one"
+            )
+        health = httpx.get(f"{url}/healthz")
+        assert (health.status_code, health.json()["reason"]) == (503, said)
+        for ask in (lambda: submit_gang(client, "pass"), lambda: detail(client, running)):
+            with pytest.raises(ApiError) as refused:
+                ask()
+            assert (refused.value.status, str(refused.value).count(said)) == (503, 1), refused.value
+        wait_for(lambda: any(said in record.getMessage() for record in caplog.records), 30, "a line in the log")
+        assert how == "replaced" or not database.exists(), "no empty file was made in its place"
+        assert processes_of(home) == before
+        away.rename(database)
+        wait_for(lambda: httpx.get(f"{url}/healthz").status_code == 200, 30, "that it serves again")
+        await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
+        assert detail(client, running)["status"] == "RUNNING" and set(before) <= set(processes_of(home))
+        client.batch("TerminateJob", jobId=running, reason="enough")
+        await_status(client, running, "FAILED")
+    assert sum(said in record.getMessage() for record in caplog.records) == 1
+
+
+def test_what_was_committed_into_a_deleted_file_is_not_acknowledged(tmp_path: Path) -> None:
+    database = Database.at(tmp_path)
+    with pytest.raises(DatabaseError, match="was deleted while the controller runs"), database.session() as session:
+        session.add(job("lost"))
+        (tmp_path / "muster.db").unlink()
+    with pytest.raises(DatabaseError, match="was deleted"), database.session() as session:
+        session.get(Job, "lost")
+    database.close()
+
+
+def test_a_server_that_can_t_be_made_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[str] = []
+    close = LocalEngine.close
+
+    def noted(engine: LocalEngine) -> None:
+        closed.append(engine.name)
+        close(engine)
+
+    monkeypatch.setattr(LocalEngine, "close", noted)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(ServerError, match="there is no engine 'nosuch'"):
+        Server(tmp_path, port=port, engines=("local", "nosuch"))
+    assert closed == ["local"]
+    before = len(os.listdir("/proc/self/fd"))
+    (tmp_path / "muster.db").write_bytes(b"no database at all" * 1000)
+    with pytest.raises(ServerError, match="file is not a database"):
+        Server(tmp_path, port=port)
+    assert len(os.listdir("/proc/self/fd")) == before
+    HomeLock(tmp_path).release()
+    with socket.create_server(("127.0.0.1", port)):
+        pass
+    (tmp_path / "muster.db").unlink()
+    Server(tmp_path, port=port).close()  # never started
+    assert closed == ["local", "local"]
+
+
+def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Path) -> None:
+    engine = RayEngine.__new__(RayEngine)  # no cluster is needed for what gangs hold
+    engine.home, engine._lock, engine._grown = tmp_path, threading.Lock(), {}
+    stop = threading.Event()
+
+    def hold_and_stop() -> None:
+        number = 0
+        while not stop.is_set():
+            number += 1
+            engine._note({"ray": f"job{number}/1/1", "hosts": ["ray/+1"]})
+            if number > 20:
+                with contextlib.suppress(KeyError):
+                    engine.stop(json.dumps({"ray": f"job{number - 20}/1/1", "hosts": ["ray/+1"]}), 0)
+
+    thread = threading.Thread(target=hold_and_stop)
+    thread.start()
+    try:
+        deadline = time.monotonic() + 1
+        while time.monotonic() < deadline:
+            assert engine._taken() == {}
+    finally:
+        stop.set()
+        thread.join()
