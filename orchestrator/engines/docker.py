@@ -58,6 +58,8 @@ _GANG, _NODE = "muster.gang", "muster.node"
 """Labels of containers and networks."""
 _VERSION = "muster.version"
 """Label of images that have Muster in them."""
+_PERMISSIONS = {"READ": "r", "WRITE": "w", "MKNOD": "m"}
+"""Of devices, and their letters in Docker."""
 _REMEMBERED = 256
 """Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
 _PORT = 29500
@@ -408,6 +410,10 @@ def _limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[
     }
     if placement.gpus:
         options["device_requests"] = [DeviceRequest(device_ids=list(placement.gpus), capabilities=[["gpu"]])]
+    linux = container.get("linuxParameters") or {}
+    if (swap := linux.get("maxSwap")) is not None:  # as on AWS, swappiness counts only beside it
+        options["memswap_limit"] = f"{placement.memory + swap}m"
+        options["mem_swappiness"] = linux.get("swappiness", 60)
     ulimits = container.get("ulimits") or []
     options["ulimits"] = [Ulimit(name=u["name"], soft=u["softLimit"], hard=u["hardLimit"]) for u in ulimits]
     return options
@@ -424,6 +430,8 @@ def _linux(container: Mapping[str, Any]) -> dict[str, Any]:
             entry["containerPath"]: ",".join([f"size={entry['size']}m", *(entry.get("mountOptions") or [])])
             for entry in tmpfs
         }
+    if devices := linux.get("devices"):
+        options["devices"] = [_device(device) for device in devices]
     if user := container.get("user"):
         options["user"] = user
     if container.get("privileged"):
@@ -431,6 +439,12 @@ def _linux(container: Mapping[str, Any]) -> dict[str, Any]:
     if container.get("readonlyRootFilesystem"):
         options["read_only"] = True
     return options
+
+
+def _device(device: Mapping[str, Any]) -> str:
+    permissions = device.get("permissions") or list(_PERMISSIONS)
+    letters = "".join(letter for name, letter in _PERMISSIONS.items() if name in permissions)
+    return f"{device['hostPath']}:{device.get('containerPath') or device['hostPath']}:{letters}"
 
 
 def _stop(container: Container, grace: float) -> None:
