@@ -1,8 +1,10 @@
-"""``python -m worker.export``: write a checkpoint's policy as one ONNX file with all that a robot needs to run it.
+"""``python -m worker.export``: write a checkpoint's policy as one ONNX file, with what its numbers mean on a robot.
 
 ``exports/<checkpoint>/policy.onnx`` takes ``obs``, shape (batch, observations), or, for a camera, (batch, channels, height, width) as
-bytes, and gives ``actions``, shape (batch, actions): the mean action, with the observation normaliser inside. ``policy.json`` beside it says what the numbers mean and holds a self-test. The
-file is run with ONNX's own reference evaluator, and compared, before the directory appears.
+bytes, and gives ``actions``, shape (batch, actions): the mean action, with the observation normaliser inside.
+``policy.json`` beside it holds a self-test, the control rate, and, where the task declares its interface, each observation with unit,
+scale, offset and (of a command) range, and each action with joint, unit, scale, offset, clip, default position, gains and effort limit
+(:mod:`worker.tasks.interface`). The file is run with ONNX's own reference evaluator, and compared, before the directory appears.
 """
 
 from __future__ import annotations

@@ -113,6 +113,9 @@ class Point:
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         pass
 
+    def interface(self) -> None:
+        return None
+
     def state_tensors(self) -> dict[str, torch.Tensor]:
         names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")
         return {name: getattr(self, name) for name in names}

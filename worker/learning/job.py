@@ -119,13 +119,21 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
 def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
     known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "ppo"}
+    by_name = {
+        f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")
+    }  # a number, or one for each name
     changes: dict[str, Any] = {}
     for key, value in values.items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(known))}"
             raise UserError(f"{where}.{key}: {type(config).__name__} has no such key; {hint}")
-        changes[key] = _as_type_of(known[key], value, f"{where}.{key}")
+        if key not in by_name:
+            changes[key] = _as_type_of(known[key], value, f"{where}.{key}")
+        elif isinstance(value, Mapping):
+            changes[key] = {name: _as_type_of(0.0, each, f"{where}.{key}.{name}") for name, each in value.items()}
+        else:
+            changes[key] = _as_type_of(0.0, value, f"{where}.{key}")
     with user_errors(where):
         return dataclasses.replace(config, **changes)
 

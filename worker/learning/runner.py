@@ -380,14 +380,13 @@ def _figure(name: str, total: float, episodes: float) -> float | None:
 
 def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
     """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
-    names: dict[str, Any] = {
-        key: list(value)
-        for key in ("joint_names", "action_names", "observation_names")
-        if (value := getattr(task, key, None)) is not None
-    }
+    names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
+    if interface := task.interface():
+        names |= dataclasses.asdict(interface)
     if len(task.observation_shape) > 1:
         names["camera"] = dataclasses.asdict(config.camera)
-        del names["observation_names"]  # of what the simulation knows; the policy sees the image
+        for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
+            names.pop(key, None)
     return {
         "task": job.section["task"],
         "train": job.section,

@@ -17,6 +17,8 @@ STEP = wp.constant(0)
 RESET = wp.constant(1)
 """Mode of an ``observe`` kernel: begin a new episode in every world, without reward or statistics."""
 
+ACTION_LIMIT = wp.constant(1.0)
+"""Actions are clipped to plus and minus this."""
 NO_MISHAP = wp.constant(2**31 - 1)
 """``EpisodeArrays.mishap`` where nothing happened."""
 RETURN = wp.constant(0)
@@ -73,6 +75,12 @@ def clear_row(rows: wp.array2d(dtype=wp.float32), world: int):
     """Set a world's row to zero."""
     for column in range(rows.shape[1]):
         rows[world, column] = 0.0
+
+
+@wp.func
+def clipped_action(episodes: EpisodeArrays, world: int, action: int) -> float:
+    """What the policy asked for, within the limits of an action."""
+    return wp.clamp(episodes.actions[world, action], -ACTION_LIMIT, ACTION_LIMIT)
 
 
 @wp.func

@@ -6,6 +6,7 @@ random stream, so that a run goes on bit for bit and its worlds are the same on 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import newton
@@ -69,17 +70,24 @@ def _delay(
         worlds.controls[world, actuator] = history[world, delays[world] * actuators + actuator]
 
 
+@wp.func
+def _blur(
+    observations: wp.array2d(dtype=wp.float32), deviations: wp.array(dtype=wp.float32), world: int, stream: wp.uint32
+) -> wp.uint32:
+    """Add normal noise to the observations of one world that have any; returns the generator as it is afterwards."""
+    for column in range(observations.shape[1]):
+        if deviations[column] > 0.0:
+            observations[world, column] = observations[world, column] + deviations[column] * wp.randn(stream)
+    return stream
+
+
 @wp.kernel
-def _add_noise(mode: int, deviation: float, episodes: EpisodeArrays):
+def _add_noise(mode: int, deviations: wp.array(dtype=wp.float32), episodes: EpisodeArrays):
     """Normal noise on what the policy sees, and on the last observation of an episode that ended."""
     world = wp.tid()
-    stream = random_stream(episodes, world)
-    for column in range(episodes.observations.shape[1]):
-        episodes.observations[world, column] = episodes.observations[world, column] + deviation * wp.randn(stream)
+    stream = _blur(episodes.observations, deviations, world, random_stream(episodes, world))
     if mode == STEP and episodes.dones[world]:
-        for column in range(episodes.observations.shape[1]):
-            terminal = episodes.terminal_observations[world, column]
-            episodes.terminal_observations[world, column] = terminal + deviation * wp.randn(stream)
+        stream = _blur(episodes.terminal_observations, deviations, world, stream)
 
 
 class Randomizer:
@@ -90,6 +98,7 @@ class Randomizer:
         worlds: The task's worlds; their model is changed here, so this must come before a capture.
         episodes: The task's buffers; ``random`` holds seed and global indices already.
         control_hz: Control steps per simulated second [Hz].
+        noise: Standard deviation of the noise on each observation, as the policy sees it.
 
     Raises:
         ValueError: Pushes are on and the first body of the worlds is not free to move.
@@ -99,7 +108,14 @@ class Randomizer:
             where the configuration leaves it.
     """
 
-    def __init__(self, config: Randomization, worlds: Worlds, episodes: EpisodeArrays, control_hz: float) -> None:
+    def __init__(
+        self,
+        config: Randomization,
+        worlds: Worlds,
+        episodes: EpisodeArrays,
+        control_hz: float,
+        noise: Sequence[float],
+    ) -> None:
         self._config, self._worlds, self._episodes = config, worlds, episodes
         self._device = worlds.model.device
         if config.push_velocity and worlds.model.joint_type.numpy()[0] != int(newton.JointType.FREE):
@@ -107,6 +123,7 @@ class Randomizer:
         self._push_probability = min(1.0, 1.0 / (config.push_interval * control_hz)) if config.push_interval else 0.0
         count, actuators = worlds.arrays.controls.shape
         self._delays = wp.zeros(count, dtype=wp.int32, device=self._device)
+        self._noise = wp.array(noise, dtype=wp.float32, device=self._device) if any(noise) else None
         slots = config.action_latency + 1 if config.action_latency else 0
         self._history = wp.zeros((count, slots * actuators), dtype=wp.float32, device=self._device)
         factors = wp.ones((count, len(FACTORS)), dtype=wp.float32, device=self._device)
@@ -135,8 +152,8 @@ class Randomizer:
 
     def add_noise(self, mode: int) -> None:
         """After ``observe`` in ``mode``: blur what the policy sees."""
-        if self._config.observation_noise:
-            inputs = [mode, self._config.observation_noise, self._episodes]
+        if self._noise is not None:
+            inputs = [mode, self._noise, self._episodes]
             wp.launch(_add_noise, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:

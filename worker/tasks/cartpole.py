@@ -16,11 +16,13 @@ from worker.simulation.episodes import (
     add_reward,
     begin_episode,
     clear_row,
+    clipped_action,
     end_step,
     random_stream,
 )
 from worker.simulation.worlds import WorldArrays, is_sound
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
@@ -75,7 +77,7 @@ class CartpoleParameters:
 def act(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays):
     """The action is the motor's share of its full force, clipped to [-1, 1]."""
     world = wp.tid()
-    worlds.controls[world, 0] = wp.clamp(episodes.actions[world, 0], -1.0, 1.0)
+    worlds.controls[world, 0] = clipped_action(episodes, world, 0)
 
 
 @wp.func
@@ -107,7 +109,7 @@ def observe(mode: int, max_age: int, parameters: CartpoleParameters, worlds: Wor
         position = worlds.joint_q[world, 0]
         angle = worlds.joint_q[world, 1]
         velocity = worlds.joint_qd[world, 0]
-        effort = wp.clamp(episodes.actions[world, 0], -1.0, 1.0)
+        effort = clipped_action(episodes, world, 0)
         fallen = valid and (wp.abs(position) > parameters.cart_limit or wp.abs(angle) > parameters.angle_limit)
 
         episodes.rewards[world] = 0.0
@@ -146,3 +148,9 @@ class Cartpole(Task):
     def build(self, builder: newton.ModelBuilder) -> None:
         """Cart on a slide joint, pole on a free hinge, motor on the slide; nothing collides."""
         builder.add_mjcf(str(Path(__file__).with_name("cartpole.xml")))
+
+    def interface(self) -> Interface:
+        """Positions and velocities as they are; the force of the motor."""
+        units = ("m", "rad", "m/s", "rad/s")
+        observations = tuple(Observation(*pair) for pair in zip(self.observation_names, units, strict=True))
+        return Interface(observations, (motor(self.worlds.solver.mj_model, 0, "slider", "N", 0.0),))

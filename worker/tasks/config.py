@@ -98,7 +98,7 @@ _PPO_NUMBERS = (
 """Numbers of :class:`PPOConfig`: name, least, greatest, and the range in words."""
 
 
-_SCALARS = ("push_interval", "push_velocity", "observation_noise")
+_SCALARS = ("push_interval", "push_velocity")
 _SCENE = ("camera_position", "camera_angle", "colors")
 
 
@@ -124,8 +124,10 @@ class Randomization:
     """Mean simulated time between two pushes of a world, which come at random [s]; 0: none."""
     push_velocity: float = 0.0
     """A push adds velocities uniform in +- this to the robot's, along the world's x and y [m/s]."""
-    observation_noise: float = 0.0
-    """Standard deviation of the normal noise on every observation [the observation's own unit]."""
+    observation_noise: float | Mapping[str, float] = field(default=0.0, metadata={"by_name": True})
+    """Standard deviation of the normal noise on what is measured; the policy's last action and its command stay exact. A number: of
+    each observation, as the policy sees it. A mapping: by name of the observation, with ``*`` for any letters, in the unit of the
+    measured quantity [m, rad, m/s, rad/s]; where several names fit, the last one counts, and where none does there is no noise."""
     camera_position: float = 0.0
     """Each camera stands up to this far from its place, along each axis [m]."""
     camera_angle: float = 0.0
@@ -155,6 +157,11 @@ class Randomization:
             value = getattr(self, name)
             if not _is_finite(value) or value < 0.0:
                 raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
+        noise = self.observation_noise
+        for name, value in (noise if isinstance(noise, Mapping) else {"": noise}).items():
+            if not _is_finite(value) or value < 0.0:
+                where = f"observation_noise.{name}" if name else "observation_noise"
+                raise ValueError(f"{where}: expected a number of 0 or more, got {value!r}")
         if not isinstance(self.action_latency, int) or not 0 <= self.action_latency <= 64:
             raise ValueError(
                 f"action_latency: expected a whole number of steps from 0 to 64, got {self.action_latency!r}"

@@ -13,16 +13,19 @@ import numpy as np
 import warp as wp
 
 from worker.simulation.episodes import (
+    ACTION_LIMIT,
     STEP,
     EpisodeArrays,
     add_reward,
     begin_episode,
     clear_row,
+    clipped_action,
     end_step,
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
 from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.interface import Interface, Observation, servo
 from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
@@ -187,7 +190,7 @@ def act(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: EpisodeA
     """The action, clipped to [-1, 1], moves each joint's target from its standing angle."""
     world = wp.tid()
     for joint in range(JOINTS):
-        action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
+        action = clipped_action(episodes, world, joint)
         worlds.controls[world, joint] = standing_angle(parameters, joint) + parameters.action_scale * action
 
 
@@ -212,7 +215,8 @@ def write_observation(
         angle = worlds.joint_q[world, FIRST_COORDINATE + joint]
         observations[world, 12 + joint] = angle - standing_angle(parameters, joint)
         observations[world, 24 + joint] = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
-        observations[world, 36 + joint] = wp.clamp(episodes.memory[world, LAST_ACTION + joint], -1.0, 1.0)
+        action = episodes.memory[world, LAST_ACTION + joint]
+        observations[world, 36 + joint] = wp.clamp(action, -ACTION_LIMIT, ACTION_LIMIT)
 
 
 @wp.func
@@ -353,3 +357,27 @@ class Quadruped(Task):
         [trunk] = np.flatnonzero(model.geom_type == 6)
         parameters.ranges = wp.array(model.jnt_range[1:], dtype=wp.vec2, device=self.device)
         parameters.trunk = wp.vec3(*model.geom_size[trunk])
+
+    def interface(self) -> Interface:
+        """Angles from the standing pose; targets of the drives."""
+        config: Any = self.config
+        standing = [config.stand_hip, config.stand_thigh, config.stand_knee] * 4
+        trunk = [Observation(f"trunk_velocity_{axis}", "m/s") for axis in "xyz"]
+        trunk += [Observation(f"trunk_angular_velocity_{axis}", "rad/s") for axis in "xyz"]
+        trunk += [Observation(f"gravity_{axis}") for axis in "xyz"]
+        commands = [
+            Observation(f"command_{name}", unit, kind="command", range=getattr(config, f"command_{name}"))
+            for name, unit in (("forward", "m/s"), ("left", "m/s"), ("turn", "rad/s"))
+        ]
+        positions = [
+            Observation(f"{joint}_position", "rad", offset=angle)
+            for joint, angle in zip(JOINT_NAMES, standing, strict=True)
+        ]
+        velocities = [Observation(f"{joint}_velocity", "rad/s", config.velocity_scale) for joint in JOINT_NAMES]
+        previous = [Observation(f"{joint}_previous_action", kind="previous_action") for joint in JOINT_NAMES]
+        model = self.worlds.solver.mj_model
+        actions = [
+            servo(model, index, joint, "rad", angle, config.action_scale)
+            for index, (joint, angle) in enumerate(zip(JOINT_NAMES, standing, strict=True))
+        ]
+        return Interface((*trunk, *commands, *positions, *velocities, *previous), tuple(actions))

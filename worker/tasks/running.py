@@ -17,11 +17,13 @@ from worker.simulation.episodes import (
     add_reward,
     begin_episode,
     clear_row,
+    clipped_action,
     end_step,
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
 from worker.tasks.config import PPOConfig, TaskConfig
+from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
@@ -107,7 +109,7 @@ def act(parameters: RunnerParameters, worlds: WorldArrays, episodes: EpisodeArra
     """The action is each motor's share of its full torque, clipped to [-1, 1]."""
     world = wp.tid()
     for joint in range(parameters.actuators.shape[0]):
-        worlds.controls[world, parameters.actuators[joint]] = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
+        worlds.controls[world, parameters.actuators[joint]] = clipped_action(episodes, world, joint)
 
 
 @wp.func
@@ -141,7 +143,7 @@ def write_observation(
         observations[world, TORSO + joints + joint] = velocity
         action = float(0.0)
         if not first_step:
-            action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
+            action = clipped_action(episodes, world, joint)
         observations[world, TORSO + 2 * joints + joint] = action
 
 
@@ -170,7 +172,7 @@ def add_rewards(parameters: RunnerParameters, worlds: WorldArrays, episodes: Epi
     energy = float(0.0)
     limits = float(0.0)
     for joint in range(parameters.ranges.shape[0]):
-        action = wp.clamp(episodes.actions[world, joint], -1.0, 1.0)
+        action = clipped_action(episodes, world, joint)
         velocity = worlds.joint_qd[world, FIRST_DOF + joint] * parameters.velocity_scale
         # of what the policy asked for: beyond the motors' limits nothing else would hold it back from drifting away
         effort += episodes.actions[world, joint] * episodes.actions[world, joint]
@@ -247,12 +249,46 @@ class Running(Task):
 
     def read_model(self, parameters: Any) -> None:
         """Ranges, motors and strengths, joint by joint: the files list motors in another order than joints."""
-        model = self.worlds.solver.mj_model
-        joint_of_motor = model.actuator_trnid[:, 0]
-        motors = [int(np.flatnonzero(joint_of_motor == joint)[0]) for joint in range(1, 1 + self.action_size)]
+        model, motors = self.worlds.solver.mj_model, self._motors()
         torques = model.actuator_gear[motors, 0]
-        pose = [self.start_pose.get(name, 0.0) for name in self.action_names]
         parameters.ranges = wp.array(model.jnt_range[1:], dtype=wp.vec2, device=self.device)
         parameters.strengths = wp.array(torques / torques.max(), dtype=wp.float32, device=self.device)
         parameters.actuators = wp.array(motors, dtype=wp.int32, device=self.device)
-        parameters.pose = wp.array(pose, dtype=wp.float32, device=self.device)
+        parameters.pose = wp.array(self._pose(), dtype=wp.float32, device=self.device)
+
+    def interface(self) -> Interface:
+        """Joint angles as shares of their ranges; each motor's torque."""
+        config: Any = self.config
+        model = self.worlds.solver.mj_model
+        torso = [Observation("torso_height", "m")]
+        torso += [Observation(f"torso_velocity_{axis}", "m/s") for axis in "xyz"]
+        torso += [
+            Observation(f"torso_angular_velocity_{axis}", "rad/s", config.angular_velocity_scale) for axis in "xyz"
+        ]
+        torso += [Observation("torso_yaw", "rad"), Observation("torso_roll", "rad")]
+        torso += [Observation("torso_up"), Observation("torso_heading")]
+        joints = self.action_names
+        ends = [tuple(map(float, pair)) for pair in model.jnt_range[1:]]
+        middles = [(least + greatest) / 2.0 for least, greatest in ends]
+        scales = [2.0 / (greatest - least) for least, greatest in ends]
+        positions = [
+            Observation(f"{joint}_position", "rad", scale, middle)
+            for joint, scale, middle in zip(joints, scales, middles, strict=True)
+        ]
+        velocities = [Observation(f"{joint}_velocity", "rad/s", config.velocity_scale) for joint in joints]
+        previous = [Observation(f"{joint}_previous_action", kind="previous_action") for joint in joints]
+        angles = [min(max(angle, pair[0]), pair[1]) for angle, pair in zip(self._pose(), ends, strict=True)]
+        actions = [
+            motor(model, index, joint, "N m", angle)
+            for index, joint, angle in zip(self._motors(), joints, angles, strict=True)
+        ]
+        return Interface((*torso, *positions, *velocities, *previous), tuple(actions))
+
+    def _motors(self) -> list[int]:
+        """The motor of each joint."""
+        joint_of_motor = self.worlds.solver.mj_model.actuator_trnid[:, 0]
+        return [int(np.flatnonzero(joint_of_motor == joint)[0]) for joint in range(1, 1 + self.action_size)]
+
+    def _pose(self) -> list[float]:
+        """Angle of each joint at the start, before noise [rad]."""
+        return [self.start_pose.get(name, 0.0) for name in self.action_names]

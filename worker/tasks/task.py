@@ -25,6 +25,7 @@ from worker.simulation.episodes import (
 from worker.simulation.randomization import Randomizer
 from worker.simulation.worlds import Worlds
 from worker.tasks.config import TaskConfig, default_rewards, value_at
+from worker.tasks.interface import Interface, Observation, deviations
 
 
 class Task:
@@ -143,11 +144,12 @@ class Task:
                 value = getattr(config, item.name)
                 setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
         self.read_model(self._parameters)
+        noise = self._noise()
         wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
 
         self.seed(seed)
         with on_torch_stream(self.device):
-            self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz)
+            self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz, noise)
             self._camera = Camera(camera, config.randomize, self.worlds, self._episodes) if camera else None
             if self._camera:
                 self.observations = self._camera.images
@@ -167,6 +169,13 @@ class Task:
 
     def read_model(self, parameters: Any) -> None:
         """Fill the fields of the kernels' parameters that the built model (``self.worlds``) tells; by default none."""
+
+    def interface(self) -> Interface | None:
+        """What the policy's numbers mean on a robot, in the order of ``observation_names`` and ``action_names``; None: not declared.
+
+        It is exported with the policy. It also says which observations are measured, so that noise leaves the others alone.
+        """
+        return None
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Called before every iteration of training, outside the recorded work: the place for a curriculum.
@@ -303,6 +312,23 @@ class Task:
             raise ValueError(
                 f"task {task}: episode_seconds is {config.episode_seconds}; use a positive time in seconds"
             )
+
+    def _noise(self) -> list[float]:
+        """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
+        interface = self.interface() or Interface(tuple(map(Observation, self.observation_names)), ())
+        for what, declared, names in (
+            ("observations", interface.observations, self.observation_names),
+            ("actions", interface.actions, self.action_names),
+        ):
+            if declared and tuple(item.name for item in declared) != tuple(names):
+                raise ValueError(
+                    f"task {type(self).__name__}: interface() has other {what} than the task, or in another order; "
+                    f"they are {', '.join(names)}"
+                )
+        try:
+            return deviations(self.config.randomize.observation_noise, interface.observations)
+        except ValueError as error:
+            raise ValueError(f"config.randomize.observation_noise: {error}") from error
 
     def _allocate(self) -> None:
         """Allocate every buffer once and let torch see it."""

@@ -1,0 +1,110 @@
+"""What the numbers of a task's policy mean on a robot: each observation and each action with its unit, scale and offset, as data."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+from worker.simulation.episodes import ACTION_LIMIT
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One number that a policy sees: ``scale * (quantity - offset)``."""
+
+    name: str
+    unit: str = "1"
+    """Unit of the quantity, before the scale; ``"1"`` of a ratio."""
+    scale: float = 1.0
+    """Factor [1/unit]."""
+    offset: float = 0.0
+    """Value of the quantity that the policy sees as 0 [unit]."""
+    kind: Literal["measured", "command", "previous_action"] = "measured"
+    """Whether a sensor gives it, whoever commands the robot, or the policy itself: its last action, clipped."""
+    range: tuple[float, float] | None = None
+    """Least and greatest value in training, of a command [unit]."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """One number that a policy asks for: the actuator's input is ``offset + scale * action``, the action clipped to ``clip`` before."""
+
+    name: str
+    """Name of the joint."""
+    kind: Literal["effort", "position"]
+    """Whether the input is a force or torque, or the target of a position controller in the actuator."""
+    unit: str
+    """Unit of the input: N, N m, m or rad."""
+    scale: float
+    """Input that an action of 1 adds [unit]."""
+    default_position: float
+    """Position of the joint at the start of an episode, before it is varied [m, rad]."""
+    offset: float = 0.0
+    """Input at an action of 0 [unit]."""
+    clip: tuple[float, float] = (-float(ACTION_LIMIT), float(ACTION_LIMIT))
+    """Limits of the action."""
+    stiffness: float = 0.0
+    """Gain on the error of the position [N/m, N m/rad]."""
+    damping: float = 0.0
+    """Gain on the velocity, which the actuator works against [N s/m, N m s/rad]."""
+    effort_limit: float | None = None
+    """Greatest force or torque of the actuator [N, N m]; None: not limited."""
+
+
+@dataclass(frozen=True)
+class Interface:
+    """Observations and actions of a policy, in order."""
+
+    observations: tuple[Observation, ...]
+    actions: tuple[Action, ...]
+
+
+def motor(model: Any, actuator: int, name: str, unit: str, default_position: float) -> Action:
+    """A motor of ``model`` (MuJoCo's) whose input is the action: a share of its full force or torque."""
+    full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+    return Action(name, "effort", unit, scale=full, default_position=default_position, effort_limit=abs(full))
+
+
+def servo(model: Any, actuator: int, name: str, unit: str, default_position: float, scale: float) -> Action:
+    """A position controller of ``model`` (MuJoCo's) whose target an action moves from the default position."""
+    limited = bool(model.actuator_forcelimited[actuator])
+    return Action(
+        name,
+        "position",
+        unit,
+        scale=scale,
+        default_position=default_position,
+        offset=default_position,
+        stiffness=float(model.actuator_gainprm[actuator, 0]),
+        damping=-float(model.actuator_biasprm[actuator, 2]),
+        effort_limit=float(model.actuator_forcerange[actuator, 1]) if limited else None,
+    )
+
+
+def deviations(noise: float | Mapping[str, float], observations: tuple[Observation, ...]) -> list[float]:
+    """Standard deviation of the noise on each observation, as the policy sees it. Only what is measured is noisy.
+
+    Args:
+        noise: As :attr:`worker.tasks.config.Randomization.observation_noise`.
+        observations: Of the task.
+
+    Raises:
+        ValueError: A name fits no observation that is measured.
+    """
+    if not isinstance(noise, Mapping):
+        return [float(noise) if seen.kind == "measured" else 0.0 for seen in observations]
+    found = [0.0] * len(observations)
+    measured = [index for index, seen in enumerate(observations) if seen.kind == "measured"]
+    for pattern, deviation in noise.items():
+        fitting = [index for index in measured if fnmatchcase(observations[index].name, pattern)]
+        if not fitting:
+            names = [observations[index].name for index in measured]
+            near = difflib.get_close_matches(pattern, names, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
+            raise ValueError(f"no observation that is measured is called {pattern!r}; {hint}")
+        for index in fitting:
+            found[index] = deviation * abs(observations[index].scale)
+    return found
