@@ -161,7 +161,7 @@ def test_it_is_a_gymnasium_environment_of_images() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [0, 2, 1]}, {})]
+    ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [8, 8, 8]}, {})]
 )
 def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: Path, ppo: dict, camera: dict) -> None:
     env = training(tmp_path, worlds=4, task="CartpolePixels", config={"camera": camera}, ppo=ppo)

@@ -90,7 +90,7 @@ def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:
     """Raises ValueError for a convolution that leaves nothing of an image."""
     height, width = shape[1:]
     for number, (kernel, stride) in enumerate(zip(config.kernel_sizes, config.strides, strict=True), start=1):
-        if stride < 1 or not 1 <= kernel <= min(height, width):
+        if kernel > min(height, width):
             raise ValueError(
                 f"ppo: convolution {number} has a kernel of {kernel} and a stride of {stride}, but {width} x {height} px are left of "
                 f"the image of {shape[2]} x {shape[1]}; change kernel_sizes and strides, or the camera's size"
