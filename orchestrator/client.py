@@ -39,6 +39,10 @@ class Unreachable(Exception):
     """No controller answers; the message says where one was looked for and how to start one."""
 
 
+def _unnamable(text: str) -> ApiError:
+    return ApiError(f"{text!r} names nothing; jobs and runs are named with letters, digits, '.', '_' and '-'", 400)
+
+
 def _is_url(text: str) -> bool:
     try:
         parts = urlsplit(text)
@@ -133,6 +137,8 @@ class Client:
                         yield json.loads(b"[" + b",".join(lines) + b"]")
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
+        except httpx.InvalidURL:
+            raise _unnamable(job) from None
 
     def _request(
         self, method: str, path: str, body: Any = None, query: dict[str, Any] | None = None, seconds: float = 30
@@ -157,6 +163,8 @@ class Client:
                 answer = send()
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
+        except httpx.InvalidURL:
+            raise _unnamable(path) from None
         if answer.is_error:
             self._raise(answer)
         return answer.json()

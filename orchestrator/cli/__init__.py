@@ -10,6 +10,7 @@ import sys
 import typer
 
 from orchestrator.cli import aws, doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
+from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.client import ApiError, Unreachable
 from orchestrator.home import ServerError
 from orchestrator.spec import SpecError
@@ -39,7 +40,7 @@ aws.register(app)
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"muster {__version__}")
+        echo(f"muster {__version__}")
         raise typer.Exit
 
 
@@ -54,6 +55,7 @@ def _options(
 
 def main() -> None:
     """Entry point of the command."""
+    log_visibly()
     try:
         app()
     except SpecError as error:
@@ -70,5 +72,5 @@ def main() -> None:
 
 
 def _fail(error: Exception, code: int) -> None:
-    print(f"muster: {' '.join(str(error).split())}", file=sys.stderr)
+    echo(f"muster: {one_line(str(error))}", err=True)
     sys.exit(code)

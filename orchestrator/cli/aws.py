@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from pathlib import Path
@@ -10,11 +9,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.engines.aws_config import config_path
 from orchestrator.home import ServerError, muster_home
 
@@ -64,7 +63,7 @@ def up(
     began = time.time() - 1
     made = stack.create(text, given)
     if made is None:
-        typer.echo(f"stack {stack_name} is up to date")
+        echo(f"stack {stack_name} is up to date")
     else:
         events = _follow(stack, made, began)
         found = stack.describe()
@@ -75,14 +74,14 @@ def up(
     path = from_template.write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
     outputs = stack.outputs()
     repository = outputs["RepositoryUri"]
-    typer.echo(f"""wrote {path}
+    echo(f"""wrote {path}
 
 push the image, then run jobs:
   aws ecr get-login-password --region {stack.region} | docker login --username AWS --password-stdin {repository.partition("/")[0]}
   docker build -f containers/Dockerfile -t {repository}:latest --build-arg EXTRAS=worker . && docker push {repository}:latest
   muster serve --engine aws-batch""")
     if url := outputs.get("WorkstationUrl"):
-        typer.echo(f"  the workstation's desktop, ready in some 15 minutes: {url}")
+        echo(f"  the workstation's desktop, ready in some 15 minutes: {url}")
 
 
 def down(
@@ -107,11 +106,9 @@ def down(
     config = config_path(muster_home())
     if config.exists() and f'"stack": "{stack_name}"' in config.read_text():
         config.unlink()
-    typer.echo(f"stack {stack_name} is deleted; {stays}")
+    echo(f"stack {stack_name} is deleted; {stays}")
     if volume:
-        typer.echo(
-            f"to delete that, too:  aws efs delete-file-system --region {stack.region} --file-system-id {volume}"
-        )
+        echo(f"to delete that, too:  aws efs delete-file-system --region {stack.region} --file-system-id {volume}")
 
 
 def status(
@@ -128,9 +125,9 @@ def status(
     told = stack.status()
     if write:
         path = _stack_module().write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
-        typer.echo(f"wrote {path}", err=as_json)
+        echo(f"wrote {path}", err=as_json)
     if as_json:
-        typer.echo(json.dumps(told, indent=1))
+        echo_json(told, indent=1)
         return
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_row("stack", f"{stack_name} in {told['region']}: {told['status']} {told['reason']}".strip())
@@ -154,7 +151,7 @@ def _follow(stack: Stack, made: str, began: float) -> list[Event]:
     for event in stack.follow(made, began):
         events.append(event)
         reason = f"  {event.reason}" if event.reason and event.is_failure else ""
-        typer.echo(f"{event.time}  {event.status:<22} {event.resource}{reason}")
+        echo(f"{event.time}  {event.status:<22} {event.resource}{reason}")
     return events
 
 

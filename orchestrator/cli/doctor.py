@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import ApiError, Client, Unreachable
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
@@ -62,7 +62,7 @@ def doctor(
     """Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing."""
     findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
     if as_json:
-        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+        echo_json([asdict(finding) for finding in findings], indent=1)
     else:
         console = Console(soft_wrap=True, highlight=False)
         for finding in findings:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -11,12 +10,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from orchestrator import specfile
 from orchestrator.cli.progress import evaluated, follow
+from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines import ENGINES
@@ -95,11 +94,11 @@ def submit(
             return
         submitted = submit_spec(client, loaded, spec)
         if as_json:
-            typer.echo(json.dumps(submitted))
+            echo_json(submitted)
         else:
-            typer.echo(f"submitted {submitted['jobName']} as {submitted['jobId']}")
+            echo(f"submitted {submitted['jobName']} as {submitted['jobId']}")
             if not follow_:
-                typer.echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
+                echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
 
@@ -130,7 +129,7 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
     definition = compile_definition(spec, os.getcwd())
     plan = client.post("/api/plan", {"definition": definition, "queue": spec.queue})
     if as_json:
-        typer.echo(json.dumps({**plan, "registerJobDefinition": definition}, indent=1))
+        echo_json({**plan, "registerJobDefinition": definition}, indent=1)
         return
     table = Table(box=None, pad_edge=False)
     for column in ("NODE", "RANK", "HOST", "CPUS", "GPUS", "MEMORY", "ADDRESS", "IMAGE"):
@@ -142,13 +141,13 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
             *(str(node["index"]), str(node["rank"]), node["host"], f"{node['cpus']:g}", ",".join(node["gpus"]) or "-"),
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
-    typer.echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
+    echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
     whole = Console(width=_WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
     with whole.capture() as printed:
         whole.print(table)
-    typer.echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
+    echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
     if plan["document"]:
-        typer.echo(f"\n{plan['document']}")
+        echo(f"\n{plan['document']}")
 
 
 def list_jobs(
@@ -163,10 +162,10 @@ def list_jobs(
     summaries.sort(key=lambda summary: -summary["createdAt"])
     shown = summaries if all_ else summaries[:20]
     if as_json:
-        typer.echo(json.dumps(shown, indent=1))
+        echo_json(shown, indent=1)
         return
     if not shown:
-        typer.echo("no jobs yet; start one with: muster submit job_specs/cartpole.yaml")
+        echo("no jobs yet; start one with: muster submit job_specs/cartpole.yaml")
         return
     table = Table(box=None, pad_edge=False)
     for column in ("JOB", "NAME", "STATUS", "NODES", "CREATED", "TOOK"):
@@ -180,7 +179,7 @@ def list_jobs(
         created = _when(summary["createdAt"])
         table.add_row(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
-            escape(" ".join(reason.split())),  # a compiler's message has lines, and brackets that are no markup
+            escape(one_line(reason)),  # a compiler's message has lines, and brackets that are no markup
         )
     # one line a job: cut to the terminal's width, whole for another program
     (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)
@@ -231,13 +230,13 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         detail = client.get(f"/api/jobs/{job}")
         detail["job"] = client.batch("DescribeJobs", jobs=[detail["id"]])["jobs"][0]
     if as_json:
-        typer.echo(json.dumps(detail, indent=1))
+        echo_json(detail, indent=1)
         return
     console = Console(highlight=False, soft_wrap=True)
     colour = _COLOURS.get(detail["status"], "white")
     console.print(f"[bold]{detail['name']}[/]  {detail['id']}  [{colour}]{detail['status']}[/]")
     facts = {
-        "why": detail["statusReason"],
+        "why": one_line(detail["statusReason"] or ""),
         "created": _when(detail["createdAt"]),
         "took": _took(detail["startedAt"], detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
@@ -257,14 +256,18 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     for attempt in detail["attempts"]:
         ended = attempt["ending"] or "running"
         counted = "" if attempt["spent"] else ", not counted"
-        reason = f": {attempt['statusReason']}" if attempt["statusReason"] else ""
+        reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] else ""
         took = _took(attempt["startedAt"], attempt["stoppedAt"])
         console.print(
             f"  attempt {attempt['number']} of {detail['attemptsAllowed']} (epoch {attempt['epoch']}, {took}{_used(attempt)}) {ended}{counted}{reason}",
             markup=False,
         )
         for node in attempt["nodes"]:
-            state = "running" if node["running"] else f"exit {node.get('exitCode', '?')}: {node.get('reason', '')}"
+            state = (
+                "running"
+                if node["running"]
+                else f"exit {node.get('exitCode', '?')}: {one_line(node.get('reason', ''))}"
+            )
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
@@ -279,7 +282,7 @@ def stop(
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{job}")
         if detail["status"] in ("SUCCEEDED", "FAILED"):
-            typer.echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
+            echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
@@ -288,20 +291,20 @@ def stop(
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
-                typer.echo(f"{detail['name']} ({detail['id'][:8]}): {said}", err=True)
+                echo(f"{detail['name']} ({detail['id'][:8]}): {one_line(said)}", err=True)
     if not wait:
-        typer.echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
+        echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
-    typer.echo(f"{detail['name']} ({detail['id'][:8]}) ended: {detail['statusReason']}")
+    echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
     if (detail["results"] or {}).get("checkpoint"):
-        typer.echo(f"go on with: muster resume {detail['run']}")
+        echo(f"go on with: muster resume {detail['run']}")
 
 
 def checkpoint(job: JobArgument) -> None:
     """Have a training job save now; returns when the checkpoint is durable."""
     with Client.connect() as client:
         answer = client.post(f"/api/jobs/{job}/checkpoint", {}, seconds=180)["answer"]
-    typer.echo(answer)
+    echo(answer)
     if not answer.startswith("checkpoint "):
         raise typer.Exit(1)
 
@@ -310,12 +313,12 @@ def stacks(job: JobArgument) -> None:
     """Print where every rank of a running job is: Python and native stacks. They go to the job's log too."""
     with Client.connect() as client:
         for node in client.get(f"/api/jobs/{job}/stacks", seconds=180):
-            typer.echo(f"== node {node['node']}\n{node['stacks']}")
+            echo(f"== node {node['node']}\n{node['stacks']}")
 
 
 def print_schema() -> None:
     """Print the JSON Schema of the job YAML, for editors."""
-    typer.echo(json.dumps(schema(), indent=2))
+    echo_json(schema(), indent=2)
 
 
 def _when(milliseconds: int | None) -> str:

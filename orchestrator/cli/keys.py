@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.client import DEFAULT_URL
 from orchestrator.home import local_url, muster_home
 from orchestrator.keys import Key, KeyStore
@@ -40,10 +39,10 @@ def create(
     """Create a key and show it, this once. From now on the server lets in only who has a key or MUSTER_TOKEN."""
     key = KeyStore(muster_home()).create(name, tuple(queue or ()), read_only)
     if as_json:
-        typer.echo(json.dumps({**_describe(key), "secretAccessKey": key.secret}))
+        echo_json({**_describe(key), "secretAccessKey": key.secret})
         return
     url = local_url() or DEFAULT_URL
-    typer.echo(
+    echo(
         f"""created key {key.name} ({_may(key)}); its secret is shown only this once
 
 AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
@@ -63,10 +62,10 @@ def list_keys(as_json: JsonOption = False) -> None:
     """List the keys, without their secrets."""
     keys = KeyStore(muster_home()).load().values()
     if as_json:
-        typer.echo(json.dumps([_describe(key) for key in keys], indent=1))
+        echo_json([_describe(key) for key in keys], indent=1)
         return
     if not keys:
-        typer.echo("no keys yet; create one with: muster keys create NAME")
+        echo("no keys yet; create one with: muster keys create NAME")
         return
     table = Table(box=None, pad_edge=False)
     for column in ("NAME", "ACCESS KEY ID", "MAY", "CREATED"):
@@ -80,7 +79,7 @@ def list_keys(as_json: JsonOption = False) -> None:
 def delete(name: NameArgument) -> None:
     """Delete a key: a running server refuses it from its next request on."""
     KeyStore(muster_home()).delete(name)
-    typer.echo(f"deleted key {name}")
+    echo(f"deleted key {name}")
 
 
 def _may(key: Key) -> str:

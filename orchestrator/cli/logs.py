@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from datetime import UTC, datetime, timedelta
@@ -11,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.jobs import JobArgument, JsonOption
+from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client
 from orchestrator.spec import SpecError
 
@@ -32,6 +32,9 @@ def logs(
     attempt: Annotated[int | None, typer.Option(help="Only this attempt.")] = None,
     since: Annotated[str | None, typer.Option(help="Only lines newer than 90s, 10m, 2h or 1d.")] = None,
     grep: Annotated[str | None, typer.Option(help="Only lines that match this regular expression.")] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="Lines as they are; by default only colours stay, other escapes are shown.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print a job's log, all nodes and attempts merged by time."""
@@ -42,23 +45,23 @@ def logs(
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour = sys.stdout.isatty()
     with Client.connect() as client:
-        client.told = lambda line: print(line, file=sys.stderr, flush=True)
+        client.told = lambda line: echo(line, err=True)
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
             shown = [
-                json.dumps(line) if as_json else _format(line, colour)
+                to_json(line) if as_json else _format(line, colour, raw)
                 for line in lines
                 if not (oldest and line["time"] < oldest) and (not pattern or pattern.search(line["text"]))
             ]
             if shown:
-                print("\n".join(shown), flush=True)
+                echo_raw("\n".join(shown))
 
 
-def _format(line: dict[str, Any], colour: bool) -> str:
+def _format(line: dict[str, Any], colour: bool, raw: bool) -> str:
     who = "node" if line["rank"] is None else f"rank {line['rank']}"
     prefix = f"[{line['time'][11:23]} {line['attempt']}.{line['node']} {who}]"
     if colour:
         prefix = f"\033[{_COLOURS[line['node'] % len(_COLOURS)]}m{prefix}\033[0m"
-    return f"{prefix} {line['text']}"
+    return f"{prefix} {line['text'] if raw else visible(line['text'], colours=True)}"
 
 
 def _oldest(since: str | None) -> str | None:

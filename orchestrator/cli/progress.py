@@ -6,9 +6,9 @@ import sys
 import time
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client, Unreachable
 
 _TERMINAL = ("SUCCEEDED", "FAILED")
@@ -62,7 +62,7 @@ def summary(client: Client, job_id: str) -> int:
     console = Console(highlight=False, soft_wrap=True)
     succeeded = detail["status"] == "SUCCEEDED"
     colour = "green" if succeeded else "red"
-    reason = "" if succeeded else f": {detail['statusReason']}"
+    reason = "" if succeeded else f": {one_line(detail['statusReason'])}"
     console.print(f"[{colour}]{detail['status']}[/]  {detail['name']} ({detail['id'][:8]})", end="")
     console.print(reason, markup=False)
     results = detail["results"] or {}
@@ -70,7 +70,7 @@ def summary(client: Client, job_id: str) -> int:
     if attempt and not succeeded:
         for node in attempt["nodes"]:
             if node.get("error"):
-                console.print(f"  first error: node {node['index']}: {node['error']}", markup=False)
+                console.print(f"  first error: node {node['index']}: {one_line(node['error'])}", markup=False)
                 break
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
@@ -95,12 +95,12 @@ def evaluated(figures: dict[str, Any]) -> str:
 
 def _follow_logs(client: Client, job_id: str) -> int:
     for lines in client.log_batches(job_id, follow=True):
-        print("\n".join(map(_format, lines)), flush=True)
+        echo_raw("\n".join(map(_format, lines)))
     return summary(client, job_id)
 
 
 def _format(line: dict[str, Any]) -> str:
-    return f"[node {line['node']} rank {'-' if line['rank'] is None else line['rank']}] {line['text']}"
+    return f"[node {line['node']} rank {'-' if line['rank'] is None else line['rank']}] {visible(line['text'], colours=True)}"
 
 
 def _describe(record: dict[str, Any]) -> dict[str, str]:
@@ -139,7 +139,7 @@ class _Display:
         """State and reason, with what a first start is busy with."""
         if job["status"] == "RUNNING":
             return f"starting {self.nodes} nodes: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
-        return f"{job['status']}: {job.get('statusReason', '')}"
+        return f"{job['status']}: {one_line(job.get('statusReason', ''))}"
 
 
 class _Bar(_Display):
@@ -151,6 +151,7 @@ class _Bar(_Display):
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.fields[text]}", markup=False),
+            console=Console(),
         )
         self._task: TaskID = self._progress.add_task(self.name, total=self.total, text="")
 
@@ -185,7 +186,7 @@ class _Lines(_Display):
         self._printed = 0.0
 
     def __enter__(self) -> _Lines:
-        print(f"{self.name}: following", flush=True)
+        echo(f"{self.name}: following")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -195,7 +196,7 @@ class _Lines(_Display):
         state = f"{job['status']} {job.get('statusReason', '')}"
         if state != self._state and job["status"] not in _TERMINAL:
             self._flush()
-            print(f"{job['status']}: {job.get('statusReason', '')}", flush=True)
+            echo(f"{job['status']}: {one_line(job.get('statusReason', ''))}")
             self._state = state
         if record:
             self.eta(record)
@@ -207,9 +208,8 @@ class _Lines(_Display):
         if self._latest is None:
             return
         values, iteration = _describe(self._latest), self._latest["iteration"]
-        print(
+        echo(
             f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-            f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}",
-            flush=True,
+            f"steps/s {values['rate']}  ETA {self.eta(self._latest)}  nodes {self.nodes}"
         )
         self._latest, self._printed = None, time.monotonic()

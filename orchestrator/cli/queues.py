@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo_json, one_line
 from orchestrator.client import ApiError, Client
 
 
@@ -37,7 +36,7 @@ def queues(
         found = [queue for queue in found if _take_snapshot(client, queue, is_named=name is not None)]
         front = _front(client, found[0]) if name else []
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        echo_json(found, indent=1)
         return
     console = Console()
     console.print(_table(found))
@@ -86,5 +85,5 @@ def _waiting(jobs: list[dict[str, Any]]) -> Table:
         table.add_column(column, no_wrap=True)
     table.add_column("WHY IT WAITS", overflow="fold")
     for number, job in enumerate(jobs, 1):
-        table.add_row(str(number), job["jobId"][:8], job["jobName"], escape(job.get("statusReason", "")))
+        table.add_row(str(number), job["jobId"][:8], job["jobName"], escape(one_line(job.get("statusReason", ""))))
     return table

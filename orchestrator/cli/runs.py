@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
 from orchestrator.cli.progress import follow
+from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.client import Client
 
 RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
@@ -45,12 +44,12 @@ def resume(
         }
         resumed = client.post(f"/api/runs/{run}/resume", body)
         if as_json:
-            typer.echo(json.dumps(resumed))
+            echo_json(resumed)
         else:
             at = f" from iteration {resumed['iteration']}" if resumed["kind"] == "train" else ""
-            typer.echo(f"resumed {resumed['run']}{at} as job {resumed['jobId']}")
+            echo(f"resumed {resumed['run']}{at} as job {resumed['jobId']}")
             if not follow_:
-                typer.echo(f"follow it with: muster logs {resumed['jobId'][:8]} -f")
+                echo(f"follow it with: muster logs {resumed['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, resumed["jobId"]))
 
@@ -65,9 +64,9 @@ def checkpoints(
         found = client.get(f"/api/runs/{run}/checkpoints", verify=verify)
     damaged = [each for each in found if each.get("problem")]
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        echo_json(found, indent=1)
     elif not found:
-        typer.echo(f"run {run} has no checkpoint yet")
+        echo(f"run {run} has no checkpoint yet")
     else:
         table = Table(box=None, pad_edge=False)
         for column in ("CHECKPOINT", "ITERATION", "REWARD", "WORLDS", "SIZE", "CREATED", "STATE"):

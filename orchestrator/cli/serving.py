@@ -16,6 +16,7 @@ import typer
 from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, on_engine, submit_spec
 from orchestrator.cli.progress import follow
+from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, Unreachable
 from orchestrator.home import ServerError, local_url, muster_home
 from orchestrator.spec import seconds_of
@@ -65,7 +66,7 @@ def see_through(client: Client, job: str) -> int:
     try:
         return follow(client, job)
     except KeyboardInterrupt:
-        typer.echo("\nstopping: the job checkpoints and leaves (Ctrl-C again: leave it running)")
+        echo("\nstopping: the job checkpoints and leaves (Ctrl-C again: leave it running)")
         client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
         follow(client, job)
         return 130
@@ -125,17 +126,15 @@ def serve(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda _number, _frame: ended.set())
     server.start()
-    typer.echo(f"Muster serves {server.url}  (API: {server.url}/api/docs)")
+    echo(f"Muster serves {server.url}  (API: {server.url}/api/docs)")
     if host in ("0.0.0.0", "::"):
-        typer.echo(
-            f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}"
-        )
-    typer.echo(f"home {muster_home()}, store {server.store.path}")
+        echo(f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}")
+    echo(f"home {muster_home()}, store {server.store.path}")
     try:
         ended.wait()
     finally:
         server.close()
-    typer.echo("stopped; running jobs go on and the next `muster serve` finds them")
+    echo("stopped; running jobs go on and the next `muster serve` finds them")
 
 
 @contextlib.contextmanager

@@ -9,10 +9,10 @@ from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.home import ServerError
 from orchestrator.spec import SpecError
 
@@ -32,10 +32,10 @@ def tasks(
     The weights of reward terms are changed in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
     if sys.stderr.isatty():
-        typer.echo("importing the simulation, some seconds …", err=True)
+        echo("importing the simulation, some seconds …", err=True)
     found = _ask_worker([name] if name else [])
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        echo_json(found, indent=1)
         return
     console = Console()
     console.print(_table(found))

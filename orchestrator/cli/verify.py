@@ -11,6 +11,7 @@ import typer
 from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
+from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.spec import Resources, Retry, Spec, SpecError
 
@@ -45,12 +46,12 @@ def verify_resume(
     loaded = specfile.load(spec, set_)
     straight, killed = _pair(loaded, spec, at, iterations)
     for note in _notes(loaded, at):
-        typer.echo(note)
+        echo(note)
     with controller(store, cpus) as connect:
         first = _train(connect, straight, spec)
         second = _train(connect, killed, spec, MUSTER_KILL_AT=str(at))
-        typer.echo(f"straight: {first['run']}")
-        typer.echo(f"killed:   {second['run']}, {_restart(connect(), second, at)}")
+        echo(f"straight: {first['run']}")
+        echo(f"killed:   {second['run']}, {_restart(connect(), second, at)}")
         code = _compare(connect(), loaded, spec, first["run"], second["run"])
     raise typer.Exit(code)
 
@@ -107,7 +108,7 @@ def _restart(client: Client, detail: dict[str, Any], at: int) -> str:
     """How the killed run died and where it went on. Raises typer.Exit where it was not killed as asked."""
     ended = detail["attempts"][0]["nodes"][0].get("reason", "")
     if len(detail["attempts"]) < 2 or "SIGKILL" not in ended:
-        typer.echo(f"the main rank was not killed after iteration {at} ({ended or 'no reason'}): nothing is proven")
+        echo(f"the main rank was not killed after iteration {at} ({ended or 'no reason'}): nothing is proven")
         raise typer.Exit(1)
     log = "\n".join(line["text"] for line in client.logs(detail["id"], attempt=2, rank=0))
     found = re.search(r"resumed from checkpoint (\d{8})-", log)
@@ -127,10 +128,10 @@ def _compare(client: Client, spec: Spec, source: str, first: str, second: str) -
     job = submit_spec(client, comparison, source)["jobId"]
     for line in client.logs(job, follow=True):
         if line["rank"] is not None:
-            typer.echo(line["text"])
+            echo(line["text"])
     detail = client.get(f"/api/jobs/{job}")
     if detail["status"] == "SUCCEEDED":
         return 0
     if not detail["attempts"] or detail["attempts"][-1]["exitCode"] != 1:
-        typer.echo(f"the comparison failed: {detail['statusReason']}")
+        echo(f"the comparison failed: {detail['statusReason']}")
     return 1

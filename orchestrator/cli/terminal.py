@@ -1,0 +1,86 @@
+"""Printing: whatever others wrote (names, reasons, log lines, errors) reaches the terminal as text, never as its commands.
+
+Every command prints through :func:`echo` and :class:`Console`. Control characters, escape sequences and what turns or hides text
+are shown escaped (``\\x1b``, ``\\u202e``); newlines and tabs stay.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+import rich.console
+from rich.segment import Segment
+from rich.text import Text
+
+_UNSAFE = re.compile(
+    "(?P<colour>\x1b\\[[0-9;]*m)|"
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # control characters of ASCII and Latin-1 (C0, C1)
+    "\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"  # direction, line ends, invisible
+    "\ud800-\udfff\U000e0000-\U000e007f]"  # halves of characters, tags
+)
+_NO_COLOUR = "\x1b[0m"
+
+
+def visible(text: str, colours: bool = False) -> str:
+    """``text`` with all that a terminal would act on escaped; with ``colours``, colour sequences stay and end with the text."""
+    if _UNSAFE.search(text) is None:
+        return text
+
+    def escaped(found: re.Match[str]) -> str:
+        if found["colour"]:
+            return found[0] if colours else "\\x1b" + found[0][1:]
+        return found[0].encode("unicode_escape").decode()
+
+    return _UNSAFE.sub(escaped, text) + (_NO_COLOUR if colours and "\x1b[" in text else "")
+
+
+def one_line(text: str) -> str:
+    """A reason or an error as one line: a line of its own could pass for one of ours."""
+    return visible(" ".join(text.split()))
+
+
+def echo(text: str, err: bool = False) -> None:
+    """Print ``text`` and a newline, on standard error with ``err``."""
+    echo_raw(visible(text), err)
+
+
+def echo_raw(text: str, err: bool = False) -> None:
+    """:func:`echo` for what is visible already, or is wanted as it is."""
+    print(text, file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def to_json(value: Any, indent: int | None = None) -> str:
+    """JSON in printable ASCII."""
+    return json.dumps(value, indent=indent).replace("\x7f", "\\u007f")
+
+
+def echo_json(value: Any, indent: int | None = None) -> None:
+    """Print :func:`to_json`."""
+    echo_raw(to_json(value, indent))
+
+
+class Console(rich.console.Console):
+    """Rich's console; the text in what it renders is made :func:`visible`, its own styles and cursor movements are not touched."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(visible(text), **options)  # before it is measured
+
+    def render(self, renderable: Any, options: rich.console.ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return visible(super().format(record))
+
+
+def log_visibly() -> None:
+    """Have the controller's warnings, which name jobs and repeat errors, printed as text, too."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Formatter())
