@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import uvicorn
 
 from orchestrator.api.app import create_app
 from orchestrator.api.auth import Access, is_loopback
+from orchestrator.api.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.limits import RATE, RateLimit
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
@@ -25,6 +29,10 @@ from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
 from shared_store.layout import Store
+
+_INVALID = Seldom("Invalid HTTP request received")
+_NO_DESCRIPTOR = Seldom("socket.accept() out of system resource")
+"""What any client can have uvicorn and asyncio log at any rate."""
 
 
 class Server:
@@ -87,7 +95,18 @@ class Server:
         self.url = (
             f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
         )
-        config = uvicorn.Config(self.app, log_level="warning", access_log=False, timeout_graceful_shutdown=2)
+        connections = Connections(raise_descriptor_limit())
+        config = uvicorn.Config(
+            self.app,
+            http=cast(Any, partial(Connection, connections)),
+            ws="none",
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=2,
+            backlog=BACKLOG,
+        )
+        logging.getLogger("uvicorn.error").addFilter(_INVALID)
+        logging.getLogger("asyncio").addFilter(_NO_DESCRIPTOR)
         self._uvicorn = uvicorn.Server(config)
         self._thread = threading.Thread(
             target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True

@@ -1,0 +1,122 @@
+"""Connections that send no request: they give way, and neither jobs nor those who follow a log notice them."""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+import subprocess
+import threading
+from pathlib import Path
+
+import httpx
+import pytest
+
+from orchestrator.api import connections
+from orchestrator.api.connections import raise_descriptor_limit
+from orchestrator.client import Client
+from orchestrator.server import Server
+from tests.conftest import MUSTER, Serving
+
+DESCRIPTORS = 1024
+HALF_OPEN = 1100
+FOLLOWERS = 50
+HALF = b"POST /v1/submitjob HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Le"
+
+
+class Limited(Serving):
+    """A server that can't have more open files than many a login shell; what it logs is in ``log_file``."""
+
+    def start(self) -> None:
+        self.home.mkdir(parents=True)
+        self.log_file = self.home / "serve.log"
+        with open(self.log_file, "wb") as log:
+            self.process = subprocess.Popen(
+                ["prlimit", f"--nofile={DESCRIPTORS}:{DESCRIPTORS}", MUSTER, "serve", "--port", "0", *self.options],
+                env={**os.environ, "MUSTER_HOME": str(self.home)},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().split()[2]
+        self.client = Client(self.url)
+
+
+def half_open(url: str, sent: bytes = HALF) -> socket.socket:
+    address = httpx.URL(url)
+    connection = socket.create_connection((address.host, address.port or 0), timeout=60)
+    connection.sendall(sent)
+    return connection
+
+
+def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp_path: Path) -> None:
+    raise_descriptor_limit()  # this process holds the other ends
+    server = Limited(tmp_path / "home", "--cpus", "4")
+    opened: list[socket.socket] = []
+    try:
+        gate = tmp_path / "gate"
+        talker = f"import time, pathlib\nprint('first')\nwhile not pathlib.Path({str(gate)!r}).exists(): time.sleep(0.1)\nprint('last')"
+        followed = server.gang(talker)
+        server.wait(followed, "RUNNING")
+        seen: list[list[str]] = [[] for _ in range(FOLLOWERS)]
+
+        def follow(lines: list[str]) -> None:
+            with Client(server.url) as client:
+                lines += [line["text"] for line in client.logs(followed, follow=True)]
+
+        followers = [threading.Thread(target=follow, args=(lines,), daemon=True) for lines in seen]
+        for follower in followers:
+            follower.start()
+        opened = [half_open(server.url) for _ in range(HALF_OPEN)]
+        jobs = [server.gang("print('ran')", name=f"job-{number}") for number in range(6)]
+        with httpx.Client(base_url=server.url, timeout=60) as fresh:
+            assert fresh.get("/healthz").json()["status"] == "ok"
+        assert [server.wait(job)["status"] for job in jobs] == ["SUCCEEDED"] * 6
+        gate.touch()
+        for follower in followers:
+            follower.join(180)
+        assert all({"first", "last"} <= set(lines) for lines in seen), "a follower was cut"
+        assert server.wait(followed)["status"] == "SUCCEEDED"
+        log = server.log_file.read_text()
+        assert "have waited longest without sending a request are closed" in log
+        assert len(log.splitlines()) < 10 and "Traceback" not in log, log[:2000]
+    finally:
+        for connection in opened:
+            connection.close()
+        server.close()
+
+
+@pytest.mark.parametrize("sent", [b"", HALF, HALF + b"ngth: 100\r\n\r\n{"])
+def test_a_connection_that_does_not_finish_its_request_in_time_is_closed(
+    inside: Server, monkeypatch: pytest.MonkeyPatch, sent: bytes
+) -> None:
+    monkeypatch.setattr(connections, "HEADER_TIMEOUT", 0.3)
+    monkeypatch.setattr(connections, "BODY_TIMEOUT", 0.3)
+    with half_open(inside.url, sent) as connection:
+        assert connection.recv(1000) == b""
+
+
+def test_trickling_gains_a_connection_no_time(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "HEADER_TIMEOUT", 0.5)
+    with half_open(inside.url) as connection:
+        connection.settimeout(0.1)
+        for _ in range(600):  # the test's patience
+            try:
+                connection.sendall(b"x")
+                if connection.recv(1000) == b"":
+                    return
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+    raise AssertionError("still open")
+
+
+def test_the_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
+        assert raise_descriptor_limit() == resource.getrlimit(resource.RLIMIT_NOFILE)[0] == min(hard, 65_536)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
