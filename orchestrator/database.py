@@ -25,7 +25,7 @@ from sqlalchemy import (
     text,
     update,
 )
-from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from orchestrator.jobs import Status
@@ -55,6 +55,8 @@ class Database:
         self.changed: Callable[[Collection[str]], None] | None = None
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self._lock: Connection | None = None
+        self._damage: str | None = None
+        """What was said when a damaged page was first met."""
         self._file: Path | None = None
         self._identity: tuple[int, int] | None = None
         """Device and inode of the file, once it is open."""
@@ -77,7 +79,7 @@ class Database:
                 found = self._file.stat()
                 self._identity = found.st_dev, found.st_ino
         except (SQLAlchemyError, ModuleNotFoundError) as error:
-            raise DatabaseError(f"database {_shown(url)}: {_first_line(error)}") from None
+            raise DatabaseError(_explain(_shown(url), error)) from None
 
     @classmethod
     def at(cls, home: Path) -> Database:
@@ -96,14 +98,20 @@ class Database:
             with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
                 yield session
                 session.commit()
-        except (OperationalError, InterfaceError) as error:
-            raise DatabaseError(f"database {self._shown}: {_first_line(error)}") from error
+        except DBAPIError as error:
+            if _is_damaged(error):
+                self._damage = _explain(self._shown, error)
+            elif not isinstance(error, OperationalError | InterfaceError):
+                raise
+            raise DatabaseError(_explain(self._shown, error)) from error
 
     def check(self) -> None:
-        """Make sure that the SQLite file is still the one that was opened: two system calls.
+        """Make sure that the SQLite file is still the one that was opened, and not known to be damaged: two system calls.
 
-        Raises DatabaseError where it is not.
+        Raises DatabaseError where it is not, and from the first damaged page on: each write could make that worse.
         """
+        if self._damage is not None:
+            raise DatabaseError(self._damage)
         if self._file is None or self._identity is None:
             return
         try:
@@ -194,6 +202,23 @@ def _shown(url: str) -> str:
     """The URL without its password."""
     scheme, sign, rest = url.partition("://")
     return f"{scheme}{sign}{rest.rpartition('@')[2]}"
+
+
+def _is_damaged(error: Exception) -> bool:
+    """Whether SQLite found that the file is not as it wrote it."""
+    name = getattr(getattr(error, "orig", None), "sqlite_errorname", "")
+    return str(name).startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB"))
+
+
+def _explain(shown: str, error: Exception) -> str:
+    """One line: which database, what is wrong, and what to do about it."""
+    if not _is_damaged(error):
+        return f"database {shown}: {_first_line(error)}"
+    path, found = shown.partition(":///")[2], getattr(error, "orig", error)
+    return (
+        f"database {shown} is damaged ({found}): stop the controller and put a backup in its place, or what "
+        f"`sqlite3 {path} .recover` can still read"
+    )
 
 
 def _first_line(error: Exception) -> str:

@@ -87,7 +87,10 @@ class Server:
             stack.callback(self.bus.close)
             self.peers = Peers(self.store, home)
             stack.callback(self.peers.close)
-            self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
+            try:
+                self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
+            except DatabaseError as error:
+                raise ServerError(str(error)) from None
             stack.callback(self.controller.close)
             self._opened = stack.pop_all()
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import threading
 from typing import Any
 
@@ -23,8 +22,6 @@ from orchestrator.database import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
 
-log = logging.getLogger("muster.api")
-
 
 def create_app(controller: Controller, access: Access | None = None, limit: RateLimit | None = None) -> FastAPI:
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
@@ -41,7 +38,6 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
     app.add_exception_handler(DataError, _refused_by_database)
     app.add_exception_handler(DatabaseError, _database_away)
     app.add_exception_handler(DamagedFile, _damaged_file)
-    app.add_exception_handler(Exception, _server_error)
 
     @app.get("/healthz")
     def healthz() -> JSONResponse:
@@ -129,8 +125,3 @@ async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
 
 async def _database_away(request: Request, error: Exception) -> JSONResponse:
     return error_response(str(error), 503, "ServerException")
-
-
-async def _server_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return error_response("internal error; the controller's log has the details", 500, "ServerException")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
+import logging
 import re
 import secrets
 import uuid
@@ -30,6 +31,8 @@ from orchestrator.api.limits import Body, RateLimit
 from orchestrator.api.permissions import BY_LOWER_NAME, THIS_PROCESS, Identity, Refusal, current_identity
 from orchestrator.excerpts import LONGEST_ERROR, excerpt
 from orchestrator.keys import Key, KeyStore
+
+log = logging.getLogger("muster.api")
 
 SKEW = 15 * 60
 """Seconds that a signature's time may differ from the server's."""
@@ -70,6 +73,24 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
+        started = False
+
+        async def sending(message: Message) -> None:
+            nonlocal started
+            started = True
+            await send(message)
+
+        try:
+            await self._serve(scope, receive, sending)
+        except Exception as error:
+            if started or scope["type"] != "http":
+                raise  # half an answer can only be cut off
+            log.error("%s %s failed", scope["method"], ascii(scope["path"][:200]), exc_info=error)
+            answer = error_response("internal error; the controller's log has the details", 500, "ServerException")
+            answer.headers["connection"] = "close"  # said, so that a client does not send its next request here
+            await answer(scope, receive, _with_request_id(send))
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = _Request(scope)
         if scope["type"] == "http" and (service := request.foreign_service) is not None:
             await elsewhere.refusal(service, request.first_of_each())(scope, receive, send)

@@ -9,11 +9,20 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import select
 
+from orchestrator.database import Database, DatabaseError
 from orchestrator.server import Server
+from orchestrator.tables import Job, JobQueue
 from shared_store.files import write_json
+from tests.conftest import run_muster
 
 SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
+NODES = {
+    "numNodes": 1,
+    "mainNode": 0,
+    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
+}
 DAMAGED: dict[str, bytes] = {
     "zeros": b"\0" * 4096,
     "empty": b"",
@@ -121,3 +130,60 @@ def test_runs_come_in_pages_that_together_hold_each_run_once(http: httpx.Client,
         address = page.links["next"]["url"] if "next" in page.links else ""
     assert seen == sorted(path.name for path in runs.iterdir())
     assert "max" in refused(http.get("/api/runs?max=100000"))
+
+
+def test_after_an_internal_error_a_client_that_keeps_its_connection_is_served(
+    inside: Server, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise KeyError("two\nlines")
+
+    with httpx.Client(base_url=inside.url) as client:
+        for _ in range(3):
+            with monkeypatch.context() as patched:
+                patched.setattr(inside.controller.engine, "capacity", fail)
+                answer = client.get("/api/capacity")
+            assert answer.status_code == 500 and answer.headers["connection"] == "close"
+            assert answer.json()["message"] == "internal error; the controller's log has the details"
+            assert client.get("/healthz").status_code == 200
+
+
+def damaged_home(home: Path) -> Path:
+    """A home whose database was written by a controller, with zeros over the pages of the table of jobs."""
+    database = Database.at(home)
+    with database.session() as session:
+        session.add_all(
+            Job(id=f"j{n}", name="j", queue="default", definition="d", request={}, node_properties=NODES, run=f"r{n}")
+            for n in range(500)
+        )
+    with database.engine.connect() as connection:
+        connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+        size = connection.exec_driver_sql("PRAGMA page_size").scalar_one()
+        root = connection.exec_driver_sql("SELECT rootpage FROM sqlite_master WHERE name = 'jobs'").scalar_one()
+    database.close()
+    with open(home / "muster.db", "r+b") as file:
+        file.seek((root - 1) * size)
+        file.write(b"\xff" * size)
+    return home / "muster.db"
+
+
+def test_a_damaged_page_of_the_database_is_said_in_one_line_at_the_start(tmp_path: Path) -> None:
+    path = damaged_home(tmp_path)
+    served = run_muster("serve", "--port", "0", home=tmp_path)
+    assert served.returncode == 1 and served.stderr.count("\n") == 1, served.stderr
+    assert f"{path} is damaged" in served.stderr and f"`sqlite3 {path} .recover`" in served.stderr
+
+
+def test_a_damaged_page_that_is_met_while_serving_is_said_to_each_request(tmp_path: Path) -> None:
+    path = damaged_home(tmp_path)
+    database = Database.at(tmp_path)
+    for _ in range(2):
+        with (
+            pytest.raises(DatabaseError, match=f"{path} is damaged .*malformed") as refused,
+            database.session() as session,
+        ):
+            session.scalars(select(Job)).all()
+        assert "\n" not in str(refused.value)
+    with pytest.raises(DatabaseError, match="is damaged"), database.session() as session:
+        session.scalars(select(JobQueue)).all()  # of pages that can still be read: nothing more is written to this file
+    database.close()
