@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator.api.app import create_app
+from orchestrator.api.app import BROWSER_HEADERS, create_app
 from orchestrator.api.auth import Access, is_loopback
 from orchestrator.api.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.limits import RATE, RateLimit
@@ -103,6 +103,7 @@ class Server:
             self.app,
             http=cast(Any, partial(Connection, connections)),
             ws="none",
+            headers=BROWSER_HEADERS,
             log_level="warning",
             access_log=False,
             timeout_graceful_shutdown=2,

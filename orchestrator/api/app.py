@@ -8,12 +8,12 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from orchestrator.api import batch, logs, native
+from orchestrator.api import batch, docs_page, logs, native
 from orchestrator.api.auth import Access, Guard, error_response, kind_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import RateLimit, parse
@@ -22,12 +22,18 @@ from orchestrator.database import DatabaseError
 from shared_store import __version__
 from shared_store.files import DamagedFile
 
+BROWSER_HEADERS = [
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "DENY"),
+    ("Content-Security-Policy", "frame-ancestors 'none'"),
+    ("Referrer-Policy", "no-referrer"),
+]
+"""Headers of every answer, errors and refusals too, which the server adds: no page may frame an answer or guess its type."""
+
 
 def create_app(controller: Controller, access: Access | None = None, limit: RateLimit | None = None) -> FastAPI:
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
-    app = FastAPI(
-        title="Muster", version=__version__, docs_url="/api/docs", openapi_url="/api/openapi.json", redoc_url=None
-    )
+    app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
     app.state.controller = controller
     app.state.closing = threading.Event()
     app.include_router(native.router)
@@ -69,6 +75,12 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
         if request.method == "DELETE":
             body = {"tagKeys": request.query_params.getlist("tagKeys")}
         return JSONResponse(await run_in_threadpool(batch.call, controller, name, {**body, "resourceArn": arn}))
+
+    @app.get("/api/docs", include_in_schema=False)
+    def describe() -> HTMLResponse:
+        """The native API for people."""
+        page = docs_page.render(app.openapi(), "/api/openapi.json")
+        return HTMLResponse(page, headers={"Content-Security-Policy": docs_page.POLICY})
 
     @app.get("/", include_in_schema=False)
     def front() -> RedirectResponse:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -152,6 +155,31 @@ def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving
 def test_a_browser_is_sent_to_the_api_s_pages(shared_server: Serving) -> None:
     answer = httpx.get(f"{shared_server.url}/", follow_redirects=True, trust_env=False)
     assert answer.status_code == 200 and answer.url.path == "/api/docs"
+    assert (
+        "<h2>POST /api/runs/{name}/resume</h2>" in answer.text
+        and "<code>checkpoint</code></td><td>integer or null" in answer.text
+    )
+
+
+def test_the_api_s_page_needs_no_script_and_nothing_from_elsewhere(shared_server: Serving) -> None:
+    answer = httpx.get(f"{shared_server.url}/api/docs", trust_env=False)
+    assert re.findall(r"<script|src=|@import|url\(|://|\son\w+=", answer.text) == []
+    assert re.findall(r'href="(.*?)"', answer.text) == ["/api/openapi.json"]
+    (style,) = re.findall(r"<style>(.*?)</style>", answer.text, re.S)
+    allowed = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert f"default-src 'none'; style-src 'sha256-{allowed}';" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize(
+    ("path", "status"), [("/healthz", 200), ("/api/docs", 200), ("/api/jobs/none", 404), ("/nowhere", 404), ("/", 403)]
+)
+def test_no_answer_may_be_framed_or_taken_for_another_type(shared_server: Serving, path: str, status: int) -> None:
+    headers = {"Origin": "http://evil.example"} if status == 403 else {}
+    answer = httpx.get(f"{shared_server.url}{path}", headers=headers, trust_env=False)
+    assert answer.status_code == status
+    assert answer.headers["x-frame-options"] == "DENY" and answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert all("frame-ancestors 'none'" in policy for policy in answer.headers.get_list("content-security-policy"))
 
 
 def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
