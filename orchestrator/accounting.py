@@ -9,15 +9,15 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.jobs import Ending, Status
 from orchestrator.scheduling import decayed
-from orchestrator.tables import Attempt, Dependency, Job, ShareUsage, now
+from orchestrator.tables import Attempt, Dependency, Job, ShareUsage
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.layout import Run
 
 
-def charge(attempt: Attempt, run: Run) -> None:
-    """Fill in what a closed attempt has used, and what of it was lost: all since the run's last checkpoint."""
+def charge(attempt: Attempt, run: Run, moment: int) -> None:
+    """Fill in what a closed attempt has used until ``moment`` (steady time [ms]), and what of it was lost: all since its last checkpoint."""
     assert attempt.stopped_at is not None
-    seconds = max(0, attempt.stopped_at - attempt.created_at) / 1000
+    seconds = _held(attempt, moment)
     gpus = sum(len(node["gpus"]) for node in attempt.nodes)
     cpus = sum(node["cpus"] for node in attempt.nodes)
     lost = 0.0 if attempt.ending == Ending.SUCCEEDED else min(seconds, _since_checkpoint(attempt, run, seconds))
@@ -38,39 +38,44 @@ def _since_checkpoint(attempt: Attempt, run: Run, otherwise: float) -> float:
     return otherwise
 
 
-def resource_seconds(attempt: Attempt, until: int) -> float:
-    """What an attempt has used until a time [ms]: GPU-seconds, or CPU-seconds where it has no GPUs."""
-    seconds = max(0, (attempt.stopped_at or until) - attempt.created_at) / 1000
+def _held(attempt: Attempt, moment: int) -> float:
+    """Seconds for which an attempt has held what it was given, at ``moment`` (steady time [ms])."""
+    return max(0, moment - (attempt.created_at if attempt.held_since is None else attempt.held_since)) / 1000
+
+
+def resource_seconds(attempt: Attempt, moment: int) -> float:
+    """What an attempt has used until ``moment`` (steady time [ms]): GPU-seconds, or CPU-seconds where it has no GPUs."""
+    seconds = _held(attempt, moment)
     gpus = sum(len(node["gpus"]) for node in attempt.nodes)
     return seconds * (gpus or sum(node["cpus"] for node in attempt.nodes))
 
 
-def add_usage(session: Session, queue: str, share: str, seconds: float, decay: int) -> None:
-    """Add resource-seconds that a share has just used of a queue."""
+def add_usage(session: Session, queue: str, share: str, seconds: float, decay: int, moment: int) -> None:
+    """Add resource-seconds that a share has used of a queue until ``moment`` (steady time [ms])."""
     usage = session.get(ShareUsage, (queue, share))
     if usage is None:
-        usage = ShareUsage(queue=queue, share=share, seconds=0.0, as_of=now())
+        usage = ShareUsage(queue=queue, share=share, seconds=0.0, as_of=moment)
         session.add(usage)
-    usage.seconds = decayed(usage.seconds, (now() - usage.as_of) / 1000, decay) + seconds
-    usage.as_of = now()
+    usage.seconds = decayed(usage.seconds, max(0, moment - usage.as_of) / 1000, decay) + seconds
+    usage.as_of = moment
 
 
-def usage_now(
-    session: Session, decays: Mapping[str, int], running: Sequence[tuple[Job, Attempt]]
+def usage_at(
+    session: Session, moment: int, decays: Mapping[str, int], running: Sequence[tuple[Job, Attempt]]
 ) -> dict[tuple[str, str], float]:
-    """(queue, share) → resource-seconds decayed to now, with what running gangs have used so far.
+    """(queue, share) → resource-seconds decayed to a moment, with what running gangs have used until then.
 
     Args:
         session: The session.
+        moment: Steady time [ms].
         decays: ``shareDecaySeconds`` by queue, of the queues that have a policy.
         running: Jobs with their open attempts.
     """
-    moment = now()
     found: dict[tuple[str, str], float] = {}
     if not decays:
         return found
     for row in session.scalars(select(ShareUsage).where(ShareUsage.queue.in_(decays))):
-        left = decayed(row.seconds, (moment - row.as_of) / 1000, decays[row.queue])
+        left = decayed(row.seconds, max(0, moment - row.as_of) / 1000, decays[row.queue])
         if left > 1e-3:  # forgotten in the end: a share with nothing used is not active
             found[row.queue, row.share] = left
     for job, attempt in running:

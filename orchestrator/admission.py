@@ -8,12 +8,13 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.accounting import usage_now
+from orchestrator.accounting import usage_at
+from orchestrator.clock import Clock
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import Host, Placement, engine_of
 from orchestrator.pools import pool_engine
 from orchestrator.scheduling import FairShare, Leading, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
-from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy, now
+from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 
 HOSTS_TAG = "muster:hosts"
 """Tag that names the hosts of a compute environment, with commas between; all of its engine's without it."""
@@ -23,6 +24,7 @@ DEFAULT_DECAY = 600
 
 def take_snapshot(
     session: Session,
+    clock: Clock,
     hosts: Sequence[Host],
     waiting: Sequence[Waiting],
     active: Sequence[str],
@@ -34,6 +36,7 @@ def take_snapshot(
 
     Args:
         session: The session.
+        clock: Tells what time it is.
         hosts: All that the engines have.
         waiting: The jobs that wait for room.
         active: Ids of the jobs that may hold some.
@@ -49,13 +52,14 @@ def take_snapshot(
     facts: dict[int, GangNeeds] = {}
     decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
     return Snapshot(
-        now=now(),
+        now=clock.now(),
+        drift=clock.drift,
         hosts=hosts,
         pools=pools,
         queues=queues,
         waiting=waiting,
         running=[_running(job, attempt, facts) for job, attempt in counted],
-        usage=usage_now(session, decays, holding),
+        usage=usage_at(session, clock.now(), decays, holding),
         leading=leading or {},
     )
 
@@ -122,7 +126,7 @@ def _running(job: Job, attempt: Attempt, facts: dict[int, GangNeeds]) -> Running
         priority=job.priority,
         pool=attempt.pool or "local",
         placements=placements_of(attempt),
-        started_at=attempt.started_at,
+        started_at=attempt.running_since,
         timeout=job.timeout,
         preemptible=needs is not None and needs.setting("MUSTER_PREEMPTIBLE") == "1",
         ending=attempt.ending is not None or job.stop_reason is not None,

@@ -19,6 +19,7 @@ from orchestrator.accounting import forget_before
 from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
+from orchestrator.clock import Clock
 from orchestrator.database import Database, DatabaseError, ask_to_end
 from orchestrator.definition import gang_needs
 from orchestrator.engines.several import Several
@@ -59,12 +60,14 @@ class Controller:
         peers: Peers,
         interval: float = 0.2,
         retention: float | None = None,
+        clock: Clock | None = None,
     ) -> None:
         """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept."""
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
         self.roster = Roster()
-        self.gangs = Gangs(engine, store, bus, peers, self.wake)
+        self.clock = clock or Clock()
+        self.gangs = Gangs(engine, store, bus, peers, self.clock, self.wake)
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
         self.submissions = Together(database, self.writing)
@@ -82,6 +85,7 @@ class Controller:
         """What goes wrong, by a part of the pass, or by what was tried of a job and the job's id."""
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
         with database.session() as session:
+            self.clock.restore(session)
             self.roster.load(session)
             for job, attempt in open_attempts(session, self.roster.active()):
                 bus.expect(job.id, attempt.number)  # before the router is there for their nodes
@@ -114,6 +118,8 @@ class Controller:
         """
         self._keep_database()
         with self.database.session() as session:
+            if self.clock.stepped:
+                self.clock.note_step(session)
             self.roster.take_dependents(session)
         taken = self.roster.take_due(_SETTLED_A_TICK)
         due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
@@ -214,6 +220,8 @@ class Controller:
         self.roster.note([job])
         if job.is_over or job.open_attempt is not None:
             return
+        if job.queued_since is None:
+            job.queued_since = job.created_at - self.clock.drift
         if job.kind == "array":
             self._settle_array(session, job)
         elif job.stop_reason is not None:
@@ -269,6 +277,7 @@ class Controller:
         with self.database.session() as session:
             snapshot = take_snapshot(
                 session,
+                self.clock,
                 self.engine.capacity(),
                 waiting,
                 self.roster.active(),
@@ -329,7 +338,7 @@ class Controller:
         order = [job for job in (board.order(queue)[:count] if board else []) if self.roster.since(job) is not None]
         times = {job: since for job in order if (since := self.roster.since(job)) is not None}
         if leading is not None and leading.job in times:
-            times[leading.job] = leading.since
+            times[leading.job] = leading.since + self.clock.drift
         return order, times
 
     def utilization(
@@ -369,7 +378,8 @@ class Controller:
                 if session.scalars(busy).first() is None:
                     session.delete(queue)
             if self.retention is not None:
-                forget_before(session, now() - int(self.retention * 1000))
+                # by the clock that is behind: nothing is forgotten too early
+                forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
 
 
 def _words(error: Exception) -> str:

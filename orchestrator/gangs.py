@@ -21,6 +21,7 @@ from orchestrator.accounting import add_usage, charge, resource_seconds
 from orchestrator.admission import DEFAULT_DECAY, node_records, placements_of
 from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
+from orchestrator.clock import Clock
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, Plan, engine_of
 from orchestrator.engines.several import Several
@@ -60,8 +61,17 @@ class StoreUnavailable(Exception):
 class Gangs:
     """Drives attempts; ``changed`` is called (from any thread) when one of them should be looked at."""
 
-    def __init__(self, engine: Several, store: Store, bus: Bus, peers: Peers, changed: Callable[[], None]) -> None:
-        self.engine, self.store, self.bus, self.peers, self.changed = engine, store, bus, peers, changed
+    def __init__(
+        self, engine: Several, store: Store, bus: Bus, peers: Peers, clock: Clock, changed: Callable[[], None]
+    ) -> None:
+        self.engine, self.store, self.bus, self.peers, self.clock, self.changed = (
+            engine,
+            store,
+            bus,
+            peers,
+            clock,
+            changed,
+        )
         self._stops: dict[tuple[str, int], Future[GangStatus]] = {}
         self._finished: dict[tuple[str, int], float] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
@@ -95,6 +105,7 @@ class Gangs:
             job.first_epoch = epoch
         number, nodes = len(job.attempts) + 1, node_records(start.placements)
         attempt = Attempt(job_id=job.id, number=number, epoch=epoch, pool=start.pool, nodes=nodes, created_at=now())
+        attempt.held_since = self.clock.now()
         job.attempts.append(attempt)
         job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
         session.commit()
@@ -179,6 +190,7 @@ class Gangs:
             job.status_reason = status[main].waiting
         elif job.status == Status.STARTING and (status[main].running or ends[main]):
             job.started_at = attempt.started_at = now()
+            attempt.running_since = self.clock.now()
             if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
                 array.started_at = job.started_at
             job.move(Status.RUNNING, runs)
@@ -239,7 +251,7 @@ class Gangs:
             if end is None and silence is not None and silence > LOST:
                 reason = f"node {index} gives no sign of life for {silence:.0f} s: frozen, or cut off"
                 return Verdict(Ending.FAILED, reason)
-        if job.timeout and attempt.started_at and now() - attempt.started_at > job.timeout * 1000:
+        if job.timeout and attempt.running_since and self.clock.now() - attempt.running_since > job.timeout * 1000:
             return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
         return None
 
@@ -332,13 +344,15 @@ class Gangs:
     def _close_attempt(
         self, session: Session, job: Job, attempt: Attempt, verdict: Verdict, ends: Sequence[NodeEnd | None]
     ) -> None:
-        ended, ending = now(), verdict.ending
+        moment, ending = self.clock.now(), verdict.ending
         attempt.ending, attempt.status_reason, attempt.exit_code = ending, verdict.reason, verdict.exit_code
-        attempt.started_at, attempt.stopped_at = attempt.started_at or ended, ended
-        left = ending == Ending.REQUEUE and ended - attempt.started_at >= _SHORTEST_REQUEUE
+        ran = moment - (attempt.running_since or moment)
+        attempt.started_at = attempt.started_at or now()
+        attempt.stopped_at = max(now(), attempt.started_at + ran)  # also where the clock was put back meanwhile
+        left = ending == Ending.REQUEUE and ran >= _SHORTEST_REQUEUE
         attempt.spent = not (left or ending == Ending.PREEMPTED)
-        charge(attempt, self.store.run(job.run))
-        self._charge_share(session, job, attempt)
+        charge(attempt, self.store.run(job.run), moment)
+        self._charge_share(session, job, attempt, moment)
         spent = sum(1 for each in job.attempts if each.spent)
         tries_left = spent < job.attempts_allowed
         number, progress = attempt.number, self._progress(job)
@@ -355,6 +369,8 @@ class Gangs:
         else:
             of = f" (attempt {spent} of {job.attempts_allowed})" if ending == Ending.FAILED and _is_native(job) else ""
             job.move(Status.FAILED, f"{verdict.reason}{of}")
+        if job.stopped_at is not None:
+            job.stopped_at = max(job.stopped_at, attempt.stopped_at)
 
     @staticmethod
     def _is_done(job: Job, ends: Sequence[NodeEnd | None]) -> bool:
@@ -370,12 +386,12 @@ class Gangs:
         return retries(job.evaluate_on_exit, verdict.exit_code, head.reason if head else "", verdict.reason)
 
     @staticmethod
-    def _charge_share(session: Session, job: Job, attempt: Attempt) -> None:
+    def _charge_share(session: Session, job: Job, attempt: Attempt, moment: int) -> None:
         queue = session.get(JobQueue, job.queue)
         policy = session.get(SchedulingPolicy, queue.policy) if queue and queue.policy else None
         if policy is not None:
             decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
-            add_usage(session, job.queue, job.share or "", resource_seconds(attempt, now()), decay)
+            add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
 
     def _progress(self, job: Job) -> str:
         checkpoints = list_checkpoints(self.store.run(job.run))

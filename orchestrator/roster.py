@@ -125,4 +125,5 @@ class Roster:
         if job.parent is not None:
             self._arrays[job.parent] = shape
         since = job.runnable_at or job.created_at
-        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, job.created_at, since, job.timeout)
+        created = job.created_at if job.queued_since is None else job.queued_since
+        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout)

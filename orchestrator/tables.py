@@ -140,6 +140,8 @@ class Job(Base):
     created_at: Mapped[int] = mapped_column(default=now, index=True)
     runnable_at: Mapped[int | None] = mapped_column(default=None)
     """Since when it waits for room."""
+    queued_since: Mapped[int | None] = mapped_column(default=None)
+    """When it was created, in steady time [ms] (:mod:`orchestrator.clock`): by this jobs are ordered."""
     started_at: Mapped[int | None] = mapped_column(default=None)
     stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
     attempts_allowed: Mapped[int] = mapped_column(default=1)
@@ -198,7 +200,7 @@ class Job(Base):
         if status == Status.RUNNABLE:
             self.runnable_at = now()
         if status.is_terminal:
-            self.stopped_at = now()
+            self.stopped_at = max(now(), self.started_at or 0)  # the clock may have been put back
         if reason is not None:
             self.status_reason = reason
 
@@ -244,6 +246,9 @@ class Attempt(Base):
     created_at: Mapped[int] = mapped_column(default=now)
     started_at: Mapped[int | None] = mapped_column(default=None)
     stopped_at: Mapped[int | None] = mapped_column(default=None)
+    held_since: Mapped[int | None] = mapped_column(default=None)
+    running_since: Mapped[int | None] = mapped_column(default=None)
+    """``created_at`` and ``started_at`` in steady time [ms] (:mod:`orchestrator.clock`)."""
     status_reason: Mapped[str | None] = mapped_column(default=None)
     exit_code: Mapped[int | None] = mapped_column(default=None)
     gpu_seconds: Mapped[float] = mapped_column(default=0.0)
@@ -262,8 +267,21 @@ class Attempt(Base):
         return None if reason is None else excerpt(reason, LONGEST_REASON)
 
 
+class ClockState(Base):
+    """The one row of steady time (:mod:`orchestrator.clock`)."""
+
+    __tablename__ = "clock"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    boot: Mapped[str]
+    """Of the machine, as long as its monotonic clock counts on."""
+    offset: Mapped[int]
+    """Steady time less monotonic time [ms]."""
+    drift: Mapped[int]
+    """Wall-clock time less steady time [ms]."""
+
+
 class ShareUsage(Base):
-    """What a share has used of a queue, decayed to ``as_of``."""
+    """What a share has used of a queue, decayed to ``as_of`` (steady time [ms])."""
 
     __tablename__ = "share_usage"
     queue: Mapped[str] = mapped_column(primary_key=True)

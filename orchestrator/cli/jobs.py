@@ -328,7 +328,9 @@ def _when(milliseconds: int | None) -> str:
 def _took(start: int | None, end: int | None) -> str:
     if not start:
         return "-"
-    seconds = int((end or time.time() * 1000) - start) // 1000
+    seconds = (
+        max(0, int((end or time.time() * 1000) - start)) // 1000
+    )  # this machine's clock may be behind the controller's
     return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
 
 

@@ -90,7 +90,7 @@ class _Pass:
             self._serve(queues[name], jobs[name])
         for name in sorted(jobs.keys() - queues.keys()):
             self.lines[name] = Line(dispatch_order(None, jobs[name], {}), None)
-        board = Board(self.now, self.lines, self.heads, self.room, self.preempts)
+        board = Board(self.now, self.lines, self.heads, self.room, self.preempts, self.snapshot.drift)
         return Decisions(tuple(self.starts), tuple(self.preempts), tuple(self.cancels), board, self.leading)
 
     def _serve(self, queue: Queue, jobs: list[Waiting]) -> None:

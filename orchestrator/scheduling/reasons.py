@@ -46,6 +46,7 @@ class Board:
         heads: Sequence[Head],
         room: Room,
         preempts: Sequence[_Preemption],
+        drift: int = 0,
     ) -> None:
         """Args:
         now: Time of the pass [ms].
@@ -53,7 +54,9 @@ class Board:
         heads: In the order in which they came.
         room: What is free after the pass.
         preempts: Who is preempted, by whom.
+        drift: What times lack to be Unix time [ms].
         """
+        self._drift = drift
         self._now, self._lines, self._heads, self._room = now, lines, {head.job.job: head for head in heads}, room
         self._preempted = {each.job for each in preempts}
         self._orders: dict[str, tuple[str, ...]] = {}
@@ -140,7 +143,9 @@ class Board:
         """When the head starts at the latest; nothing where nobody knows or it is about to."""
         if not self._now < head.spare.at < inf:
             return ""
-        return lead + datetime.fromtimestamp(head.spare.at / 1000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return lead + datetime.fromtimestamp((head.spare.at + self._drift) / 1000, UTC).strftime(
+            "%Y-%m-%d %H:%M:%S UTC"
+        )
 
     def _hint(self, shape: Shape, lane: Lane) -> str:
         """That the shape would fit now, and with which timeout it could start without delaying anybody."""

@@ -1,4 +1,7 @@
-"""What a scheduling pass looks at: jobs, queues, pools, hosts and the clock. Values only; times are Unix times [ms]."""
+"""What a scheduling pass looks at: jobs, queues, pools, hosts and the clock. Values only.
+
+Times are in milliseconds, on a clock that never steps (:mod:`orchestrator.clock`).
+"""
 
 from __future__ import annotations
 
@@ -75,7 +78,7 @@ class Waiting:
     share: str | None
     created_at: int
     since: int
-    """When it became RUNNABLE [ms]."""
+    """When it became RUNNABLE (Unix time [ms]); for people."""
     timeout: int | None
     """Of an attempt [s]."""
 
@@ -173,3 +176,5 @@ class Snapshot:
     """(queue, share) → resource-seconds, decayed to now; a job without a share counts under the share ``""``."""
     leading: Mapping[str, Leading] = field(default_factory=dict)
     """By queue, of the last pass."""
+    drift: int = 0
+    """What a time lacks [ms] to be Unix time, as people read it."""

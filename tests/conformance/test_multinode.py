@@ -50,7 +50,7 @@ def overdue(batch: Batch) -> Iterator[str]:
 def age(batch: Batch, job: str, seconds: int) -> None:
     """Make a running attempt so much older: its start is set back in the database."""
     with sqlite3.connect(batch.server.home / "muster.db", timeout=30) as database:
-        older = "UPDATE attempts SET started_at = started_at - ? WHERE job_id = ? AND started_at IS NOT NULL"
+        older = "UPDATE attempts SET running_since = running_since - ? WHERE job_id = ? AND running_since IS NOT NULL"
         assert database.execute(older, [seconds * 1000, job]).rowcount == 1
 
 

@@ -16,7 +16,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
-from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_now
+from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
 from orchestrator.client import ApiError
 from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
 from orchestrator.roster import Roster
@@ -280,25 +280,22 @@ def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Da
     run = Store(tmp_path / "store").open().run("r")
     nodes = [{"gpus": ["0", "1"], "cpus": 4.0}, {"gpus": ["2", "3"], "cpus": 4.0}]
     failed = Attempt(job_id="a", number=1, epoch=1, nodes=nodes, created_at=10_000, stopped_at=70_000, ending="failed")
-    charge(failed, run)
+    charge(failed, run, 70_000)
     assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
     assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
     done = Attempt(job_id="a", number=2, epoch=2, nodes=nodes, created_at=10_000, stopped_at=20_000, ending="succeeded")
-    charge(done, run)
+    charge(done, run, 20_000)
     assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
-    assert resource_seconds(failed, 0) == 240.0
+    assert resource_seconds(failed, 70_000) == 240.0
 
 
 def test_what_a_share_used_halves_with_its_decay_time(opened: Callable[[], Database]) -> None:
     with opened().session() as session:
-        add_usage(session, "default", "red", 100.0, 60)
-        session.flush()
-        session.execute(text("UPDATE share_usage SET as_of = as_of - 60000"))
-        session.expire_all()
-        add_usage(session, "default", "red", 10.0, 60)
-        found = usage_now(session, {"default": 60}, [])
-        assert found[("default", "red")] == pytest.approx(60.0, rel=0.02)
-        assert usage_now(session, {}, []) == {}
+        add_usage(session, "default", "red", 100.0, 60, 1_000_000)
+        add_usage(session, "default", "red", 10.0, 60, 1_060_000)
+        assert usage_at(session, 1_060_000, {"default": 60}, []) == {("default", "red"): pytest.approx(60.0)}
+        assert usage_at(session, 1_000_000, {"default": 60}, []) == {("default", "red"): pytest.approx(60.0)}
+        assert usage_at(session, 1_060_000, {}, []) == {}
 
 
 def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) -> None:

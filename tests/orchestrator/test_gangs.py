@@ -112,7 +112,7 @@ def test_a_job_that_outlives_its_timeout_is_ended_and_not_tried_again(server: Se
     import sqlite3
 
     with sqlite3.connect(server.home / "muster.db") as database:
-        database.execute("UPDATE attempts SET started_at = started_at - 59000")
+        database.execute("UPDATE attempts SET running_since = running_since - 59000")
     detail = server.wait(job, timeout=30)
     assert detail["status"] == "FAILED" and detail["statusReason"] == "Job attempt duration exceeded timeout"
     assert len(detail["attempts"]) == 1
