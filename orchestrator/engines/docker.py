@@ -46,6 +46,7 @@ from orchestrator.engines.docker_logs import LogCopy
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store import __version__
+from shared_store.contract import BUS_VARIABLES
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
@@ -251,6 +252,7 @@ class DockerEngine:
             entrypoint = ["python", "-P", "-m", "worker.supervisor", "--"]
         else:
             command = list(node.command)
+            environment = {name: value for name, value in environment.items() if name not in BUS_VARIABLES}
         return self._client.containers.create(
             image,
             command,

@@ -47,7 +47,7 @@ class Bench:
     def gang(self, script: str = WAIT, nodes: int = 2, image: str = PLAIN, **container: Any) -> Gang:
         changes = {
             name: container.pop(name)
-            for name in ("attempt", "is_gang", "memory", "main", "log_limit")
+            for name in ("attempt", "is_gang", "memory", "main", "log_limit", "bus", "bus_token")
             if name in container
         }
         memory = changes.pop("memory", 256)
@@ -104,7 +104,8 @@ def bench(docker_client: Any, tmp_path: Path) -> Iterator[Bench]:
 
 
 def test_a_plain_image_runs_plainly_and_its_log_and_outcome_are_in_the_store(bench: Bench) -> None:
-    handle = bench.launch(bench.gang('echo "$GREETING from $AWS_BATCH_JOB_NODE_INDEX of $NNODES"; exit $NODE_RANK', 3))
+    script = 'echo "$GREETING from $AWS_BATCH_JOB_NODE_INDEX of $NNODES$MUSTER_BUS$MUSTER_BUS_TOKEN"; exit $NODE_RANK'
+    handle = bench.launch(bench.gang(script, 3, bus="tcp/1", bus_token="no supervisor needs it"))
     status = bench.ended(handle)
     assert [node.exit_code for node in status] == [0, 1, 2]
     assert sorted(bench.log()) == [f"hello from {index} of 3" for index in range(3)]
