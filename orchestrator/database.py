@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +84,14 @@ class Database:
 
     @classmethod
     def at(cls, home: Path) -> Database:
-        """The SQLite database of a Muster home directory."""
-        return cls(f"sqlite:///{home / 'muster.db'}")
+        """The SQLite database of a Muster home directory, for its user alone: jobs' environments hold secrets."""
+        path = home / "muster.db"
+        with suppress(OSError):  # said by SQLite, in its own words
+            os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+        for name in ("muster.db", "muster.db-wal", "muster.db-shm"):  # SQLite gives new ones the mode of the first
+            with suppress(OSError):
+                (home / name).chmod(0o600)
+        return cls(f"sqlite:///{path}")
 
     @contextmanager
     def session(self) -> Iterator[Session]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import json
+import logging
 import os
 from pathlib import Path
 from typing import IO
+
+log = logging.getLogger("muster.home")
 
 
 class ServerError(Exception):
@@ -28,6 +31,24 @@ def local_url() -> str | None:
         return None
 
 
+def make_private(directory: Path, is_ours: bool = True) -> None:
+    """Create a directory for its user alone (0700); one that others can enter is closed to them, which is logged.
+
+    ``is_ours``: it was made for Muster. Another one is closed only while it is empty: who knows who else uses it. Raises OSError.
+    """
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = directory.stat()
+    if not found.st_mode & 0o077:
+        return
+    if found.st_uid == os.geteuid() and (is_ours or not any(directory.iterdir())):
+        directory.chmod(found.st_mode & 0o700)
+        log.warning("%s was open to other users; it is closed to them now (chmod 700)", directory)
+    else:
+        log.warning(
+            "%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", directory
+        )
+
+
 class ControllerRuns(ServerError):
     """Another controller has this home directory; the message says which."""
 
@@ -36,7 +57,7 @@ class HomeLock:
     """One controller a home directory: a lock that the kernel drops when the process dies, however it dies."""
 
     def __init__(self, home: Path) -> None:
-        home.mkdir(parents=True, exist_ok=True)
+        make_private(home, is_ours=(home / "controller.lock").exists())
         self.path = home / "controller.json"
         self._file: IO[str] = open(home / "controller.lock", "a")  # noqa: SIM115 - held until release()
         try:

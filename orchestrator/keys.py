@@ -175,7 +175,7 @@ class KeyStore:
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
         """One change at a time: two commands at once must not lose each other's key."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open(self.path.with_suffix(".lock"), "a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 import logging
+import os
 import socket
 import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +32,9 @@ from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
 from shared_store.layout import Store
 
+SHORTEST_TOKEN = 16
+"""Characters of a token that lets its bearer do everything."""
+_FEWEST_CHARACTERS = 6
 _INVALID = Seldom("Invalid HTTP request received")
 _NO_DESCRIPTOR = Seldom("socket.accept() out of system resource")
 """What any client can have uvicorn and asyncio log at any rate."""
@@ -54,6 +59,7 @@ class Server:
         retention: float | None = None,
         engines: Sequence[str] = ("local",),
         secrets: str | None = None,
+        trusted_proxies: Sequence[str] = (),
     ) -> None:
         """Take the lock, the port, the store, the database and the engines, in this order; nothing runs until :meth:`start`.
 
@@ -61,17 +67,24 @@ class Server:
         ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
         jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.job_secrets.Secrets`); None: jobs get none.
+        ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
 
         Raises:
             ServerError, StoreError: One line each: what is in the way, and what to do.
         """
-        self.access = Access(KeyStore(home), token, exposed=not is_loopback(host))
-        _check_exposure(host, self.access)
+        _check_token(token)
+        _check_proxies(trusted_proxies)
+        exposed = not is_loopback(host) or bool(trusted_proxies)
+        self.access = Access(KeyStore(home), token, exposed=exposed, user=os.geteuid())
+        _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home)
             stack.callback(self._lock.release)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
+            if store is None:
+                with suppress(OSError):  # said by open()
+                    (home / "store").mkdir(mode=0o700)
             self.store = Store(store or home / "store").open()
             try:
                 found = Database(database) if database else Database.at(home)
@@ -108,6 +121,8 @@ class Server:
             access_log=False,
             timeout_graceful_shutdown=2,
             backlog=BACKLOG,
+            proxy_headers=bool(trusted_proxies),
+            forwarded_allow_ips=list(trusted_proxies),
         )
         logging.getLogger("uvicorn.error").addFilter(_INVALID)
         logging.getLogger("asyncio").addFilter(_NO_DESCRIPTOR)
@@ -154,14 +169,34 @@ def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Se
     return several
 
 
-def _check_exposure(host: str, access: Access) -> None:
-    """Raises ServerError where others could come in unasked, or the keys can't be read."""
+def _check_exposure(option: str, access: Access) -> None:
+    """Raises ServerError where others could come in without a key, or the keys can't be read."""
     keys = access.keys.load() if access.keys else {}
     if access.exposed and not access.token and not keys:
         raise ServerError(
-            f"--host {host} is reachable from other machines: first create a key with `muster keys create NAME`, or set "
+            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`, or set "
             "MUSTER_TOKEN to a secret, here and for the clients"
         )
+
+
+def _check_token(token: str | None) -> None:
+    """Raises ServerError for a token that can be guessed."""
+    if token and (len(token) < SHORTEST_TOKEN or len(set(token)) < _FEWEST_CHARACTERS):
+        raise ServerError(
+            f"MUSTER_TOKEN is too easy to guess: use at least {SHORTEST_TOKEN} characters, {_FEWEST_CHARACTERS} of them different, "
+            "such as those that `openssl rand -hex 24` prints"
+        )
+
+
+def _check_proxies(addresses: Sequence[str]) -> None:
+    """Raises ServerError for what is neither an address nor a network."""
+    for address in addresses:
+        try:
+            ipaddress.ip_network(address)
+        except ValueError as error:
+            raise ServerError(
+                f"--trust-proxy: {error}; give the proxy's address or network, such as 10.0.0.7 or 10.0.0.0/24"
+            ) from None
 
 
 def _listen(host: str, port: int) -> socket.socket:

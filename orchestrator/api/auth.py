@@ -1,8 +1,8 @@
 """Who may come in, as whom, and what they may do: in front of every request.
 
 With a token or a key in force a request carries ``Authorization: Bearer …`` (the token, or ``ACCESS_KEY_ID:SECRET``) or an AWS
-Signature Version 4 by a key of :mod:`orchestrator.keys`. Without either the server listens on loopback only, lets everyone on this
-machine in, and ignores signatures, since AWS clients always sign with something.
+Signature Version 4 by a key of :mod:`orchestrator.keys`. Without either the server listens on loopback only, takes requests from
+processes of its own user (:mod:`orchestrator.api.callers`), and ignores signatures, since AWS clients always sign with something.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from orchestrator.api import elsewhere
+from orchestrator.api.callers import Caller, user_name
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import Body, RateLimit
 from orchestrator.api.permissions import BY_LOWER_NAME, THIS_PROCESS, Identity, Refusal, current_identity
@@ -42,12 +43,14 @@ _LOGS_TARGET = "Logs_20140328."
 
 @dataclass
 class Access:
-    """What lets a request in: the keys of the home directory, one token that may do everything, or being on this machine."""
+    """What lets a request in: the keys of the home directory, one token that may do everything, or the controller's own user."""
 
     keys: KeyStore | None = None
     token: str | None = None
     exposed: bool = False
     """Other machines can reach the server, or there were keys: from then on it is never open."""
+    user: int | None = None
+    """Uid of the processes whose requests are taken while no key is demanded; None for an application without a socket."""
     own_token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     """Lets this process into its own server (`muster run`), whoever else needs what."""
 
@@ -61,6 +64,14 @@ class Access:
             keys = self.known()
             self.exposed = bool(self.token or keys or (self.keys and self.keys.unusable))
         return self.exposed
+
+    def admitted(self) -> str:
+        """Who may send requests just now, in one line for people."""
+        if not self.demanded():
+            name = "anybody" if self.user is None else f"user {user_name(self.user)} of this machine"
+            return f"open to {name}, without a key; `muster keys create NAME` lets others in, and then everybody needs a key"
+        with_token = " or MUSTER_TOKEN" if self.token else ""
+        return f"open to those who have a key{with_token}; `muster keys list` shows the keys"
 
 
 class Guard:
@@ -97,7 +108,7 @@ class Guard:
             return
         body = Body(receive, request.first("content-length"), request.operation)
         try:
-            identity = await self._admit(request, body)
+            identity = await self._admit(request, body, scope.get("state", {}).get("caller"))
             if scope["type"] == "http":
                 await body.read()
         except ClientDisconnect:
@@ -117,7 +128,7 @@ class Guard:
         finally:
             current_identity.reset(before)
 
-    async def _admit(self, request: _Request, body: Body) -> Identity:
+    async def _admit(self, request: _Request, body: Body, caller: Caller | None) -> Identity:
         """Whose request it is. Raises ClientError where it may not pass."""
         demanded = self.access.demanded()
         request.check_browser(loopback_only=not demanded)
@@ -128,8 +139,12 @@ class Guard:
             try:
                 identity = await self._authenticate(request, body)
             except ClientError:
-                self._count(identity, "")  # or a weak token could be guessed at any speed
+                if reason := self.limit.refusal_of_failures(request.client):
+                    raise Refusal("TooManyRequestsException", reason, 429) from None
+                self._count(identity, "")
                 raise
+        elif self.access.user is not None:
+            identity = await self._local_user(self.access.user, caller)
         self._count(identity, request.operation)
         if identity.read_only and not request.reads:
             raise Refusal(
@@ -137,6 +152,24 @@ class Guard:
                 f"{identity.name} is read-only: {request.method} {request.path} is refused; use a key that may write",
             )
         return identity
+
+    @staticmethod
+    async def _local_user(user: int, caller: Caller | None) -> Identity:
+        """The controller's own user, where the process at the other end is that user's. Raises Refusal."""
+        uid = await caller.uid() if caller else None
+        name = user_name(user)
+        if uid == user:
+            return Identity(f"user {name}")
+        who = (
+            f"it comes from user {user_name(uid)}"
+            if uid is not None
+            else "its user can't be seen from here (it comes out of a container, or its process has left)"
+        )
+        raise Refusal(
+            "AccessDeniedException",
+            f"without keys this controller takes requests from user {name} of its machine alone, and {who}; ask {name} for a key: "
+            "`muster keys create NAME` makes one",
+        )
 
     def _count(self, identity: Identity, operation: str) -> None:
         if reason := self.limit.refusal(identity.name, operation):

@@ -16,6 +16,8 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from orchestrator.api.callers import Caller
+
 HEADER_TIMEOUT = 10.0
 """Seconds from the opening of a connection, or from the last answer, to the end of the next request's headers."""
 BODY_TIMEOUT = 60.0
@@ -122,6 +124,9 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.peer = self.client[0] if self.client else ""
+        if self.client and self.server and self.server[1] is not None:
+            caller = Caller(self.client, (self.server[0], self.server[1]))
+            self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
         if not self._connections.admit(self):
             self._refuse()
             return

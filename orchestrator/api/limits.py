@@ -35,6 +35,8 @@ MOST = {
 """Entries of these lists of a request, as on AWS."""
 RATE = 1000
 """Requests per second that one client may send for long, unless the server is told otherwise."""
+FAILURES = 50
+"""Requests per second with a wrong token, key or signature that one address may send for long, twice as many at once."""
 _FULL = 2.0
 """Seconds after which a bucket that nobody took from is full again, and need not be kept."""
 _SWEEP = 10.0
@@ -149,6 +151,12 @@ class RateLimit:
         if operation == "submitjob" and not self._take((client, operation), self.submit_rate):
             return f"Too Many Requests: {client} may submit {self.submit_rate} jobs per second; wait and try again"
         return None
+
+    def refusal_of_failures(self, address: str) -> str | None:
+        """Count a request whose token, key or signature is wrong; None where it is answered as such, else why not."""
+        if self._take((address, "failures"), FAILURES):
+            return None
+        return f"Too Many Requests: {address} sends more than {FAILURES} requests per second with a wrong token or key"
 
     def _take(self, bucket: tuple[str, str], rate: int) -> bool:
         if rate <= 0:

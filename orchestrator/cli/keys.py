@@ -77,9 +77,17 @@ def list_keys(as_json: JsonOption = False) -> None:
 
 
 def delete(name: NameArgument) -> None:
-    """Delete a key: a running server refuses it from its next request on."""
-    KeyStore(muster_home()).delete(name)
+    """Delete a key: a running server refuses it from its next request on. After the last one it says who may come in."""
+    keys = KeyStore(muster_home())
+    keys.delete(name)
     echo(f"deleted key {name}")
+    if not keys.load():
+        echo(
+            f"""it was the last one of {muster_home()}:
+  a running server lets in only who has its MUSTER_TOKEN, until there is a key again or it is restarted
+  a server that starts from now on takes requests on loopback from its own user without a key
+  a server that other machines can reach (--host) does not start until there is a key or MUSTER_TOKEN"""
+        )
 
 
 def _may(key: Key) -> str:

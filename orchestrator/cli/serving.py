@@ -94,6 +94,13 @@ def serve(
         int,
         typer.Option(min=0, help="Requests per second that each key may send, twice as many at once; 0: any number."),
     ] = 1000,
+    trust_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are believed; repeatable. "
+            "None by default."
+        ),
+    ] = None,
     submit_rate_limit: Annotated[
         int, typer.Option(min=0, help="SubmitJob requests per second that each key may send (AWS: 50); 0: any number.")
     ] = 0,
@@ -121,6 +128,7 @@ def serve(
         database=database,
         retention=seconds_of("--retention", retention),
         secrets=secrets,
+        trusted_proxies=trust_proxy or (),
     )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -129,6 +137,7 @@ def serve(
     echo(f"Muster serves {server.url}  (API: {server.url}/api/docs)")
     if host in ("0.0.0.0", "::"):
         echo(f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}")
+    echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
     try:
         ended.wait()

@@ -95,7 +95,7 @@ def load_config(home: Path) -> AwsConfig:
 
 def save_config(home: Path, config: AwsConfig) -> Path:
     """Write ``aws.json``; returns its path. Raises OSError."""
-    home.mkdir(parents=True, exist_ok=True)
+    home.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = config_path(home)
     told = {name: value for name, value in asdict(config).items() if value is not None}
     path.write_text(json.dumps(told, indent=1) + "\n")

@@ -137,7 +137,7 @@ class LocalEngine:
         command = [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command]
         container = plan.gang.containers[index] if plan.gang.containers else {}
         said = self._said(plan.gang.name, index)
-        said.parent.mkdir(parents=True, exist_ok=True)
+        said.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open(said, "ab") as stderr:
             process = subprocess.Popen(
                 with_mounts(command, mounts_of(container, plan.gang.store)),

@@ -37,7 +37,7 @@ from tests.conftest import MUSTER, Serving, processes_of
 
 EXAMPLES = int(os.environ.get("MUSTER_FUZZ", "300"))
 IS_LONG = "MUSTER_FUZZ" in os.environ
-TOKEN = "fuzz-token"
+TOKEN = "fuzz-token-for-tests"
 KEPT = {"default", "local", "fuzz", "fair", "spare", "made"}
 """Queues and compute environments that the requests name; others are removed now and then, since there may be only 50."""
 

@@ -19,7 +19,11 @@ from starlette.routing import Route
 from orchestrator.api.auth import Access, Guard
 from orchestrator.api.limits import RateLimit
 from orchestrator.api.permissions import current_identity
+from orchestrator.database import Database
+from orchestrator.home import HomeLock, ServerError
 from orchestrator.keys import KeyStore
+from orchestrator.server import Server
+from orchestrator.tables import JobQueue
 from tests.conformance.test_security import client, refused
 from tests.conftest import Serving, run_muster
 
@@ -103,7 +107,9 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
         key = store.create("a")
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
-        store.delete("a")
+        done = run_muster("keys", "delete", "a", home=tmp_path)
+        assert "deleted key a\nit was the last one" in done.stdout, done.stdout
+        assert "on loopback from its own user" in done.stdout and "does not start until" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
     finally:
         server.close()
@@ -137,10 +143,57 @@ def test_the_rate_counts_each_client_and_submissions_apart(monkeypatch: pytest.M
     assert limit.refusal("b", "submitjob") is None
     now = 101.0
     assert [bool(limit.refusal("a", "listjobs")) for _ in range(12)] == [False] * 10 + [True] * 2
+    failed = [limit.refusal_of_failures("10.0.0.1") for _ in range(150)]
+    assert failed[:100] == [None] * 100 and "wrong token" in str(failed[100])  # whatever the rate for right ones is
+    assert limit.refusal_of_failures("10.0.0.2") is None
     now = 150.0
     limit.refusal("c", "")
     assert len(limit._buckets) == 1
     assert not any(RateLimit(rate=0).refusal("a", "submitjob") for _ in range(5000))
+
+
+@pytest.mark.parametrize("token", ["x", "fifteen-letters", "abababababababababababab"])
+def test_a_token_that_can_be_guessed_is_refused_at_the_start(tmp_path: Path, token: str) -> None:
+    with pytest.raises(ServerError, match="MUSTER_TOKEN is too easy to guess: use at least 16 characters"):
+        Server(tmp_path, token=token)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_proxy_is_trusted_by_its_address_and_only_where_keys_are_demanded(tmp_path: Path) -> None:
+    with pytest.raises(ServerError, match="--trust-proxy: 'proxy' does not appear"):
+        Server(tmp_path, trusted_proxies=["proxy"])
+    with pytest.raises(
+        ServerError, match="--trust-proxy: the server is reachable from other machines: first create a key"
+    ):
+        Server(tmp_path, trusted_proxies=["127.0.0.1"])
+
+
+def test_a_home_directory_is_its_users_alone_and_an_open_one_is_closed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = os.umask(0o022)
+    try:
+        HomeLock(tmp_path / "new").release()
+        assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o700 and not caplog.records
+        for name in ("older", "shared"):
+            (tmp_path / name).mkdir(mode=0o755)
+        (tmp_path / "older" / "controller.lock").touch()
+        (tmp_path / "older" / "muster.db").touch(mode=0o644)
+        (tmp_path / "shared" / "of somebody").touch()
+        for name, mode, words in (("older", 0o700, "it is closed to them now"), ("shared", 0o755, "run chmod 700")):
+            HomeLock(tmp_path / name).release()
+            assert stat.S_IMODE((tmp_path / name).stat().st_mode) == mode
+            [record] = caplog.records
+            assert words in record.message and str(tmp_path / name) in record.message
+            caplog.clear()
+        database = Database.at(tmp_path / "older")
+        with database.session() as session:
+            session.add(JobQueue(name="x", environments=[]))
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "older").glob("muster.db*")}
+        database.close()
+        assert modes == {"muster.db": 0o600, "muster.db-wal": 0o600, "muster.db-shm": 0o600}
+    finally:
+        os.umask(before)
 
 
 def test_the_application_sees_who_asks(tmp_path: Path) -> None:

@@ -356,6 +356,8 @@ def submission(name: str, queue: str, **environment: str) -> dict[str, Any]:
 
 def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_source(world: World) -> None:
     lab, epoch = world.clients["lab"], world.server.home / "store" / "runs" / world.run / "EPOCH"
+    for each in world.clients["admin"].get(f"/api/runs/{world.run}")["jobs"]:
+        world.server.wait(each["id"])
     before = epoch.read_bytes()
     own = world.register("lab", "labs")
     foreign = f"run {world.run} belongs to job queue robots"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import json
 import socket
 from collections.abc import Iterator
@@ -390,7 +391,12 @@ def test_over_the_rate_boto3_is_throttled_and_gets_through_by_trying_again(tmp_p
         with Client(server.url, f"{other.access_key_id}:{other.secret}") as own:
             for _ in range(15):  # our own client tries again by itself
                 own.batch("DescribeJobs", jobs=["x"])
-        wrong = {"Authorization": "Bearer wrong"}  # guessing is limited by the client's address
-        wait_for(lambda: httpx.get(f"{server.url}/api/runs", headers=wrong).status_code == 429, 10, "limited guesses")
+        addresses = (f"10.0.0.{number % 250}" for number in itertools.count())
+
+        def guess() -> int:  # guessing is limited by the client's address, not by the one that it invents
+            headers = {"Authorization": "Bearer wrong", "X-Forwarded-For": next(addresses)}
+            return httpx.get(f"{server.url}/api/runs", headers=headers).status_code
+
+        wait_for(lambda: guess() == 429, 10, "limited guesses")
     finally:
         server.close()

@@ -118,7 +118,7 @@ def test_a_second_controller_on_the_same_home_is_refused(shared_server: Serving)
 
 def test_off_loopback_a_token_is_demanded_and_then_checked(tmp_path: Path) -> None:
     refused(["serve", "--host", "0.0.0.0", "--port", "0"], tmp_path, 1, "set MUSTER_TOKEN")
-    os.environ["MUSTER_TOKEN"] = "secret"
+    os.environ["MUSTER_TOKEN"] = "a-secret-of-this-test"
     try:
         server = Serving(tmp_path / "home", "--host", "0.0.0.0")
     finally:
@@ -126,7 +126,7 @@ def test_off_loopback_a_token_is_demanded_and_then_checked(tmp_path: Path) -> No
     try:
         refused(["list"], server.home, 1, "this token is not known here", MUSTER_TOKEN="wrong")
         refused(["list"], server.home, 1, "a token is needed")
-        assert run_muster("list", home=server.home, MUSTER_TOKEN="secret").returncode == 0
+        assert run_muster("list", home=server.home, MUSTER_TOKEN="a-secret-of-this-test").returncode == 0
     finally:
         server.close()
 
