@@ -24,13 +24,17 @@ from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
+from orchestrator.engines.local_gangs import running_gangs
 from orchestrator.engines.several import Several
 from orchestrator.home import HomeLock, ServerError
 from orchestrator.job_secrets import Secrets, SecretsError
 from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
+from orchestrator.tables import Job
 from shared_store.layout import Store
+
+log = logging.getLogger("muster.controller")
 
 SHORTEST_TOKEN = 16
 """Characters of a token that lets its bearer do everything."""
@@ -105,6 +109,8 @@ class Server:
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
             stack.callback(self.controller.close)
+            if "local" in nodes.names:
+                _name_lost_gangs(home, found)
             self._opened = stack.pop_all()
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
         bound = self._socket.getsockname()[1]
@@ -167,6 +173,20 @@ def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Se
         several = Several(made)
         stack.pop_all()
     return several
+
+
+def _name_lost_gangs(home: Path, database: Database) -> None:
+    """Log gangs of this home that run although the database has no such job: it was deleted, or an older copy was put back."""
+    for gang, pids in running_gangs(home).items():
+        with database.session() as session:
+            if session.get(Job, gang.partition("/")[0]) is not None:
+                continue
+        log.error(
+            "gang %s runs on this machine, but the database has no such job (was it deleted, or replaced by an older copy?); "
+            "nothing watches the gang any more; end it with: kill %s",
+            gang,
+            " ".join(map(str, pids)),
+        )
 
 
 def _check_exposure(option: str, access: Access) -> None:

@@ -159,6 +159,35 @@ def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_i
     assert sum(said in record.getMessage() for record in caplog.records) == 1
 
 
+def test_gangs_of_a_database_that_was_deleted_are_named_at_the_next_start_with_how_to_end_them(
+    home: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with serving(home) as client:
+        known = submit_gang(client, FOREVER)
+        await_status(client, known, "RUNNING")
+    for path in home.glob("muster.db*"):
+        path.unlink()
+    with serving(home) as client:
+        [line] = [record.getMessage() for record in caplog.records if "has no such job" in record.getMessage()]
+        assert line.startswith(f"gang {known}/1/1 runs on this machine") and "end it with: kill " in line
+        other = submit_gang(client, FOREVER)
+        await_status(client, other, "RUNNING")
+    for pid in line.partition("end it with: kill ")[2].split():
+        os.kill(int(pid), signal.SIGTERM)
+    wait_for(lambda: not [pid for pid in processes_of(home) if known in environment(pid)], 30, "its end")
+    with serving(home) as client:
+        client.batch("TerminateJob", jobId=other, reason="enough")
+        await_status(client, other, "FAILED")
+    assert sum("has no such job" in record.getMessage() for record in caplog.records) == 1
+
+
+def environment(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/environ").read_text()
+    except OSError:
+        return ""
+
+
 def test_what_was_committed_into_a_deleted_file_is_not_acknowledged(tmp_path: Path) -> None:
     database = Database.at(tmp_path)
     with pytest.raises(DatabaseError, match="was deleted while the controller runs"), database.session() as session:
