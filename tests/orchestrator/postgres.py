@@ -34,9 +34,10 @@ def serving(binaries: Path) -> Iterator[Server]:
     data, options = directory / "data", f"-p {port} -k {directory} -c listen_addresses=127.0.0.1"
     _as_postgres(str(binaries / "initdb"), "-D", str(data), "-A", "trust", "-U", "muster", "--no-sync")
     control = [str(binaries / "pg_ctl"), "-D", str(data), "-w"]
-    _as_postgres(*control, "-l", str(directory / "log"), "-o", options, "start")
+    start = [*control, "-l", str(directory / "log"), "-o", options, "start"]
+    _as_postgres(*start)
     try:
-        yield Server(port)
+        yield Server(port, start, [*control, "-m", "immediate", "stop"])
     finally:
         _as_postgres(*control, "-m", "immediate", "stop")
         shutil.rmtree(directory, ignore_errors=True)
@@ -45,8 +46,17 @@ def serving(binaries: Path) -> Iterator[Server]:
 class Server:
     """A server that listens on loopback, and lets in anybody."""
 
-    def __init__(self, port: int) -> None:
-        self.port = port
+    def __init__(self, port: int, start: list[str], stop: list[str]) -> None:
+        self.port, self._start, self._stop = port, start, stop
+
+    @contextmanager
+    def away(self) -> Iterator[None]:
+        """It crashes, and is started again at the end."""
+        _as_postgres(*self._stop)
+        try:
+            yield
+        finally:
+            _as_postgres(*self._start)
 
     def new_database(self) -> str:
         """SQLAlchemy URL of an empty database."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from alembic import command
 from alembic.autogenerate import compare_metadata
@@ -22,7 +23,7 @@ from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
 from orchestrator.roster import Roster
 from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
 from shared_store.layout import Store
-from tests.conftest import Serving
+from tests.conftest import Serving, wait_for
 from tests.orchestrator import postgres
 
 NODES = {
@@ -349,6 +350,19 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.
             with pytest.raises(ApiError, match="the database refuses a value") as refused:
                 serving.client.batch(operation, **request)
             assert refused.value.status == 400
+        running = serving.gang("import time; time.sleep(600)", name="running")
+        serving.wait(running, "RUNNING")
+        with server.away():
+            with pytest.raises(ApiError, match="database postgresql") as away:
+                serving.gang("pass")
+            assert away.value.status == 503
+            health = f"{serving.url}/healthz"
+            wait_for(lambda: (a := httpx.get(health)).status_code == 503 and "reason" in a.json(), 30, "its trouble")
+        wait_for(lambda: httpx.get(health).status_code == 200, 30, "that it serves again")
+        assert serving.wait(serving.gang("print('again')"))["status"] == "SUCCEEDED"
+        assert serving.detail(running)["status"] == "RUNNING"
+        serving.client.batch("TerminateJob", jobId=running, reason="enough")
+        serving.wait(running)
         serving.kill()
         serving.start()
         detail = serving.detail(job)
