@@ -20,8 +20,9 @@ from orchestrator.admission import open_attempts, take_snapshot
 from orchestrator.backoff import Backoff
 from orchestrator.bus import Bus
 from orchestrator.clock import Clock
-from orchestrator.database import Database, DatabaseError, ask_to_end
+from orchestrator.database import Database, DatabaseError, DatabaseFull, ask_to_end
 from orchestrator.definition import gang_needs
+from orchestrator.disk import DEFAULT, Disk, MinFree
 from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs, StoreUnavailable
 from orchestrator.jobs import Ending, Status
@@ -61,10 +62,16 @@ class Controller:
         interval: float = 0.2,
         retention: float | None = None,
         clock: Clock | None = None,
+        min_free: MinFree = DEFAULT,
     ) -> None:
-        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept."""
+        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
+        ``min_free``: what must be free on the volumes of the store and the database for something new to start.
+        """
         self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
         self.interval, self.retention = interval, retention
+        volumes = {"store": store.path, "database": database.volume}
+        self.disk = Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
+        self._short = False
         self.roster = Roster()
         self.clock = clock or Clock()
         self.gangs = Gangs(engine, store, bus, peers, self.clock, self.wake)
@@ -263,7 +270,13 @@ class Controller:
     # -- admission ----------------------------------------------------------------------------------------------------
 
     def _admit(self) -> None:
-        """A scheduling pass, where something changed or time has passed."""
+        """A scheduling pass, where something changed or time has passed, and the volumes have room."""
+        shortage = self.disk.shortage()
+        if self._short != (shortage is not None):
+            log.warning("%s", shortage or "the volumes have room again")
+            self._short = shortage is not None
+        if shortage is not None:
+            return
         version, at, took = self._passed
         pause = took / _PASS_SHARE
         idle = time.monotonic() - at
@@ -319,13 +332,23 @@ class Controller:
 
     # -- what the API asks --------------------------------------------------------------------------------------------
 
-    def reason(self, job: str) -> str | None:
-        """Why a job waits just now; None where it is not known to wait."""
+    def check_room(self) -> None:
+        """Raises DatabaseFull where the database's volume has too little room for what is new."""
+        if shortage := self.disk.shortage("database"):
+            raise DatabaseFull(f"{shortage}, and nothing new is accepted")
+
+    def reason(self, job: Job) -> str | None:
+        """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
+        shortage = self.disk.shortage()
+        if job.status in (Status.STARTING, Status.RUNNING) and shortage is not None:
+            return f"{job.status_reason}; {shortage}"
         board = self._board
-        if board is None or self.roster.since(job) is None:
+        if job.status != Status.RUNNABLE or self.roster.since(job.id) is None:
             return None
+        if shortage is not None or board is None:
+            return shortage
         try:
-            return board.reason(job)
+            return board.reason(job.id)
         except KeyError:
             return None  # submitted since the last pass
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -32,15 +33,25 @@ from sqlalchemy.orm import Session
 from orchestrator.jobs import Status
 from orchestrator.tables import Attempt, Base, Job, now
 
-__all__ = ["Attempt", "Base", "Database", "DatabaseError", "Job", "find_job", "now"]
+__all__ = ["Attempt", "Base", "Database", "DatabaseError", "DatabaseFull", "Job", "find_job", "now"]
 
 MIGRATIONS = Path(__file__).parent / "migrations"
+_RESERVE = 5 << 20
+"""Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
+_FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_SHMSIZE")
 _CONTROLLER_LOCK = 0x6D7573746572
 """Key of PostgreSQL's advisory lock: one controller a database."""
 
 
+log = logging.getLogger("muster.controller")
+
+
 class DatabaseError(Exception):
     """The database can't be used; the message says why and what to do."""
+
+
+class DatabaseFull(DatabaseError):
+    """The volume of the database has no room for what is new; what ends jobs is still written."""
 
 
 class Database:
@@ -79,6 +90,7 @@ class Database:
             if self._file is not None:
                 found = self._file.stat()
                 self._identity = found.st_dev, found.st_ino
+                self._reserve()
         except (SQLAlchemyError, ModuleNotFoundError) as error:
             raise DatabaseError(_explain(_shown(url), error)) from None
 
@@ -110,7 +122,14 @@ class Database:
                 self._damage = _explain(self._shown, error)
             elif not isinstance(error, OperationalError | InterfaceError):
                 raise
+            elif _is_full(error):
+                raise DatabaseFull(f"database {self._shown}: its volume is full; make room there") from error
             raise DatabaseError(_explain(self._shown, error)) from error
+
+    @property
+    def volume(self) -> Path | None:
+        """A directory on the volume that the database grows on; None where that is another machine's."""
+        return self._file.absolute().parent if self._file is not None else None
 
     def check(self) -> None:
         """Make sure that the SQLite file is still the one that was opened, and not known to be damaged: two system calls.
@@ -158,6 +177,24 @@ class Database:
     def _check_before_connect(self, *_: object) -> None:
         """SQLite would make a new, empty file in place of one that was deleted."""
         self.check()
+
+    def _reserve(self) -> None:
+        """Have SQLite own room that nobody else on the volume can take: free pages in its file, and a write-ahead log as long as it
+        grows between two checkpoints. With that a controller ends jobs, and records their ends, on a volume without a free byte.
+        """
+        try:
+            with self.engine.connect() as connection:
+                connection.exec_driver_sql("DROP TABLE IF EXISTS muster_reserve")
+                connection.exec_driver_sql("CREATE TABLE muster_reserve (room BLOB)")
+                connection.exec_driver_sql(f"INSERT INTO muster_reserve VALUES (zeroblob({_RESERVE}))")
+                connection.commit()
+                connection.exec_driver_sql("DROP TABLE muster_reserve")
+                connection.commit()
+                connection.exec_driver_sql("PRAGMA wal_checkpoint(RESTART)").close()
+        except OperationalError as error:
+            if not _is_full(error):
+                raise
+            log.warning("database %s: its volume is nearly full; make room there", self._shown)
 
     def close(self) -> None:
         if self._lock is not None:
@@ -226,6 +263,12 @@ def _explain(shown: str, error: Exception) -> str:
         f"database {shown} is damaged ({found}): stop the controller and put a backup in its place, or what "
         f"`sqlite3 {path} .recover` can still read"
     )
+
+
+def _is_full(error: Exception) -> bool:
+    """Whether SQLite or PostgreSQL found no room on its volume."""
+    cause = getattr(error, "orig", None)
+    return getattr(cause, "sqlite_errorname", "") in _FULL or getattr(cause, "sqlstate", "") == "53100"
 
 
 def _first_line(error: Exception) -> str:

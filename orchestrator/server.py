@@ -22,6 +22,7 @@ from orchestrator.api.limits import RATE, RateLimit
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
+from orchestrator.disk import DEFAULT, MinFree
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.local_gangs import running_gangs
@@ -64,11 +65,13 @@ class Server:
         engines: Sequence[str] = ("local",),
         secrets: str | None = None,
         trusted_proxies: Sequence[str] = (),
+        min_free: MinFree = DEFAULT,
     ) -> None:
         """Take the lock, the port, the store, the database and the engines, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
-        ``database``: URL, where it is not the SQLite file of the home directory. ``retention``: seconds for which the history of
+        ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
+        the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of
         jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.job_secrets.Secrets`); None: jobs get none.
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
@@ -91,7 +94,7 @@ class Server:
                     (home / "store").mkdir(mode=0o700)
             self.store = Store(store or home / "store").open()
             try:
-                found = Database(database) if database else Database.at(home)
+                found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)
                 nodes = _make_engines(engines, home, cpus, gpus)
                 stack.callback(nodes.close)
@@ -105,7 +108,9 @@ class Server:
             self.peers = Peers(self.store, home)
             stack.callback(self.peers.close)
             try:
-                self.controller = Controller(found, nodes, self.store, self.bus, self.peers, retention=retention)
+                self.controller = Controller(
+                    found, nodes, self.store, self.bus, self.peers, retention=retention, min_free=min_free
+                )
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
             stack.callback(self.controller.close)
@@ -152,6 +157,10 @@ class Server:
         if self._thread.is_alive():
             self._thread.join(timeout=5)
         self._opened.close()
+
+
+def _database_url(text: str) -> str:
+    return text if "://" in text else f"sqlite:///{Path(text).expanduser().absolute()}"
 
 
 def _take_lock(home: Path) -> HomeLock:

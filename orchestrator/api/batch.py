@@ -59,6 +59,10 @@ _INSTEAD = {
 """What to use for operations that are not here, by a part of their names."""
 
 
+_ADDING = ("Submit", "Register", "Create", "Tag")
+"""How operations begin that need room in the database; the others change or end what is there."""
+
+
 @cache
 def _model() -> Any:
     return botocore.session.Session().get_service_model("batch")
@@ -83,7 +87,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 
 
 def call(controller: Controller, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
-    """Carry out one operation. Raises ClientError."""
+    """Carry out one operation. Raises ClientError; DatabaseFull where it adds something and there is no room for that."""
     handler = OPERATIONS.get(operation)
     if handler is None:
         instead = next((use for part, use in _INSTEAD.items() if part in operation), None)
@@ -103,6 +107,8 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
     def carry_out(session: Session) -> dict[str, Any]:
         return handler(Context(session, controller, idempotency_key), checked)
 
+    if operation.startswith(_ADDING):
+        controller.check_room()
     try:
         if operation == "SubmitJob":
             response = controller.submissions.call(carry_out)

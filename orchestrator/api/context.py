@@ -63,8 +63,8 @@ class Context:
             raise ClientError(str(error)) from None
 
     def reason(self, job: Job) -> str | None:
-        """Why a job waits just now; None where it does not wait for room."""
-        return self.controller.reason(job.id) if job.status == "RUNNABLE" else None
+        """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
+        return self.controller.reason(job)
 
 
 def find_run(controller: Controller, name: str) -> Run:

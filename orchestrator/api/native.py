@@ -177,7 +177,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
             ),
             "status": job.status,
-            "statusReason": controller.reason(job.id) or job.status_reason,
+            "statusReason": controller.reason(job) or job.status_reason,
             "queue": job.queue,
             "share": job.share,
             "createdAt": job.created_at,

@@ -18,8 +18,9 @@ from orchestrator.cli.jobs import SetOption, SpecArgument, on_engine, submit_spe
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, Unreachable
+from orchestrator.disk import DEFAULT, MinFree
 from orchestrator.home import ServerError, local_url, muster_home
-from orchestrator.spec import seconds_of
+from orchestrator.spec import SpecError, seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 EngineOption = Annotated[
@@ -83,13 +84,22 @@ def serve(
     database: Annotated[
         str | None,
         typer.Option(
-            envvar="MUSTER_DATABASE", help="postgresql+psycopg://USER@HOST/NAME; $MUSTER_HOME/muster.db by default."
+            envvar="MUSTER_DATABASE",
+            help="postgresql+psycopg://USER@HOST/NAME, or path of an SQLite file on a local disk; $MUSTER_HOME/muster.db by default.",
         ),
     ] = None,
     retention: Annotated[
         str | None,
         typer.Option(help="How long the history of finished jobs is kept, such as 90d; for ever by default."),
     ] = None,
+    min_free: Annotated[
+        str,
+        typer.Option(
+            help="What must be free on the volumes of the store and the database for a gang to start, such as 1GiB or 5%; 0: "
+            "nothing. By default 1GiB, of a small volume 5%.",
+            show_default=False,
+        ),
+    ] = "",
     rate_limit: Annotated[
         int,
         typer.Option(min=0, help="Requests per second that each key may send, twice as many at once; 0: any number."),
@@ -129,6 +139,7 @@ def serve(
         retention=seconds_of("--retention", retention),
         secrets=secrets,
         trusted_proxies=trust_proxy or (),
+        min_free=_min_free(min_free),
     )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -144,6 +155,13 @@ def serve(
     finally:
         server.close()
     echo("stopped; running jobs go on and the next `muster serve` finds them")
+
+
+def _min_free(text: str) -> MinFree:
+    try:
+        return MinFree.parse(text) if text else DEFAULT
+    except ValueError as error:
+        raise SpecError(f"--min-free {text}: {error}") from None
 
 
 @contextlib.contextmanager
