@@ -1,7 +1,8 @@
-"""How long a printed line takes to a client of CloudWatch Logs: ``python -m benchmarks.log_follow [lines]``.
+"""How fast logs are read: ``python -m benchmarks.log_follow [lines]``.
 
 A gang of three nodes prints the time, ``lines`` times in all; a follower reads it with nothing but HTTP, as boto3 would. A line's
-latency is from just before ``print`` in the rank to the client that has parsed it. Prints a Markdown table.
+latency is from just before ``print`` in the rank to the client that has parsed it. Then the logs of jobs that have printed many
+lines are read from beginning to end. Prints Markdown tables.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ PAUSE = 0.02
 """Seconds between two lines of a node."""
 POLL = 0.2
 """Seconds between two polls of a FilterLogEvents follower."""
+MANY = 300_000
+"""Lines of a job whose log is read whole."""
+_FLOOD = "for i in range({lines}): print('line', i, 'of the log of a program that prints much')"
+_LAST = "\nimport os, time\nif os.environ['NODE_RANK'] == '0': time.sleep(5)"
+"""The main node, whose end ends the others, waits for them."""
 _SCRIPT = """
 import time
 time.sleep(3)
@@ -84,22 +90,64 @@ def latencies(texts: Iterator[str], sources: int) -> list[float]:
 
 def follow(url: str, lines: int, texts: Callable[[str], Iterator[str]], sources: int) -> list[float]:
     """One gang and one follower of it, which is there before the first line: latencies [s], sorted."""
-    container = {
-        "image": "any",
-        "command": ["python", "-u", "-c", _SCRIPT.format(lines=-(-lines // NODES), pause=PAUSE)],
-        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
-    }
-    ranges = [{"targetNodes": "0:", "container": container}]
-    properties = {"numNodes": NODES, "mainNode": 0, "nodeRangeProperties": ranges}
+    script = _SCRIPT.format(lines=-(-lines // NODES), pause=PAUSE)
     with Client(url) as client:
-        client.batch("RegisterJobDefinition", jobDefinitionName="ticker", type="multinode", nodeProperties=properties)
-        job = client.batch("SubmitJob", jobName="ticker", jobQueue="default", jobDefinition="ticker")["jobId"]
+        job = submit(client, "ticker", script, NODES)
         while client.get(f"/api/jobs/{job}")["status"] != "RUNNING":
             time.sleep(0.1)
         found = latencies(texts(f"ticker/{job}/1/node-"), sources)
-        while client.get(f"/api/jobs/{job}")["status"] == "RUNNING":
-            time.sleep(0.1)
+        finish(client, job)
     return sorted(found)
+
+
+def submit(client: Client, name: str, script: str, nodes: int) -> str:
+    container = {
+        "image": "any",
+        "command": ["python", "-u" if name == "ticker" else "-P", "-c", script],
+        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
+    }
+    ranges = [{"targetNodes": "0:", "container": container}]
+    properties = {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": ranges}
+    client.batch("RegisterJobDefinition", jobDefinitionName=name, type="multinode", nodeProperties=properties)
+    return str(client.batch("SubmitJob", jobName=name, jobQueue="default", jobDefinition=name)["jobId"])
+
+
+def finish(client: Client, job: str) -> None:
+    while client.get(f"/api/jobs/{job}")["status"] not in ("SUCCEEDED", "FAILED"):
+        time.sleep(0.1)
+
+
+def rates(url: str, home: str) -> list[tuple[str, int, float]]:
+    """What reads, how many lines, and how many in a second."""
+    rows = []
+    with Client(url) as client:
+        for nodes in (1, NODES):
+            job = submit(client, f"flood-{nodes}", _FLOOD.format(lines=MANY // nodes) + _LAST, nodes)
+            finish(client, job)
+            what = "one node" if nodes == 1 else f"{nodes} nodes merged"
+            for name, read in (
+                ("GET /api/jobs/X/logs", lambda job=job: received(url, job)),
+                ("GET …?follow=true", lambda job=job: received(url, job, follow="true")),
+                ("orchestrator.client", lambda job=job: sum(map(len, client.log_batches(job)))),
+                ("muster logs", lambda job=job: printed(url, home, job)),
+            ):
+                began = time.monotonic()
+                count = read()
+                rows.append((f"{name}, {what}", count, count / (time.monotonic() - began)))
+    return rows
+
+
+def received(url: str, job: str, **query: str) -> int:
+    """Lines that a client gets which does nothing with them."""
+    with httpx.stream("GET", f"{url}/api/jobs/{job}/logs", params=query, timeout=120) as answer:
+        return sum(chunk.count(b"\n") for chunk in answer.iter_bytes())
+
+
+def printed(url: str, home: str, job: str) -> int:
+    """Lines that the command prints."""
+    environment = {**os.environ, "MUSTER_HOME": home, "MUSTER_URL": url}
+    done = subprocess.run([MUSTER, "logs", job], env=environment, stdout=subprocess.PIPE, check=True)
+    return done.stdout.count(b"\n")
 
 
 def measure(url: str, lines: int) -> list[tuple[str, list[float]]]:
@@ -132,7 +180,8 @@ def main() -> None:
         )
         try:
             assert server.stdout is not None
-            rows = measure(server.stdout.readline().split()[2], lines)
+            url = server.stdout.readline().split()[2]
+            rows, read = measure(url, lines), rates(url, home)
         finally:
             server.terminate()
             server.wait()
@@ -143,6 +192,11 @@ def main() -> None:
     for name, values in rows:
         middle, high = values[len(values) // 2] * 1000, values[int(len(values) * 0.99)] * 1000
         print(f"| {name} | {len(values)} | {middle:.0f} ms | {high:.0f} ms |")
+    print()
+    print("| a whole log read by | lines | lines/s |")
+    print("|---|---|---|")
+    for name, count, rate in read:
+        print(f"| {name} | {count} | {round(rate, -3):.0f} |")
 
 
 if __name__ == "__main__":
