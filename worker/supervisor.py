@@ -242,11 +242,7 @@ class Supervisor:
     def _lose(self, data: bytes, error: OSError) -> None:
         why = error.strerror or str(error)
         if not self._lost[0] and time.monotonic() >= self._complain:
-            print(
-                f"log of node {self.contract.node_index} can't be written: {why}",
-                file=sys.stderr,
-                flush=True,
-            )
+            _tell(f"log of node {self.contract.node_index} can't be written: {why}")
             self._complain = time.monotonic() + _COMPLAINTS
         self._lost = (self._lost[0] + data.count(b"\n"), self._lost[1] + len(data), why)
 
@@ -320,8 +316,14 @@ class Supervisor:
         try:
             write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
         except OSError as error:
-            print(f"outcome of node {outcome.node} can't be written: {error.strerror}", file=sys.stderr, flush=True)
+            _tell(f"outcome of node {outcome.node} can't be written: {error.strerror}")
         return outcome.exit_code
+
+
+def _tell(text: str) -> None:
+    """One line on standard error, which may lie on the very volume that is full; nothing is kept to fail again at the exit."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{text}\n".encode(errors="backslashreplace"))
 
 
 def main(argv: list[str], make: Callable[[NodeContract, Run, list[str]], Supervisor] = Supervisor) -> int:

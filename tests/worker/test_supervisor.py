@@ -92,6 +92,16 @@ def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> N
     assert n.stderr.read_text() == "log of node 0 can't be written: No space left on device\n"
 
 
+def test_where_nothing_at_all_can_be_written_the_exit_code_is_still_the_rank_s(node: Nodes) -> None:
+    n = node()
+    log = n.run.log("job", 1, 0)
+    log.parent.mkdir(parents=True)
+    log.symlink_to("/dev/full")
+    (n.run.path / "outcomes").write_text("a file where a directory should be")
+    n.stderr.symlink_to("/dev/full")
+    assert n.python("print('x')\nraise SystemExit(5)") == 5
+
+
 def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: Nodes) -> None:
     n = node()
     write, least = "import time\nfor i in range(150): print(f'{i:03d}', 'x' * 100, 'end'); time.sleep(0.01)", 5000
