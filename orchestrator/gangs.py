@@ -46,6 +46,10 @@ _FAILED_GRACE = 5.0
 """The same for a gang whose collectives are broken: there is nothing left to save."""
 LOST = 20.0
 """Seconds without a node's token on the bus, while the engine says that it runs, after which the gang is started again."""
+_MARGIN = 5.0
+"""Seconds that an engine waits beyond the grace time: supervisors count it too, and record what did not leave in time."""
+_CAUSE_PATIENCE = 90.0
+"""Seconds for which a gang that has lost nodes which were told to end waits for the end of the node that is the cause."""
 _FINISHING = 10.0
 """Seconds that children of a native job get to end by themselves after the main node is done."""
 _SHORTEST_REQUEUE = 10_000
@@ -76,6 +80,8 @@ class Gangs:
         self._finished: dict[tuple[str, int], float] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
         """Why the engine could not stop an attempt's gang when it was last asked."""
+        self._uncertain: dict[tuple[str, int], float] = {}
+        """Since when all nodes that are known to have failed were told to end."""
 
     def begin(self, session: Session, job: Job, start: Start) -> None:
         """Record a new attempt, then launch it: a crash in between is mended by the next pass, which finds no handle.
@@ -238,7 +244,7 @@ class Gangs:
             verdict = judge(needs.on_child_failure, main, ends)
         else:
             verdict = judge_as_aws(main, ends, attempt.nodes[main]["host"])
-        if verdict:
+        if verdict and (verdict.certain or self._cause_is_overdue(job, attempt)):
             return verdict
         if job.stop_reason is not None:
             return Verdict(Ending.STOPPED, job.stop_reason)
@@ -254,6 +260,11 @@ class Gangs:
         if job.timeout and attempt.running_since and self.clock.now() - attempt.running_since > job.timeout * 1000:
             return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
         return None
+
+    def _cause_is_overdue(self, job: Job, attempt: Attempt) -> bool:
+        """Whether it has been waited long enough for the end of the node that made the others end."""
+        since = self._uncertain.setdefault((job.id, attempt.number), time.monotonic())
+        return time.monotonic() - since > _CAUSE_PATIENCE
 
     def _ends(self, job: Job, attempt: Attempt, status: GangStatus) -> list[NodeEnd | None]:
         """How each node ended: by the outcome in the store, else by what the engine saw; noted in the attempt's record."""
@@ -275,6 +286,7 @@ class Gangs:
                         node.detail if starved else outcome.reason,
                         outcome.error.time if outcome.error else outcome.ended,
                         message,
+                        asked=outcome.asked,
                     )
                 else:
                     code = 137 if node.exit_code in (None, 0) else node.exit_code
@@ -304,7 +316,7 @@ class Gangs:
         """
         key = (job.id, attempt.number)
         if key not in self._stops and not self._denied.waits(key):
-            grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE
+            grace = _FAILED_GRACE if attempt.ending in (Ending.FAILED, Ending.FATAL) else GRACE + _MARGIN
             assert attempt.handle is not None
             self._stops[key] = self._stop(attempt.handle, grace)
         if key in self._stops and self._stops[key].done():
@@ -335,6 +347,7 @@ class Gangs:
             self._close_attempt(session, job, attempt, verdict, ends)
         key = (job.id, attempt.number)
         self._finished.pop(key, None)
+        self._uncertain.pop(key, None)
         self._denied.worked(key)
         self.bus.forget(*key)
         with suppress(OSError):  # while this controller lives, another one may then say that the run is written

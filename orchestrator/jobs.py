@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.outcomes import EX_TEMPFAIL, first_cause
 
 
 class Status(StrEnum):
@@ -72,6 +72,8 @@ class NodeEnd:
     """Message of the node's first error."""
     lost: bool = False
     """Nobody saw the end: the node vanished, with its host as far as anyone knows."""
+    asked: bool = False
+    """The node was told to end: why is to be found elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class Verdict:
     ending: Ending
     reason: str
     exit_code: int | None = None
+    certain: bool = True
+    """False while only nodes that were told to end have been seen to end: what made them end may be seen later."""
 
 
 AWS_EXITED = "Essential container in task exited"
@@ -114,9 +118,7 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
         main: Index of the main node.
         ends: By node index; None for a node that runs or has not started.
     """
-    failures = [
-        (end.ended, index, end) for index, end in enumerate(ends) if end and end.exit_code not in (0, EX_TEMPFAIL)
-    ]
+    failures = [(index, end) for index, end in enumerate(ends) if end and end.exit_code not in (0, EX_TEMPFAIL)]
     head = ends[main]
     if head is not None and head.exit_code == 0:
         return Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
@@ -127,9 +129,10 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
     if not failures or policy == "ignore":
         return None
     # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
-    _, index, first = min(failures)
+    index, first = failures[first_cause([(end.asked, end.ended) for _, end in failures])]
     ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
-    return Verdict(ending, f"{'main node' if index == main else f'node {index}'}: {first.reason}", first.exit_code)
+    reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
+    return Verdict(ending, reason, first.exit_code, certain=head is not None or not first.asked)
 
 
 def main_container(job_nodes: Sequence[dict[str, Any]], main: int) -> dict[str, Any]:

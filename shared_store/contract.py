@@ -13,6 +13,27 @@ from shared_store.log_files import LIMIT
 
 BUS_VARIABLES = ("MUSTER_BUS", "MUSTER_BUS_TOKEN")
 """For the node's supervisor only: the job's own program does not get them."""
+_FOR_RANKS = "MUSTER_RANK_ENV_"
+"""Prefix of the job's own variables on their way through the supervisor."""
+
+
+def sealed(job: Mapping[str, str], contract: Mapping[str, str]) -> dict[str, str]:
+    """The variables of a node's supervisor: the contract, and the job's own so that they take effect in its ranks only.
+
+    A job's ``PYTHONPATH``, ``LD_PRELOAD`` or ``TMPDIR`` must not change what supervises it. The contract wins over the job.
+    """
+    return {**{f"{_FOR_RANKS}{name}": value for name, value in job.items() if name not in contract}, **contract}
+
+
+def job_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """The job's own variables among those of its supervisor."""
+    return {name[len(_FOR_RANKS) :]: value for name, value in environment.items() if name.startswith(_FOR_RANKS)}
+
+
+def rank_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables of a rank, from those of its supervisor: the job's own stand over what the node inherited."""
+    inherited = {name: value for name, value in environment.items() if not name.startswith(_FOR_RANKS)}
+    return {**inherited, **job_variables(environment)}
 
 
 class ContractError(Exception):

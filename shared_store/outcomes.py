@@ -5,6 +5,7 @@ A controller that was down when a gang ended reads here what the engine can't te
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -46,6 +47,20 @@ class Outcome:
     started: float
     ended: float
     """Unix times [s] of the first rank's start and of the last rank's end."""
+    asked: bool = False
+    """Its ranks ended because they were told to: what made the gang end is elsewhere. Outcomes of older versions lack it."""
+
+
+def first_cause(ends: Sequence[tuple[bool, float]]) -> int:
+    """Which of several failures made the others happen: the first by time of those that nobody asked for, else the first of all.
+
+    Args:
+        ends: Of each failure whether it was asked to end, and when it ended (Unix time [s]). Not empty.
+
+    Returns:
+        Its index in ``ends``; of equal ones the smallest.
+    """
+    return min(range(len(ends)), key=lambda index: ends[index])
 
 
 def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
@@ -67,6 +82,8 @@ def parse_outcome(value: dict[str, Any]) -> Outcome:
     error = FirstError(**value["error"]) if value.get("error") else None
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
+    if not isinstance(outcome.asked, bool):
+        raise TypeError("asked is of the wrong type")
     if not 0 <= outcome.exit_code <= 255:
         raise TypeError("exit_code is not one of a process")
     if error is not None:

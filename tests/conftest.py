@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -74,6 +75,24 @@ def wait_for(condition: Callable[[], Any], timeout: float = 60, what: str = "con
             return value
         time.sleep(0.05)
     raise AssertionError(f"{what}: not within {timeout * PATIENCE} s")
+
+
+@contextlib.contextmanager
+def frozen(pid: int) -> Iterator[None]:
+    """A process in state D that SIGKILL does not end until this is left: what version 1 of the freezer does."""
+    directory = Path("/sys/fs/cgroup/freezer") / f"muster-test-{os.getpid()}"
+    try:
+        directory.mkdir()
+        (directory / "cgroup.procs").write_text(str(pid))
+    except OSError:
+        pytest.skip("this process can't freeze others (cgroup v1 freezer)")
+    try:
+        (directory / "freezer.state").write_text("FROZEN")
+        yield
+    finally:
+        (directory / "freezer.state").write_text("THAWED")
+        wait_for(lambda: not (directory / "cgroup.procs").read_text(), 20, "an empty freezer")
+        directory.rmdir()
 
 
 class Serving:

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
-from shared_store.contract import ContractError, NodeContract
+from shared_store.contract import ContractError, NodeContract, job_variables, sealed
 from shared_store.epoch import Claim, StaleEpoch, raise_epoch, read_claim, read_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.logs import OUTCOME_LINE, format_line, format_lines
@@ -59,7 +59,7 @@ class AwsSupervisor(supervisor.Supervisor):
         if self._loss is None or self.stopping != self._loss.reason:
             return outcome  # a rank of this node was first
         code = outcome.exit_code if outcome.exit_code not in (0, EX_TEMPFAIL) else self._loss.exit_code
-        return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None)
+        return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None, asked=True)
 
     def _commit(self, outcome: Outcome) -> int:
         code = super()._commit(outcome)
@@ -107,7 +107,8 @@ def complete(env: Mapping[str, str]) -> tuple[NodeContract, dict[str, str]]:
     else:
         kept = {name: value for name, value in kept.items() if name not in _NODE_VARIABLES}
         ours["AWS_BATCH_JOB_ID"] = env.get("AWS_BATCH_JOB_ID", contract.job).partition("#")[0]
-    return contract, {**kept, **variables, **ours, "AWS_BATCH_JOB_ATTEMPT": str(contract.attempt)}
+    ours["AWS_BATCH_JOB_ATTEMPT"] = str(contract.attempt)
+    return contract, {**kept, **variables, **sealed(job_variables(env), ours)}
 
 
 def own_address(env: Mapping[str, str]) -> str:

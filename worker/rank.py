@@ -41,6 +41,10 @@ class Rank:
         self.running = False
         self.overdue = False
         """Killed because it did not leave in time."""
+        self.asked = False
+        """It was told to end before it was seen to have ended: its end is not the cause of anything."""
+        self.stuck: str | None = None
+        """Names the processes of it that SIGKILL does not end, and where they are."""
         self.exit_code = 0
         self.signal_name: str | None = None
         self.ended = 0.0
@@ -116,6 +120,11 @@ class Rank:
             self.signal_name = _signal_name(-code)
         return True
 
+    def give_up(self, stuck: str) -> None:
+        """It does not end from SIGKILL: count it as ended, for the reason ``stuck``."""
+        self.running, self.ended, self.stuck = False, time.time(), stuck
+        self.exit_code, self.signal_name = 128 + signal.SIGKILL, "SIGKILL"
+
     def read(self, stream: str) -> list[str] | None:
         """The whole lines printed since the last call; None at the end of the stream."""
         try:
@@ -187,6 +196,8 @@ class Rank:
         """Why the rank ended, in one line."""
         if self.stalled:
             return f"rank {self.number} {self.stalled}"
+        if self.stuck:
+            return f"rank {self.number} was killed and is still there: {self.stuck}"
         if self.overdue:
             return f"rank {self.number} did not leave within {grace:g} s of SIGTERM and was killed"
         if self.signal_name:

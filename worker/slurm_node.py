@@ -1,4 +1,4 @@
-"""A node of a gang on Slurm: what is known only where Slurm has placed it, then the supervisor in this process's place.
+"""A node of a gang on Slurm: what is known only where Slurm has placed it, then the supervisor's shim in this process's place.
 
 ``python -m worker.slurm_node meet``, in the batch script, on the first node: prints the nodes' addresses in the order of the tasks
 and a port, as JSON. ``python -m worker.slurm_node node MEETING``, as a task: reads what the controller says from standard input. The
@@ -19,8 +19,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from shared_store.contract import NodeContract
-from shared_store.tied import follow
+from shared_store.contract import NodeContract, sealed
+from shared_store.shim import shimmed
 from worker.network import address_towards
 
 _PORTS, _SLOTS, _EACH = 20000, 600, 20
@@ -89,13 +89,15 @@ def environment_of(told: Mapping[str, Any], contract: NodeContract, given: Mappi
         "CUDA_VISIBLE_DEVICES": "",  # Slurm sets it where it gave GPUs, and does not hide them where it gave none
         **given,
         "PATH": f"{Path(sys.executable).parent}:{given.get('PATH', '/usr/bin:/bin')}",
-        **told["kinds"][told["kind"][contract.node_index]]["environment"],
-        **contract.to_env(),
+        **sealed(told["kinds"][told["kind"][contract.node_index]]["environment"], contract.to_env()),
     }
 
 
 def start(meeting: Mapping[str, Any]) -> NoReturn:
-    """Become the node's supervisor. Raises OSError, ValueError: one line each."""
+    """Become the shim of the node's supervisor. Raises OSError, ValueError: one line each.
+
+    Without a control group of Muster's: Slurm looks for a step's processes in its own.
+    """
     told = json.load(sys.stdin)
     contract = contract_of(told, meeting, int(os.environ["SLURM_PROCID"]))
     environment = environment_of(told, contract, os.environ)
@@ -104,9 +106,9 @@ def start(meeting: Mapping[str, Any]) -> NoReturn:
         os.chdir(told["directory"])
     devnull = os.open(os.devnull, os.O_RDONLY)
     os.dup2(devnull, 0)
-    # the tie holds over exec: where Slurm's process on this host dies, the supervisor dies, and its ranks with it
-    follow(os.getppid())
-    os.execve(sys.executable, [sys.executable, "-P", "-m", "worker.supervisor", "--", *command], environment)
+    # where Slurm's process on this host dies, the shim ends the node
+    shim = shimmed([sys.executable, "-P", "-m", "worker.supervisor", "--", *command], tied_to=os.getppid())
+    os.execve(shim[0], shim, environment)
 
 
 def main(argv: list[str]) -> int:

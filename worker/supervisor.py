@@ -18,15 +18,18 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
+from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract, rank_variables
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
 from shared_store.logs import END_LINE, format_line, format_lines
-from shared_store.outcomes import EX_TEMPFAIL, Outcome, write_outcome
+from shared_store.nodes import end_descendants
+from shared_store.outcomes import EX_TEMPFAIL, Outcome, first_cause, write_outcome
+from shared_store.processes import PATIENCE, find_process, unkillable
+from shared_store.shim import SCRATCH
 from worker.bus import Command, NodeBus
 from worker.network import interface_of
-from worker.processes import adopt_orphans, kill_group, reap_orphans
+from worker.processes import adopt_orphans, kill_group
 from worker.rank import Rank
 from worker.stacks import dump_stacks, state_of
 
@@ -43,6 +46,7 @@ _COMPLAINTS = 60.0
 """Seconds between two lines on standard error about a log that can't be written."""
 _PATIENCE = 1800.0
 """Seconds that a training may take to start, and to finish after its last iteration."""
+_ASKED = "asked to leave"
 _STATES = {
     "R": "it runs",
     "D": "it waits for a device or the store",
@@ -77,7 +81,7 @@ class Supervisor:
         self._wakeup, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._catch_signals(write_end)
         self.bus = NodeBus(self.contract, write_end)
-        with tempfile.TemporaryDirectory(prefix="muster-node-") as scratch:
+        with tempfile.TemporaryDirectory(prefix=SCRATCH.format(pid=os.getpid())) as scratch:
             try:
                 self._start_ranks(Path(scratch))
             except OSError as error:
@@ -89,13 +93,13 @@ class Supervisor:
                     )
                 )
             if self.stopping:  # asked while the ranks were being started: they have not heard it
-                for rank in self.ranks:
-                    kill_group(rank.pid, signal.SIGTERM)
+                self._ask_ranks()
             while any(rank.running for rank in self.ranks):
                 self._read(timeout=0.1)
                 self._watch()
                 self._serve_bus()
-            reap_orphans()
+            if left := end_descendants():
+                self.write(None, "e", unkillable(left))
             self._drain()
             outcome = self._outcome(started)
         self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
@@ -107,16 +111,21 @@ class Supervisor:
         """Kill everything at once and write nothing more: the run belongs to a newer attempt."""
         for rank in self.ranks:
             kill_group(rank.pid, signal.SIGKILL)
-        reap_orphans()
+        end_descendants()
 
     def stop(self, why: str, grace: float) -> None:
         """Ask every rank to leave; those that are still here ``grace`` seconds later are killed."""
         if self.deadline is None:
             self.stopping = why
             self.deadline = time.monotonic() + grace
-            for rank in self.ranks:
-                if rank.running:
-                    kill_group(rank.pid, signal.SIGTERM)
+            self._ask_ranks()
+
+    def _ask_ranks(self) -> None:
+        for rank in self.ranks:
+            rank.poll()  # one that has ended by itself was not asked
+            if rank.running:
+                rank.asked = rank.stalled is None
+                kill_group(rank.pid, signal.SIGTERM)
 
     # -- ranks --------------------------------------------------------------------------------------------------------
 
@@ -133,9 +142,8 @@ class Supervisor:
         for local in range(contract.ranks_per_node):
             rank = Rank(contract, local, scratch / f"error-{local}.json")
             # what the user set in the job's environment stands; the bus is the supervisor's alone
-            given = {name: value for name, value in os.environ.items() if name not in BUS_VARIABLES}
-            env = {**shared, **given, **rank.environment()}
-            rank.start(self.command, env)
+            given = {name: value for name, value in rank_variables(os.environ).items() if name not in BUS_VARIABLES}
+            rank.start(self.command, {**shared, **given, **rank.environment()})
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))
@@ -148,11 +156,13 @@ class Supervisor:
                 self.stop(f"rank {rank.number} failed", _PEER_GRACE)
             elif rank.running and self.deadline is None and self._stalls(rank):
                 self.stop(f"rank {rank.number} stalls", 0.0)
-        if self.deadline is not None and time.monotonic() >= self.deadline:
+        if self.deadline is not None and (late := time.monotonic() - self.deadline) >= 0:
             for rank in self.ranks:
                 if rank.running:
                     rank.overdue = True
                     kill_group(rank.pid, signal.SIGKILL)
+                    if late > PATIENCE and (process := find_process(rank.pid)):
+                        rank.give_up(unkillable([process]))
 
     def _stalls(self, rank: Rank) -> bool:
         """Whether the rank has told of no iteration for too long; then its stacks are in the log."""
@@ -214,7 +224,7 @@ class Supervisor:
     def _catch_signals(self, write_end: int) -> None:
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, lambda _number, _frame: self.stop("asked to leave", self.contract.grace))
+            signal.signal(number, lambda _number, _frame: self.stop(_ASKED, self.contract.grace))
         signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
         self.selector.register(self._wakeup, selectors.EVENT_READ, None)
 
@@ -298,7 +308,8 @@ class Supervisor:
 
     def _outcome(self, started: float) -> Outcome:
         failed = [rank for rank in self.ranks if rank.exit_code not in (0, EX_TEMPFAIL)]
-        first = min(failed, key=lambda rank: (rank.stalled is None, rank.ended), default=None)
+        ends = [(self._was_asked(rank), rank.ended) for rank in failed]
+        first = failed[first_cause(ends)] if failed else None
         if first:
             code, reason, error = first.exit_code, first.reason(self.contract.grace), first.first_error()
         elif any(rank.exit_code == EX_TEMPFAIL for rank in self.ranks):
@@ -306,7 +317,13 @@ class Supervisor:
         else:
             code, reason, error = 0, "done", None
         name = first.signal_name if first else None
-        return Outcome(self.contract.node_index, self.contract.epoch, code, name, reason, error, started, time.time())
+        asked = first is not None and self._was_asked(first)
+        node, epoch = self.contract.node_index, self.contract.epoch
+        return Outcome(node, epoch, code, name, reason, error, started, time.time(), asked)
+
+    def _was_asked(self, rank: Rank) -> bool:
+        """Some engines send SIGTERM to the ranks themselves, too: one may be gone before this process knows."""
+        return rank.asked or (self.stopping == _ASKED and rank.signal_name == "SIGTERM")
 
     def _commit(self, outcome: Outcome) -> int:
         with contextlib.suppress(OSError):

@@ -8,6 +8,7 @@ checkpoints stay on the volume.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import threading
 import time
@@ -31,6 +32,8 @@ from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outc
 
 _OVER = ("SUCCEEDED", "FAILED")
 _PORT = 29500
+_GRACE = 25.0
+"""Grace time [s] of a supervisor: AWS kills containers after 30, and it has to record what did not leave in time before that."""
 _CAPACITY_AGE = 60.0
 """Seconds for which AWS's answer about its size is kept."""
 _STRAGGLE = 180.0
@@ -207,6 +210,7 @@ class AwsBatchEngine:
     # -- starting -----------------------------------------------------------------------------------------------------
 
     def _planned(self, gang: Gang) -> tuple[Plan, Requests]:
+        gang = dataclasses.replace(gang, grace=min(gang.grace, _GRACE))
         nodes = node_plans(gang, ["given by AWS"] * len(gang.placements), _PORT)
         requests = requests_for(gang, nodes, self.config.with_options(gang.options))
         return Plan(gang, nodes, requests.document()), requests

@@ -14,6 +14,7 @@ from typing import Any
 from orchestrator.engines.aws_config import AwsConfig
 from orchestrator.engines.base import EngineError, Gang, NodePlan
 from shared_store import __version__
+from shared_store.contract import sealed
 
 DIGEST, GANG = "muster:digest", "muster:gang"
 """Tags: of a definition, of what it says; of a job, the attempt that it is."""
@@ -176,11 +177,11 @@ def _volume(config: AwsConfig) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _supervised(environment: Mapping[str, str], config: AwsConfig) -> dict[str, str]:
-    """Muster's own variables travel as one: on whatever plays AWS they must not be taken for its own."""
+    """Muster's own variables travel as one: on whatever plays AWS they must not be taken for its own. The rest is the ranks' alone."""
     own = {name: value for name, value in environment.items() if name.startswith("MUSTER_")}
     rest = {name: value for name, value in environment.items() if name not in own}
     kernels = {"WARP_CACHE_PATH": f"{config.store}/kernels"}  # compiled once a kind of GPU, not once an instance
-    return {**kernels, **rest, "MUSTER_ENVIRONMENT": json.dumps(own, separators=(",", ":"))}
+    return {**sealed(kernels | rest, {}), "MUSTER_ENVIRONMENT": json.dumps(own, separators=(",", ":"))}
 
 
 def _node(gang: Gang, node: NodePlan, config: AwsConfig) -> str:

@@ -1,20 +1,23 @@
 """The local engine: nodes are process groups on this machine, each with its own loopback address and its share of it.
 
-Supervisors outlive the controller. A restarted controller finds them again by pid and start time, and every process of a gang
-by the gang's name in its environment.
+Each supervisor has a shim as its parent (:mod:`shared_store.shim`), and a control group where these can be made. Both outlive the
+controller. A restarted controller finds the shims again by pid and start time, what a node leaves behind by its control group and by
+the gang's name in its environment.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from orchestrator.engines.base import (
@@ -31,12 +34,21 @@ from orchestrator.engines.base import (
 )
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
+from shared_store.cgroups import own_group
+from shared_store.contract import sealed
 from shared_store.layout import Store
+from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
+from shared_store.processes import find_process, marked, unkillable
+from shared_store.shim import STUCK, group_of, shimmed
+
+log = logging.getLogger("muster.engines")
 
 _FIRST_PORT = 29500
 _UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
 """What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
+_REMEMBERED = 256
+"""Gangs whose nodes' ends are known after they were stopped: the controller asks once more when all has ended."""
 
 
 class LocalEngine:
@@ -63,6 +75,9 @@ class LocalEngine:
             machine=HERE,
         )
         self._children: dict[int, subprocess.Popen[bytes]] = {}
+        self._groups = own_group()
+        """Directory in which control groups of nodes are made; empty where they can't be."""
+        self._ended: dict[str, GangStatus] = {}
 
     def capacity(self) -> Sequence[Host]:
         return [self._host]
@@ -76,18 +91,24 @@ class LocalEngine:
         if gang.directory and not Path(gang.directory).is_dir():
             raise EngineError(f"working directory {gang.directory} is not on this machine")
         master = plan.nodes[gang.main].contract.master_address
-        found = _supervisors(gang.name)
-        running = {index: pid for pid, index, _ in found}
+        found = _shims(gang.name)
         # a node that is started late must meet the others where they are
-        port = found[0][2] if found else _free_port(master)
+        port = next((shim.port for shim in found.values()), 0) or _free_port(master)
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
         before = set(self._children)
         try:
             for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
-                ended = index not in running and read_outcome(run, gang.job, gang.attempt, index) is not None
-                pid = 0 if ended else running.get(index) or self._start(plan, index, port)
-                nodes[index] = {"pid": pid, "start": _start_time(pid), "address": plan.nodes[index].contract.address}
+                if index in found:
+                    pid, group = found[index].pid, found[index].group
+                elif read_outcome(run, gang.job, gang.attempt, index) is not None:
+                    pid, group = 0, ""
+                else:
+                    group = self._group(gang.name, index)
+                    pid = self._start(plan, index, port, group)
+                process, address = find_process(pid), plan.nodes[index].contract.address
+                start = process.start if process else ""
+                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group}
         except BaseException as error:  # never half a gang
             # by its pid: for a moment after it was started a process has no environment yet by which it would be found
             for pid in self._children.keys() - before:
@@ -95,7 +116,8 @@ class LocalEngine:
                 child.kill()
                 child.wait()
             try:
-                _end(gang.name)
+                end_nodes([_processes(node) for node in nodes.values()], [f"MUSTER_GANG={gang.name}"])
+                self._forget(gang.name, list(nodes.values()))
             except OSError as trouble:  # /proc can't be read now: the next try finds what may be left
                 said = f"can't start the gang now ({error}), nor look for what is left of it ({trouble}); trying again"
                 raise Transient(said, unknown=True) from error
@@ -104,24 +126,47 @@ class LocalEngine:
 
     def observe(self, handle: str) -> GangStatus:
         state = json.loads(handle)
+        if state["gang"] in self._ended:
+            return self._ended[state["gang"]]
         return [self._observe_node(state["gang"], index, node) for index, node in enumerate(state["nodes"])]
 
     def stop(self, handle: str, grace: float) -> None:
+        """Raises EngineError where something of the gang can't be killed: it holds its place until it is gone."""
         state = json.loads(handle)
         deadline = time.monotonic() + grace
-        nodes = state["nodes"]
+        gang, nodes = state["gang"], [_processes(node) for node in state["nodes"]]
         for node in nodes:
-            if _alive(node["pid"], node["start"]):
-                _signal(node["pid"], signal.SIGTERM)
-        while any(_alive(node["pid"], node["start"]) for node in nodes) and time.monotonic() < deadline:
+            if shim := node.shim:
+                _signal(shim.pid, signal.SIGTERM)
+        while any((shim := node.shim) and shim.name != STUCK for node in nodes) and time.monotonic() < deadline:
             time.sleep(0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
-        _end(state["gang"])
+        if left := end_nodes(nodes, [f"MUSTER_GANG={gang}"]):
+            raise EngineError(f"{unkillable(left)}; its CPUs and GPUs are not given to other jobs until it is gone")
+        self._ended[gang] = self.observe(handle)
+        while len(self._ended) > _REMEMBERED:
+            self._ended.pop(next(iter(self._ended)), None)
+        self._forget(gang, state["nodes"])
 
     def close(self) -> None:
         """Supervisors go on."""
 
-    def _start(self, plan: Plan, index: int, port: int) -> int:
+    def _forget(self, gang: str, nodes: Sequence[Mapping[str, object]]) -> None:
+        """Nothing of the gang is left: remove what was kept of its supervisors."""
+        for index, node in enumerate(nodes):
+            self._children.pop(int(str(node["pid"])), None)
+            said = self._said(gang, index)
+            try:
+                if len(lines := said.read_text(errors="replace").strip().splitlines()) > 1:
+                    log.error("gang %s, node %d: its supervisor said:\n%s", gang, index, "\n".join(lines[-50:]))
+                said.unlink()
+            except OSError:
+                pass  # it was never started, or this was done before
+
+    def _group(self, gang: str, index: int) -> str:
+        return f"{self._groups}/muster-{gang.replace('/', '-')}-{index}" if self._groups else ""
+
+    def _start(self, plan: Plan, index: int, port: int, group: str) -> int:
         node = plan.nodes[index]
         inherited = {name: value for name, value in os.environ.items() if name not in (*PRIVATE, "SLURM_JWT")}
         contract = {**node.contract.to_env(), "MASTER_PORT": str(port)}
@@ -130,8 +175,7 @@ class LocalEngine:
             "PATH": f"{Path(sys.executable).parent}:{inherited.get('PATH', '/usr/bin:/bin')}",
             "WARP_CACHE_PATH": inherited.get("WARP_CACHE_PATH", str(self.home / "kernels")),
             "CUDA_VISIBLE_DEVICES": ",".join(node.placement.gpus),
-            **node.environment,
-            **contract,
+            **sealed(node.environment, contract),
         }
         # -P: a folder called "worker" in the job's directory must not hide ours
         command = [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command]
@@ -140,7 +184,7 @@ class LocalEngine:
         said.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open(said, "ab") as stderr:
             process = subprocess.Popen(
-                with_mounts(command, mounts_of(container, plan.gang.store)),
+                shimmed(with_mounts(command, mounts_of(container, plan.gang.store)), group),
                 env=env,
                 cwd=plan.gang.directory,
                 stdin=subprocess.DEVNULL,
@@ -152,10 +196,11 @@ class LocalEngine:
         return process.pid
 
     def _observe_node(self, gang: str, index: int, node: dict[str, object]) -> NodeStatus:
-        pid, start, address = int(str(node["pid"])), str(node["start"]), str(node["address"])
+        pid, address = int(str(node["pid"])), str(node["address"])
         child = self._children.get(pid)
         code = child.poll() if child else None
-        if code is None and _alive(pid, start):
+        shim = _processes(node).shim if code is None else None
+        if shim is not None and shim.name != STUCK:
             return NodeStatus(True, address)
         said = self._said(gang, index)
         detail = said.read_text(errors="replace").strip().rpartition("\n")[2] if said.exists() else ""
@@ -166,9 +211,9 @@ class LocalEngine:
 
 
 def _address(gang: Gang, index: int) -> str:
-    """A loopback address of the node's own: 127.64–127.a.b, one /24 a gang, so that two gangs can use the same ports."""
+    """A loopback address of the node's own in 127.64.0.0/10, so that two gangs can use the same ports: 254 nodes to each /24."""
     digest = hashlib.sha256(gang.name.encode()).digest()
-    return f"127.{64 + digest[0] % 63}.{digest[1]}.{index + 1}"
+    return f"127.{64 + digest[0] % 63}.{(digest[1] + index // 254) % 256}.{index % 254 + 1}"
 
 
 def _free_port(address: str) -> int:
@@ -184,72 +229,35 @@ def _free_port(address: str) -> int:
     raise EngineError(f"no free port from {_FIRST_PORT} on {address}")
 
 
-def _start_time(pid: int) -> str:
-    """Start time of a process in clock ticks since boot, which tells it from a later one with its pid; empty if it is gone."""
-    fields = _stat(pid)
-    return fields[19] if fields else ""
+@dataclass(frozen=True)
+class _Shim:
+    """What is known of a node that runs."""
+
+    pid: int
+    port: int
+    """The gang's master port."""
+    group: str
 
 
-def _alive(pid: int, start: object) -> bool:
-    """Whether the process exists and is no zombie. Raises OSError where that can't be told now."""
-    fields = _stat(pid)
-    return fields is not None and fields[0] not in "ZX" and fields[19] == start
-
-
-def _stat(pid: int) -> list[str] | None:
-    """``/proc/<pid>/stat`` from the process's state (field 3) on; None where there is no such process.
-
-    Raises OSError where it can't be read now, without free descriptors for instance: that is not the death of a process.
-    """
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return None
-
-
-def _processes(gang: str) -> list[int]:
-    """Every process, zombies left out, that carries ``MUSTER_GANG=<gang>`` in its environment."""
-    return [pid for pid, _ in _scan(gang)]
-
-
-def _end(gang: str) -> None:
-    while pids := _processes(gang):
-        for pid in pids:
-            _signal(pid, signal.SIGKILL)
-        time.sleep(0.02)
-
-
-def _supervisors(gang: str) -> list[tuple[int, int, int]]:
-    """Pid, node index and master port of the gang's supervisors."""
-    found = []
-    for pid, environment in _scan(gang):
+def _shims(gang: str) -> dict[int, _Shim]:
+    """The shims of the gang's nodes that run, by node index."""
+    found = {}
+    for process in marked([f"MUSTER_GANG={gang}"]):
         try:
-            command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            group = group_of(Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0"))
+            raw = Path(f"/proc/{process.pid}/environ").read_bytes()
         except _UNSEEN:
             continue
-        index = environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0")  # a single-node job has none
-        # its ranks are children of it; a supervisor that is still being given its mounts has another command in front
-        if b"worker.supervisor" in command and b"TORCHELASTIC_ERROR_FILE" not in environment and index.isdigit():
-            found.append((pid, int(index), int(environment[b"MASTER_PORT"])))
+        if group is not None:
+            environment = dict(item.split(b"=", 1) for item in raw.split(b"\0") if b"=" in item)
+            index = int(environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0"))  # a single-node job has none
+            found[index] = _Shim(process.pid, int(environment[b"MASTER_PORT"]), group)
     return found
 
 
-def _scan(gang: str) -> list[tuple[int, dict[bytes, bytes]]]:
-    wanted = gang.encode()
-    found = []
-    for entry in os.listdir("/proc"):
-        if not entry.isdigit() or int(entry) == os.getpid():
-            continue
-        try:
-            raw = Path(f"/proc/{entry}/environ").read_bytes()
-            if wanted not in raw or not _alive(int(entry), _start_time(int(entry))):
-                continue
-        except _UNSEEN:
-            continue
-        environment = dict(item.split(b"=", 1) for item in raw.split(b"\0") if b"=" in item)
-        if environment.get(b"MUSTER_GANG") == wanted:
-            found.append((int(entry), environment))
-    return found
+def _processes(node: Mapping[str, object]) -> NodeProcesses:
+    """Of a node in a handle; handles of older versions have no group."""
+    return NodeProcesses(int(str(node["pid"])), str(node["start"]), str(node.get("group") or ""))
 
 
 def _signal(pid: int, number: int) -> None:

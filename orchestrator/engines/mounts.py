@@ -13,9 +13,9 @@ from orchestrator.engines.base import EngineError
 
 _SCRIPT = """
 while [ "$1" != -- ]; do
-  mkdir -p "$1" "$2"
-  mount --bind "$1" "$2"
-  [ "$3" = rw ] || mount -o remount,bind,ro "$2"
+  mkdir -p -- "$1" "$2"
+  mount --bind -- "$1" "$2"
+  [ "$3" = rw ] || mount -o remount,bind,ro -- "$2"
   shift 3
 done
 shift
@@ -74,7 +74,8 @@ def with_mounts(command: Sequence[str], mounts: Sequence[Mount], engine: str = "
             "or take the volumes out of the job definition and use $MUSTER_STORE"
         )
     for mount in mounts:
-        if ".." in Path(mount.source).parts or not mount.target.startswith("/") or mount.target == "/":
+        paths = Path(mount.source), Path(mount.target)
+        if any(not path.is_absolute() or ".." in path.parts for path in paths) or mount.target == "/":
             raise EngineError(f"volume {mount.source} at {mount.target}: two absolute paths without '..' are needed")
     triples = [part for m in mounts for part in (m.source, m.target, "ro" if m.read_only else "rw")]
     namespace = ["unshare", "--mount", "--propagation", "private"]

@@ -195,6 +195,8 @@ class RayEngine:
         while (state := read_json(folder.state(gang))) is None or state["phase"] != "stopped":
             if state is None and not folder.plan(gang).exists():
                 break
+            if state is not None and state["phase"] == "stopping" and state["why"]:
+                raise EngineError(f"{state['why']}; its CPUs and GPUs are not given to other jobs until it is gone")
             now = time.monotonic()
             if now > patience and state is not None:  # frozen; its actors have missed it for long enough
                 with contextlib.suppress(ProcessLookupError):

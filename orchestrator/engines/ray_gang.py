@@ -23,6 +23,8 @@ _BEAT = 2.0
 """Seconds between two signs of life to an actor."""
 _BROKEN = 3.0
 """Seconds after which an actor whose connection broke, and that does not answer on another, is given up."""
+_ENDING = 15.0
+"""Seconds beyond the grace time that an actor may take to kill its node, or to say what of it can't be killed."""
 _STARTING = 60.0
 """Seconds that an actor may take to start: a machine that Ray believes alive may be frozen."""
 
@@ -136,7 +138,7 @@ class Gang:
 
     def stop(self, grace: float) -> None:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
-        self.phase, self.deadline = "stopping", time.monotonic() + grace + 10.0
+        self.phase, self.why, self.deadline = "stopping", "", time.monotonic() + grace + _ENDING
         lost = {index for index, node in enumerate(self.nodes) if not node["running"] and node["code"] is None}
         self.asked = {ref: told for ref, told in self.asked.items() if told[1] not in lost}
         for index, actor in enumerate(self.actors):
@@ -191,6 +193,9 @@ class Gang:
             else:
                 node["started"] = True
                 self.asked[self.actors[index].wait.remote()] = ("wait", index)
+        elif kind == "stop" and answer:  # it was asked in vain: again, until nothing is left
+            self.why, self.deadline = f"node {index}: {answer}", time.monotonic() + _ENDING
+            self.asked[self.actors[index].stop.remote(0.0)] = ("stop", index)
         elif kind == "wait":
             self.end(index, answer[0], answer[1] if answer[0] else "")
 

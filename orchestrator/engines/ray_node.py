@@ -36,8 +36,8 @@ class Node:
         self._order: tuple[list[str], dict[str, str], str | None] | None = None
         self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
-        self._reaper: subprocess.Popen[bytes] | None = None
-        """For where the actor is killed: Ray does that to the actors of a driver that died."""
+        self._shim: Any = None
+        """``shared_store.nodes.NodeProcesses`` of the node."""
         self._problem = ""
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
@@ -96,12 +96,13 @@ class Node:
             directory: Working directory.
         """
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(_OF_RAY)}
+        from shared_store.contract import sealed  # it is there by now, and of the same version: see facts()
+
         environment = {
             **inherited,
             "PATH": f"{os.path.dirname(sys.executable)}:{inherited.get('PATH', '/usr/bin:/bin')}",
             "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "") if gpus else "",
-            **user,
-            **contract,
+            **sealed(user, contract),
         }
         # -P: a folder called "worker" in the job's directory must not hide ours
         supervisor = [*prefix, sys.executable, "-P", "-m", "worker.supervisor", "--", *command]
@@ -129,12 +130,12 @@ class Node:
             with contextlib.suppress(ProcessLookupError):
                 self._process.send_signal(signal.SIGTERM)
 
-    def stop(self, grace: float) -> None:
-        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the node is left."""
+    def stop(self, grace: float) -> str:
+        """SIGTERM, ``grace`` seconds later SIGKILL; what of the node can't be killed, or nothing once no process of it is left."""
         if self._process is not None:
             self.leave()
             self._ended.wait(grace)
-        self._end()
+        return self._end()
 
     def _keep(self) -> None:
         while not self._ordered.wait(0.5):
@@ -143,12 +144,16 @@ class Node:
         assert self._order is not None
         command, environment, directory = self._order
         try:
-            from shared_store.reaper import start_reaper  # it is there by now, and of the same version: see facts()
-            from shared_store.tied import tied
+            from shared_store.cgroups import own_group
+            from shared_store.nodes import NodeProcesses
+            from shared_store.processes import find_process
+            from shared_store.shim import shimmed
 
-            self._reaper = start_reaper(self.marks)
+            name = "-".join(mark.partition("=")[2] for mark in self.marks).replace("/", "-")
+            group = f"{groups}/muster-{name}" if (groups := own_group()) else ""
             self._process = subprocess.Popen(
-                tied(command),
+                # where the actor is killed (Ray does that to the actors of a driver that died) the shim ends the node
+                shimmed(command, group, tied_to=os.getpid()),
                 env=environment,
                 cwd=directory,
                 stdin=subprocess.DEVNULL,
@@ -156,6 +161,8 @@ class Node:
                 stderr=self._said,
                 start_new_session=True,
             )
+            shim = find_process(self._process.pid)
+            self._shim = NodeProcesses(self._process.pid, shim.start if shim else "", group)
         except (ImportError, OSError, ValueError) as error:
             self._problem = f"can't start the node: {error}"
             self._started.set()
@@ -176,12 +183,15 @@ class Node:
     def _abandoned(self) -> bool:
         return time.monotonic() - self.heard > self.lease
 
-    def _end(self) -> None:
-        """SIGKILL to everything here that carries the marks, until nothing is left."""
-        if self._reaper is not None:
-            from shared_store.reaper import end_marked
+    def _end(self) -> str:
+        """SIGKILL to all of the node; what it does not end, or nothing."""
+        if self._shim is None:
+            return ""
+        from shared_store.nodes import end_nodes
+        from shared_store.processes import unkillable
 
-            end_marked(self.marks)
+        left = end_nodes([self._shim], self.marks)
+        return unkillable(left) if left else ""
 
 
 def _foreign(store: str, run: str, epoch: int) -> str:

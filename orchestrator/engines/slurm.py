@@ -38,6 +38,8 @@ _LOOK = 0.3
 """Seconds between two looks at a job that is being stopped."""
 _AGAIN = 2.0
 """Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
+_KILLING = 60.0
+"""Seconds after which a job that was killed and is still there is reported; Slurm's KillWait is 30 s by default."""
 _PATIENCE = 5.0
 """Seconds for which a launch waits for sbatch, which tries for longer where slurmctld is away: other jobs wait meanwhile."""
 _FORGOTTEN = "0"
@@ -122,6 +124,7 @@ class SlurmEngine:
     def stop(self, handle: str, grace: float) -> None:
         facts = json.loads(handle)
         number, deadline, asked, killed = facts["slurm"], time.monotonic() + grace, False, 0.0
+        give_up = deadline + _KILLING
         while True:
             try:
                 job = self._job(facts, _LOOK)
@@ -129,6 +132,11 @@ class SlurmEngine:
                     self._submitted.pop(number, None)
                     return
                 now = time.monotonic()
+                if now > give_up and killed:
+                    raise EngineError(
+                        f"Slurm: job {number} is {job.state} on {job.hosts} since it was killed {_KILLING:.0f} s ago: something of it "
+                        f"can't be killed (`scontrol show job {number}`, and ps on that host, say what)"
+                    )
                 if job.state in QUEUED:
                     _cancel(number)
                 elif not asked and grace > 0:

@@ -70,6 +70,23 @@ def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypat
         with_mounts(["true"], [Mount("/data", "/mnt")], engine)
 
 
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("-h", "/mnt"),
+        ("--", "/mnt"),
+        ("data", "/mnt"),
+        ("/data", "--"),
+        ("/data", "mnt"),
+        ("/data", "/"),
+        ("/a/../b", "/mnt"),
+    ],
+)
+def test_what_is_mounted_and_where_are_absolute_paths(source: str, target: str) -> None:
+    with pytest.raises(EngineError, match=r"^volume .*: two absolute paths without '..' are needed$"):
+        with_mounts(["true"], [Mount(source, target)])
+
+
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
     assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
     with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):

@@ -110,6 +110,30 @@ def test_the_ends_of_nodes_are_judged(
     assert (verdict and (verdict.ending, verdict.reason, verdict.exit_code)) == expected
 
 
+ASKED = [
+    # what was told to end is the cause only where nothing else is; whoever is read first, and whatever the clocks say
+    ((RUNS, (143, 1.0, True)), "node 1: exit 143", False),
+    ((RUNS, (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
+    ((RUNS, (137, 2.0), (143, 1.0, True)), "node 1: exit 137", True),
+    (((143, 1.0, True), (137, 2.0), (143, 0.5, True)), "node 1: exit 137", True),
+    (((1, 3.0), (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
+    (((143, 1.0, True), RUNS, RUNS), "main node: exit 143", True),
+    (((143, 2.0, True), (143, 1.0, True)), "node 1: exit 143", True),
+]
+
+
+@pytest.mark.parametrize(("codes", "reason", "certain"), ASKED)
+def test_a_node_that_was_told_to_end_is_not_the_cause(
+    codes: tuple[tuple[int, float, bool] | tuple[int, float] | None, ...], reason: str, certain: bool
+) -> None:
+    found = [
+        None if each is None else NodeEnd(each[0], f"exit {each[0]}", each[1], asked=len(each) > 2) for each in codes
+    ]
+    verdict = judge("restart", 0, found)
+    assert verdict
+    assert (verdict.reason, verdict.certain) == (reason, certain)
+
+
 def test_on_aws_only_the_main_node_matters() -> None:
     for main_code, *child_codes in itertools.product((None, 0, 1, 75), repeat=3):
         alone = judge("ignore", 0, ends(main_code))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import os
 import signal
@@ -20,7 +21,8 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
-from tests.conftest import processes_of, wait_for
+from shared_store.processes import end_all, find_process
+from tests.conftest import alive, frozen, processes_of, wait_for
 
 WAIT = "echo ready; exec sleep 600"
 STAY = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
@@ -152,10 +154,10 @@ def test_two_gangs_have_different_addresses(bench: Bench) -> None:
 
 
 def test_the_addresses_of_the_largest_gang_are_addresses(bench: Bench) -> None:
-    addresses = [node.contract.address for node in bench.engine.plan(bench.gang(nodes=250)).nodes]
-    assert len(set(addresses)) == 250
-    for address in addresses:
-        socket.inet_aton(address or "")
+    nodes = bench.engine.plan(bench.gang(nodes=1000)).nodes  # as many as the Batch API allows
+    assert len({node.contract.address for node in nodes}) == 1000
+    for node in nodes:
+        assert ipaddress.IPv4Address(node.contract.address or "").is_loopback
 
 
 # -- what a node gets -------------------------------------------------------------------------------------------------
@@ -224,6 +226,13 @@ def test_commands_run_in_the_job_s_directory_which_can_not_hide_our_own_packages
     (directory / "worker" / "__init__.py").write_text("raise SystemExit('the wrong worker')")
     bench.wait_for_end(bench.launch(bench.gang("pwd", nodes=1, directory=str(directory))))
     assert bench.lines() == [(0, str(directory))]
+
+
+def test_a_job_s_own_modules_do_not_hide_those_of_its_supervisor(bench: Bench, tmp_path: Path) -> None:
+    (tmp_path / "queue.py").write_text("MINE = True")
+    script = "python -c 'import queue; print(queue.MINE)'"
+    bench.wait_for_end(bench.launch(bench.gang(script, nodes=1, environments=[{"PYTHONPATH": str(tmp_path)}])))
+    assert bench.lines() == [(0, "True")]
 
 
 def test_a_directory_that_is_not_there_is_refused_before_anything_starts(bench: Bench) -> None:
@@ -371,6 +380,59 @@ def test_stopping_ends_what_a_dead_supervisor_left_behind(bench: Bench) -> None:
     assert [pid for pid in bench.processes() if "sleep 600" in command_line(pid)], "there is something to end"
     bench.engine.stop(handle, 5.0)
     assert bench.processes() == []
+
+
+def test_stopping_ends_what_took_the_gang_s_name_out_of_its_environment(bench: Bench) -> None:
+    escape = "env -i setsid sh -c 'echo escaped $$; exec sleep 600' & (env -i setsid sh -c 'echo escaped $$; exec sleep 600' &) ; "
+    handle = bench.launch(bench.gang(f"{escape}{STAY}", nodes=1))
+    bench.ready(1)
+    wait_for(lambda: len(escaped(bench)) == 2, 10, "two processes that escaped")
+    bench.engine.stop(handle, 0.5)
+    assert bench.processes() == [] and not any(alive(pid) for pid in escaped(bench))
+
+
+def test_a_job_that_kills_its_supervisor_leaves_nothing(bench: Bench) -> None:
+    escape = "env -i setsid sh -c 'echo escaped $$; exec sleep 600' & sleep 0.2; "
+    handle = bench.launch(bench.gang(f"{escape}kill -9 $PPID; sleep 600", nodes=1))
+    assert bench.wait_for_end(handle)[0].exit_code == 137
+    assert bench.processes() == [] and not any(alive(pid) for pid in escaped(bench)), "before anybody stopped it"
+
+
+def escaped(bench: Bench) -> list[int]:
+    return [int(text.split()[1]) for _, text in bench.lines() if text.startswith("escaped ")]
+
+
+def test_a_gang_with_a_process_that_can_not_be_killed_is_not_stopped_until_it_is_gone(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
+    handle = bench.launch(bench.gang(f"env -i setsid sh -c 'echo escaped $$; exec sleep 600' & {WAIT}", nodes=1))
+    bench.ready(1)
+    wait_for(lambda: escaped(bench), 10, "the process")
+    [stubborn] = escaped(bench)
+    wait_for(lambda: (process := find_process(stubborn)) and process.name == "sleep", 10, "it sleeps")
+    with frozen(stubborn):
+        for _ in range(2):  # it is asked again
+            with pytest.raises(EngineError, match=rf"^SIGKILL does not end process {stubborn} \(sleep\), state D"):
+                bench.engine.stop(handle, 1.0)
+    bench.engine.stop(handle, 5.0)
+    assert not alive(stubborn) and bench.processes() == []
+
+
+def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: Bench) -> None:
+    raise_epoch(bench.store.run("run"), 5)
+    gangs = [
+        bench.gang(nodes=2),
+        bench.gang(nodes=1, epoch=5, job="another"),
+        bench.gang(nodes=1, epoch=4, job="fenced"),
+    ]
+    handles = [bench.launch(gang) for gang in gangs]
+    bench.wait_for_end(handles[2])
+    for handle in handles:
+        bench.engine.stop(handle, 5.0)
+    assert bench.engine.observe(handles[2])[0].detail.startswith("muster supervisor: run run: this attempt has epoch 4")
+    assert list((bench.home / "home" / "supervisors").iterdir()) == []
+    assert not bench.engine._children
 
 
 def test_stopping_one_gang_leaves_the_others_alone(bench: Bench) -> None:

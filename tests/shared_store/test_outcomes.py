@@ -10,7 +10,16 @@ from typing import Any
 import pytest
 
 from shared_store.layout import Run
-from shared_store.outcomes import LONGEST_TEXT, FirstError, Outcome, bounded, read_outcome, write_outcome
+from shared_store.outcomes import (
+    LONGEST_TEXT,
+    FirstError,
+    Outcome,
+    bounded,
+    first_cause,
+    parse_outcome,
+    read_outcome,
+    write_outcome,
+)
 
 ERROR = FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
 OUTCOME = Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
@@ -47,6 +56,7 @@ def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(t
         {"error": [1]},
         {"error": "x"},
         {"other": 1},
+        {"asked": 1},
     ],
 )
 def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict[str, Any]) -> None:
@@ -54,3 +64,28 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps({**asdict(OUTCOME), **change}))
     assert read_outcome(Run(tmp_path), "job", 1, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("ends", "cause"),
+    [
+        ([(False, 1.0)], 0),
+        ([(True, 1.0)], 0),
+        ([(False, 2.0), (False, 1.0)], 1),
+        ([(False, 1.0), (False, 1.0)], 0),
+        ([(True, 1.0), (False, 9.0)], 1),
+        ([(False, 9.0), (True, 1.0)], 0),
+        ([(True, 1.0), (False, 9.0), (False, 8.0), (True, 0.5)], 2),
+        ([(True, 2.0), (True, 1.0)], 1),
+    ],
+)
+def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool, float]], cause: int) -> None:
+    assert first_cause(ends) == cause
+
+
+def test_an_outcome_is_read_as_it_was_written_and_one_of_an_older_version_was_not_asked() -> None:
+    asked = replace(OUTCOME, asked=True)
+    written = asdict(asked)
+    assert parse_outcome(written) == asked
+    del written["asked"]
+    assert parse_outcome(written) == OUTCOME

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from shared_store.contract import sealed
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import LONGEST_TEXT
 from tests.conftest import alive, wait_for
@@ -171,6 +172,30 @@ def test_when_one_rank_fails_the_others_are_ended_and_the_first_failure_is_the_r
     assert outcome.error.rank == 1  # type: ignore[union-attr]
 
 
+def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node: Nodes) -> None:
+    asked = node()
+    asked.start("sh", "-c", "echo ready; exec sleep 60")
+    asked.wait_for_output("ready")
+    asked.process.terminate()
+    assert (asked.wait(), asked.ended().asked) == (143, True)
+    failed = node(attempt=2)
+    assert (failed.shell("exit 3"), failed.ended().asked) == (3, False)
+    gang = node(attempt=3, ranks_per_node=3)
+    assert gang.shell("[ $RANK = 1 ] && kill -9 $$; exec sleep 60") == 137
+    assert (gang.ended().reason, gang.ended().asked) == ("rank 1 was killed by SIGKILL", False)
+
+
+def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node: Nodes) -> None:
+    n = node()
+    n.start("sh", "-c", "echo $$; exec sleep 60")
+    wait_for(lambda: len(n.output()) == 1, 10, "the rank")
+    n.process.send_signal(signal.SIGSTOP)  # as under load: the rank is gone first
+    os.kill(int(n.output()[0]), signal.SIGTERM)
+    n.process.terminate()
+    n.process.send_signal(signal.SIGCONT)
+    assert (n.wait(), n.ended().asked) == (143, True)
+
+
 def test_a_rank_that_does_not_heed_the_failure_of_another_is_killed(node: Nodes) -> None:
     n = node(ranks_per_node=2)
     main = "import sys, worker.supervisor as s; s._PEER_GRACE = 0.5; sys.exit(s.main(sys.argv[1:]))"
@@ -262,6 +287,26 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
     )
     n.start("sleep", "60", program=("-c", script))
     assert n.wait(10) == 143
+
+
+# -- the job's own environment ----------------------------------------------------------------------------------------
+
+
+def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_what_supervises_it(node: Nodes, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "queue.py").write_text("MINE = True\n")
+    job = {
+        "PYTHONPATH": str(tmp_path / "mine"),
+        "PYTHONHOME": "/nowhere",
+        "LD_LIBRARY_PATH": "/nowhere",
+        "TMPDIR": "/nowhere",
+        "RANK": "99",
+        "MUSTER_EPOCH": "99",
+    }
+    n = node()
+    script = "echo $PYTHONPATH $PYTHONHOME $LD_LIBRARY_PATH $TMPDIR $RANK $MUSTER_EPOCH; env | grep -c MUSTER_RANK_ENV_"
+    assert n.shell(script, **sealed(job, n.contract.to_env())) == 1, "grep found none"
+    assert n.output() == [f"{tmp_path}/mine /nowhere /nowhere /nowhere 0 1", "0"]
 
 
 # -- nothing outlives the node ----------------------------------------------------------------------------------------

@@ -1,0 +1,57 @@
+"""Control groups (version 2) around nodes: nothing that a node starts can leave its group, whatever sessions and forks it hides behind.
+
+They are used where this process may make one below its own: as root, or where it was delegated (``systemd-run --user --scope -p
+Delegate=yes``). Whether it may is found out by trying. No controller is enabled in them. Linux only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+
+from shared_store.processes import Process, find_process, kill
+
+
+def own_group() -> str:
+    """Directory of the control group that this process is in; empty where it can't make groups below it."""
+    try:
+        with open("/proc/self/cgroup") as file:
+            path = next(line[3:].rstrip("\n") for line in file if line.startswith("0::"))
+        with open("/proc/self/mountinfo") as file:
+            mounts = [line.partition(" - ") for line in file]
+        root, point = next(head.split()[3:5] for head, _, tail in mounts if tail.startswith("cgroup2 "))
+        directory = os.path.normpath(os.path.join(point, os.path.relpath(path, root)))
+        trial = os.path.join(directory, f"muster-trial-{os.getpid()}")
+        os.mkdir(trial)
+        os.rmdir(trial)
+    except (OSError, StopIteration):
+        return ""
+    return directory
+
+
+def members(group: str) -> list[Process]:
+    """Processes in the group and in groups below it; none where there is no such group."""
+    found = []
+    for directory, _, _ in os.walk(group):
+        with contextlib.suppress(FileNotFoundError), open(os.path.join(directory, "cgroup.procs")) as file:
+            found += [process for pid in file.read().split() if (process := find_process(int(pid)))]
+    return found
+
+
+def kill_group(group: str, processes: Sequence[Process] = ()) -> None:
+    """SIGKILL to all of the group at once, where the kernel can (Linux 5.14), and to each of ``processes``."""
+    with contextlib.suppress(OSError):
+        file = os.open(f"{group}/cgroup.kill", os.O_WRONLY)  # not open(): it must not make one
+        try:
+            os.write(file, b"1")
+        finally:
+            os.close(file)
+    kill(processes)
+
+
+def remove_group(group: str) -> None:
+    """Remove the group and those below it; one that is not empty, or not there, is left alone."""
+    for directory, _, _ in os.walk(group, topdown=False):
+        with contextlib.suppress(OSError):
+            os.rmdir(directory)

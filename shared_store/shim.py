@@ -1,0 +1,159 @@
+"""A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP COMMAND ...``.
+
+It outlives whatever the node does. Everything the node starts is re-parented to it, not to init, when its own parent dies (it is a
+subreaper), and where control groups can be made it puts the node into one. When the supervisor ends, however it ends, the shim kills
+and reaps all that is left and leaves with the supervisor's exit code. It passes on SIGTERM, SIGINT and SIGHUP.
+
+What this promises. With a control group: nothing survives, also where a job kills the shim itself (the engine finds the group). Without
+one: nothing survives the supervisor's end; of a job that kills the shim *and* has taken the node's marks out of its environment, what
+it started in a session of its own does. A process that SIGKILL does not end (state D) is named on standard error after ten seconds; the
+shim then calls itself ``STUCK``, for the engine to see, and stays until that process is gone. Linux only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+STUCK = "muster-stuck"
+"""Name of a shim's process whose supervisor has ended, while something of the node can't be killed."""
+SCRATCH = "muster-node-{pid}-"
+"""Prefix of a supervisor's temporary directory, by its pid: the shim removes that of one that was killed."""
+_PASSED_ON = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_ORPHANED = signal.SIGUSR1
+"""What the kernel sends the shim when the process that it is tied to dies."""
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
+
+
+def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0) -> list[str]:
+    """The command line that runs ``command``, a node's supervisor, below a shim.
+
+    Args:
+        command: What to run. It keeps the shim's standard streams and environment.
+        group: Directory of a control group to make for it; empty for none.
+        tied_to: Pid of the parent with whose death (of its thread that starts the shim) the node has to end; 0 for none.
+    """
+    return [sys.executable, "-I", "-S", __file__, str(tied_to), group, *command]
+
+
+def group_of(command: Sequence[bytes]) -> str | None:
+    """The control group (empty for none) in a command line that :func:`shimmed` made; None for any other command line."""
+    is_shim = len(command) > 6 and os.path.basename(command[3]) == os.path.basename(__file__).encode()
+    return os.fsdecode(command[5]) if is_shim else None
+
+
+def main(parent: str, group: str, *command: str) -> None:
+    """Run ``command`` to its end; leaves with its exit code, 128 + n for signal n."""
+    import ctypes
+
+    libc = ctypes.CDLL(None)
+    libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    watched = {signal.SIGCHLD, _ORPHANED, *_PASSED_ON}
+    signal.pthread_sigmask(signal.SIG_BLOCK, watched)
+    if int(parent):
+        libc.prctl(_PR_SET_PDEATHSIG, _ORPHANED, 0, 0, 0)
+        if os.getppid() != int(parent):  # it died before the kernel was told
+            os._exit(1)
+    sys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    me = os.getpid()
+    supervisor = os.fork()  # there is one thread only: Python may run in the child
+    if not supervisor:
+        _become(me, group, command)
+    code = _wait(supervisor, watched)
+    if _has_children() or not _removed(group):
+        _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
+    if code > 128:  # the supervisor did not get to remove it
+        _remove_scratch(supervisor)
+    os._exit(code)
+
+
+def _become(shim: int, group: str, command: Sequence[str]) -> None:
+    from shared_store import tied
+
+    os.setsid()
+    if group:
+        with contextlib.suppress(OSError):  # without a group the shim itself finds what is left
+            with contextlib.suppress(FileExistsError):
+                os.mkdir(group)
+            with open(os.path.join(group, "cgroup.procs"), "w") as file:
+                file.write("0")
+    tied.main(str(shim), "", *command)
+
+
+def _wait(supervisor: int, watched: set[signal.Signals]) -> int:
+    """Pass signals on and reap orphans until the supervisor has ended; its exit code."""
+    while True:
+        number = signal.sigwait(watched)
+        if number in _PASSED_ON:
+            os.kill(supervisor, number)
+            os.kill(supervisor, signal.SIGCONT)  # a job may have stopped it
+        elif number == _ORPHANED:
+            os.kill(supervisor, signal.SIGKILL)
+        else:
+            while True:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+                if pid == supervisor:
+                    code = os.waitstatus_to_exitcode(status)
+                    return code if code >= 0 else 128 - code
+                if not pid:
+                    break
+
+
+def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
+    """Kill and reap all that is left of the node; returns when nothing is."""
+    from shared_store.cgroups import remove_group
+    from shared_store.nodes import end_descendants
+    from shared_store.processes import unkillable
+
+    told = False
+    while True:
+        try:
+            stuck = end_descendants(group=group)
+        except OSError:  # /proc can't be read now: the machine has no descriptors left
+            time.sleep(0.2)
+            continue
+        if not stuck:
+            break
+        if not told:
+            told = True
+            print(f"muster: {unkillable(stuck)}", file=sys.stderr, flush=True)
+            call_stuck()
+    remove_group(group)
+
+
+def _removed(group: str) -> bool:
+    """Remove the group; False where there is something in it."""
+    try:
+        if group:
+            os.rmdir(group)
+    except FileNotFoundError:
+        pass
+    except OSError:
+        return False
+    return True
+
+
+def _has_children() -> bool:
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
+
+
+def _remove_scratch(supervisor: int) -> None:
+    import shutil
+    import tempfile
+
+    directory, prefix = tempfile.gettempdir(), SCRATCH.format(pid=supervisor)
+    for name in os.listdir(directory):
+        if name.startswith(prefix):
+            shutil.rmtree(os.path.join(directory, name), ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

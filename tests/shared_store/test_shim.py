@@ -1,0 +1,219 @@
+"""A node's shim: whatever the node does, and however it ends, nothing of it is left; nothing else is touched. All of it is real."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shared_store.cgroups import own_group, remove_group
+from shared_store.nodes import NodeProcesses, end_nodes
+from shared_store.processes import end_all, find_process, marked
+from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
+from tests.conftest import alive, frozen, wait_for
+
+ESCAPE = (
+    "env -i setsid sh -c 'echo $$ >>{pids}; exec sleep 600' & "
+    "(env -i setsid sh -c 'setsid sleep 600 & echo $! >>{pids}; exit' &) ; "
+    "while [ $(cat {pids} 2>/dev/null | wc -l) -lt 2 ]; do sleep 0.01; done; "
+)
+"""Starts two processes in sessions of their own, without the node's environment, and one of them without its parent."""
+
+
+@pytest.fixture(params=["control group", "subreaper alone"])
+def group(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The control group to use; empty for none."""
+    if request.param == "subreaper alone":
+        yield ""
+        return
+    if not (groups := own_group()):
+        pytest.skip("this process can't make control groups")
+    path = f"{groups}/muster-test-{os.getpid()}"
+    yield path
+    remove_group(path)
+    assert not os.path.exists(path)
+
+
+@pytest.fixture
+def pids(tmp_path: Path) -> Iterator[Path]:
+    """A file that a node writes pids into; they are ended after a test that failed."""
+    path = tmp_path / "pids"
+    yield path
+    for pid in read(path):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def read(path: Path) -> list[int]:
+    return [int(line) for line in path.read_text().split()] if path.exists() else []
+
+
+def start(script: str, group: str, tied_to: int = 0, **env: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        shimmed(["sh", "-c", script], group, tied_to=tied_to),
+        env={**os.environ, **env},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def known(shim: subprocess.Popen[str], group: str) -> NodeProcesses:
+    process = find_process(shim.pid)
+    return NodeProcesses(shim.pid, process.start if process else "", group)
+
+
+@pytest.mark.parametrize(("end", "code"), [("exit 0", 0), ("exit 75", 75), ("kill -9 $$", 137), ("kill -TERM $$", 143)])
+def test_what_escaped_is_gone_when_the_supervisor_has_ended(group: str, pids: Path, end: str, code: int) -> None:
+    shim = start(ESCAPE.format(pids=pids) + end, group)
+    assert shim.wait(20) == code
+    assert len(read(pids)) == 2 and not any(alive(pid) for pid in read(pids))
+
+
+def test_a_child_that_kills_its_parent_does_not_outlive_it(group: str, pids: Path) -> None:
+    script = ESCAPE.format(pids=pids) + "setsid sh -c 'kill -9 $PPID; exec sleep 600' & wait"
+    shim = start(script, group)
+    assert shim.wait(20) == 137
+    assert not any(alive(pid) for pid in read(pids))
+
+
+def test_the_node_ends_when_what_its_shim_is_tied_to_dies(group: str, pids: Path) -> None:
+    inner = f"{ESCAPE.format(pids=pids)}exec sleep 600"
+    owner = (
+        "import os, subprocess, sys; from shared_store.shim import shimmed;"
+        "shim = subprocess.Popen(shimmed(['sh', '-c', sys.argv[1]], sys.argv[2], tied_to=os.getpid()));"
+        "print(shim.pid, flush=True); shim.wait()"
+    )
+    with subprocess.Popen([sys.executable, "-c", owner, inner, group], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        shim = int(process.stdout.readline())
+        wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
+        process.kill()
+    wait_for(lambda: not alive(shim), 20, "the shim's end")
+    assert not any(alive(pid) for pid in read(pids))
+
+
+def test_with_a_control_group_a_job_that_kills_the_shim_leaves_nothing_either(pids: Path) -> None:
+    if not (groups := own_group()):
+        pytest.skip("this process can't make control groups")
+    group = f"{groups}/muster-test-{os.getpid()}"
+    shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
+    wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
+    node = known(shim, group)
+    shim.kill()
+    shim.wait()
+    assert any(alive(pid) for pid in read(pids)), "there is something to end"
+    assert not end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
+    assert not any(alive(pid) for pid in read(pids))
+    assert not os.path.exists(group)
+
+
+def test_without_one_what_kept_its_marks_is_found_by_them_and_others_are_left_alone(pids: Path) -> None:
+    gang = f"shim-{os.getpid()}/1/1"
+    script = f"setsid sleep 600 & echo $! >>{pids}; exec sleep 600"
+    shim, other = start(script, "", MUSTER_GANG=gang), start(script, "", MUSTER_GANG=f"{gang}1")
+    wait_for(lambda: len(read(pids)) == 2, 20, "two processes in sessions of their own")
+    node, of_the_other = known(shim, ""), known(other, "")
+    shim.kill()
+    shim.wait()
+    assert not end_nodes([node], [f"MUSTER_GANG={gang}"])
+    assert sorted(alive(pid) for pid in read(pids)) == [False, True] and alive(other.pid)
+    assert not end_nodes([of_the_other], [f"MUSTER_GANG={gang}1"])
+    other.wait(20)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_requests_reach_the_supervisor_also_where_a_job_stopped_it(number: int, pids: Path) -> None:
+    script = f"trap 'exit 75' TERM INT HUP; echo $$ >{pids}; while :; do sleep 0.02; done"
+    shim = start(script, "")
+    wait_for(lambda: read(pids), 20, "the supervisor")
+    os.kill(read(pids)[0], signal.SIGSTOP)
+    shim.send_signal(number)
+    assert shim.wait(20) == 75
+
+
+def test_a_shim_that_a_job_stopped_ends_all_the_same(group: str, pids: Path) -> None:
+    shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
+    wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
+    shim.send_signal(signal.SIGSTOP)
+    assert not end_nodes([known(shim, group)], ["MUSTER_GANG=no-such-gang/1/1"])
+    assert shim.wait(20) == 137
+    assert not any(alive(pid) for pid in read(pids))
+
+
+def test_a_killed_supervisor_s_temporary_directory_is_removed_and_no_other(pids: Path) -> None:
+    other = Path(tempfile.mkdtemp(prefix=SCRATCH.format(pid=1)))
+    script = f"mkdir {tempfile.gettempdir()}/{SCRATCH.format(pid='$$')}abc; echo $$ >{pids}; kill -9 $$"
+    assert start(script, "").wait(20) == 137
+    assert not list(Path(tempfile.gettempdir()).glob(SCRATCH.format(pid=read(pids)[0]) + "*"))
+    assert other.exists()
+    other.rmdir()
+
+
+def test_a_shim_is_told_apart_from_other_commands_by_its_command_line() -> None:
+    line = [word.encode() for word in shimmed(["python", "-m", "worker.supervisor"], "/sys/fs/cgroup/x")]
+    assert group_of(line) == "/sys/fs/cgroup/x"
+    assert group_of([word.encode() for word in shimmed(["python"])]) == ""
+    assert group_of([b"python", b"-P", b"-m", b"worker.supervisor", b"--", b"sleep", b"1"]) is None
+
+
+def test_what_can_not_be_killed_is_named_and_waited_for(pids: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shim = start(f"setsid sleep 600 & echo $! >{pids}; while :; do sleep 0.02; done", "")
+    node = known(shim, "")
+    wait_for(lambda: read(pids), 20, "the process")
+    [stubborn] = read(pids)
+    wait_for(lambda: (process := find_process(stubborn)) and process.name == "sleep", 20, "it sleeps")
+    with frozen(stubborn):
+        monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
+        [left] = end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
+        assert left.pid == stubborn and left.state == "D"
+        wait_for(lambda: node.shim and node.shim.name == STUCK, 20, "the shim says that it is stuck")
+    assert shim.wait(20) == 137
+    assert shim.stderr is not None
+    said = shim.stderr.read()
+    assert said.startswith(
+        f"muster: SIGKILL does not end process {stubborn} (sleep), state D: in an uninterruptible wait"
+    )
+    assert said.count("\n") == 1, "said once"
+
+
+CHAIN = """
+import os, time
+end = time.time() + 60
+while time.time() < end:
+    if os.fork():
+        os._exit(0)
+    os.setsid()
+    time.sleep(0.002)
+"""
+"""A process that replaces itself by a child in a session of its own, again and again, for a minute at most."""
+
+
+def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pids: Path, tmp_path: Path) -> None:
+    (tmp_path / "chain.py").write_text(CHAIN)
+    shim = start(
+        f"for i in 1 2 3 4; do {sys.executable} -I -S {tmp_path}/chain.py & done; sleep 0.5; kill -9 $$", group
+    )
+    assert shim.wait(60) == 137
+    left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if _holds(path, str(tmp_path).encode())]
+    assert not left
+
+
+def _holds(path: Path, text: bytes) -> bool:
+    try:
+        return text in path.read_bytes() and path.parent.name != str(os.getpid())
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("marks", [[], ["MUSTER_GANG="], ["MUSTER_GANG"], ["MUSTER_GANG=job/1/1", ""]])
+def test_marks_that_would_fit_every_process_are_refused(marks: list[str]) -> None:
+    with pytest.raises(ValueError, match="no process can be told by the marks"):
+        marked(marks)
