@@ -189,7 +189,7 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
     assert follower.stdout is not None
     first = follower.stdout.readline()
     before = set(
-        wait_for(lambda: len(found := processes_of(server.home)) == 4 and found, what="two supervisors, two ranks")
+        wait_for(lambda: len(found := processes_of(server.home)) == 6 and found, what="two shims, supervisors, ranks")
     )
     server.kill()
     time.sleep(0.3)

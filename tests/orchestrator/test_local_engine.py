@@ -391,13 +391,6 @@ def test_stopping_ends_what_took_the_gang_s_name_out_of_its_environment(bench: B
     assert bench.processes() == [] and not any(alive(pid) for pid in escaped(bench))
 
 
-def test_a_job_that_kills_its_supervisor_leaves_nothing(bench: Bench) -> None:
-    escape = "env -i setsid sh -c 'echo escaped $$; exec sleep 600' & sleep 0.2; "
-    handle = bench.launch(bench.gang(f"{escape}kill -9 $PPID; sleep 600", nodes=1))
-    assert bench.wait_for_end(handle)[0].exit_code == 137
-    assert bench.processes() == [] and not any(alive(pid) for pid in escaped(bench)), "before anybody stopped it"
-
-
 def escaped(bench: Bench) -> list[int]:
     return [int(text.split()[1]) for _, text in bench.lines() if text.startswith("escaped ")]
 
