@@ -61,7 +61,7 @@ def judge(verdict: Verdict, home: Home, run: Run, reference: Reference, controll
 
 
 def _check_accounts(home: Home, run: Run, controller_kills: int, verdict: Verdict) -> None:
-    """Attempts in the database = launches = epochs; each has an end and a reason."""
+    """Attempts in the database = epochs, and all that left a log; each has a launch, an end and a reason."""
     jobs = home.jobs(run.name)
     attempts = [attempt for job in jobs for attempt in job["attempts"]]
     verdict.jobs, verdict.attempts = len(jobs), len(attempts)
@@ -79,13 +79,10 @@ def _check_accounts(home: Home, run: Run, controller_kills: int, verdict: Verdic
         missing = [key for key in ("ending", "status_reason", "stopped_at", "handle") if not attempt[key]]
         if missing or (attempt["exit_code"] is None and attempt["ending"] in ("succeeded", "requeue")):
             say(f"{name} is closed without {', '.join(missing) or 'exit code'}")
-        launched = home.path / "supervisors" / f"{attempt['job_id']}-{attempt['number']}-{attempt['epoch']}-node-0.err"
-        if not launched.exists():
-            say(f"{name} was never launched")
-    launches = {path.name[: -len("-node-0.err")] for path in (home.path / "supervisors").glob("*-node-0.err")}
-    ours = {name for name in launches if any(name.startswith(job["id"]) for job in jobs)}
-    if len(ours) != len(attempts):
-        say(f"{len(attempts)} attempts in the database, {len(ours)} launches")
+    known = {(attempt["job_id"], attempt["number"]) for attempt in attempts}
+    logged = {(path.parent.name, int(path.name)) for path in (run.path / "logs").glob("*/*")}
+    if logged - known:
+        say(f"launched, and not in the database: {sorted(logged - known)}")
     epochs, newest = [attempt["epoch"] for attempt in attempts], read_epoch(run)
     if any(later <= earlier for earlier, later in itertools.pairwise(epochs)):
         say(f"epochs do not grow: {epochs}")
