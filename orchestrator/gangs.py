@@ -92,16 +92,14 @@ class Gangs:
         try:
             # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
             known = [attempt.epoch for attempt in session.scalars(select(Attempt).join(Job).where(Job.run == job.run))]
-            if read_epoch(run) not in known and (writer := self.peers.writer(run)):
+            current = read_epoch(run)
+            if current not in known and (writer := self.peers.writer(run)):
                 raise StoreError(f"it is being written by {writer}; stop that job first")
             if job.first_epoch is not None and run.description() is None:
                 raise StoreError("it was deleted from the store while the job ran")
             self._describe(session, run, job)
-            epoch = take_epoch(run, max(known, default=0), Claim(self.peers.id, job.id, len(job.attempts) + 1))
-        except (
-            OSError,
-            StaleEpoch,
-        ) as error:  # a volume that is full or away may come back; another controller was faster
+            epoch = take_epoch(run, max([current, *known]), Claim(self.peers.id, job.id, len(job.attempts) + 1))
+        except (OSError, StaleEpoch) as error:  # a volume that is away may come back; another controller was faster
             said = f"store {self.store.path}: can't prepare run {job.run} now ({error}); trying again"
             raise StoreUnavailable(said) from error
         except (StoreError, ValueError) as error:

@@ -81,7 +81,11 @@ class Peers:
             OSError, ValueError: The store can't be read, or the run's ``EPOCH`` is damaged.
         """
         claim = read_claim(run, read_epoch(run))
-        if claim is None or claim.controller == self.id or (peer := self._present(claim.controller)) is None:
+        if claim is None or claim.controller == self.id or not NAME.fullmatch(claim.controller):
+            return None
+        if claim.controller not in self._seen and (found := self._read(claim.controller)):
+            self._note(claim.controller, found)  # it started after the last look
+        if (peer := self._present(claim.controller)) is None:
             return None
         return f"job {claim.job[:8]} (attempt {claim.attempt}) of {peer}"
 
@@ -120,16 +124,17 @@ class Peers:
             return None
 
     def _note(self, name: str, peer: Peer) -> None:
-        before, heard = self._seen.get(name, (None, None))
-        if before == peer:
-            return
-        outdated = before is None and abs(time.time() - peer.time) > _OUTDATED
+        """Any thread may call."""
+        with self._lock:
+            before, heard = self._seen.get(name, (None, None))
+            if before == peer:
+                return
+            outdated = before is None and abs(time.time() - peer.time) > _OUTDATED
+            self._seen[name] = peer, None if outdated else time.monotonic()
         if outdated:  # left by one that was killed; one that lives writes it again
             with contextlib.suppress(OSError):
                 (self._directory / f"{name}.json").unlink(missing_ok=True)
-        with self._lock:
-            self._seen[name] = peer, None if outdated else time.monotonic()
-        if heard is None and not outdated:
+        elif heard is None:
             log.warning(
                 "%s uses the store %s too: each runs jobs of its own, and neither starts a run that the other is writing",
                 peer,

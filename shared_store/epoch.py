@@ -23,6 +23,8 @@ LARGEST_EPOCH = 10**15 - 1
 """A greater number in ``EPOCH`` is damage: no run has that many attempts."""
 _KEPT = 64
 """Claims that are kept behind the newest one, so that a controller that froze while it claimed can't free a number."""
+_PUBLICATION = 1.0
+"""Seconds between a claim and its publication after which the controller that claimed is taken for dead."""
 _LONGEST_CLAIM = 4096
 """Bytes that are read of a claim."""
 
@@ -55,15 +57,19 @@ def read_epoch(run: Run) -> int:
 
 
 def take_epoch(run: Run, after: int, claim: Claim) -> int:
-    """Give the run to ``claim``, with the first free epoch greater than ``after`` and than the run's; returns it.
+    """Give the run to ``claim``, with the first free epoch greater than ``after``; returns it.
+
+    ``after``: at least the run's epoch, as the caller read it before it decided to take the run. An epoch that another controller has claimed and not yet published is waited for, up to a second: that controller has the run
+    then. One that died in between is passed over.
 
     Raises:
-        StaleEpoch: Another controller took the run meanwhile.
+        StaleEpoch: Another controller took the run at this moment.
         ValueError: ``EPOCH`` is damaged, or no epoch is left.
         OSError: The store can't be written.
     """
-    epoch = max(read_epoch(run), after) + 1
+    epoch = after + 1
     while not _create(run, epoch, claim):
+        _await_publication(run, epoch, claim)
         epoch += 1
     _publish(run, epoch)
     return epoch
@@ -149,6 +155,17 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
         os.fsync(descriptor)
     sync_directory(run.path)  # a number that a crash of the volume forgets could be given again
     return True
+
+
+def _await_publication(run: Run, epoch: int, claim: Claim) -> None:
+    """Returns where ``epoch`` will not be published: its controller died, or it is the caller's own, which died before."""
+    deadline = time.monotonic() + _PUBLICATION
+    while time.monotonic() < deadline:
+        if (current := read_epoch(run)) >= epoch:
+            raise StaleEpoch(f"another controller has just taken run {run.name} with epoch {current}")
+        if (other := read_claim(run, epoch)) and other.controller == claim.controller:
+            return
+        time.sleep(0.05)
 
 
 def _publish(run: Run, epoch: int) -> None:

@@ -44,6 +44,19 @@ def test_controllers_of_a_store_see_each_other_until_one_is_gone(
     assert [path.stem for path in (store.path / "controllers").iterdir()] == [first.id]
 
 
+def test_a_controller_that_started_since_the_last_look_is_found_by_its_claim(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store").open()
+    first, second = Peers(store, tmp_path / "a"), Peers(store, tmp_path / "b")
+    first.start()
+    second.start()
+    raise_epoch(store.run("ant"), 1, Claim(second.id, "job", 1))
+    assert (first.writer(store.run("ant")) or "").startswith("job job (attempt 1) of the controller of ")
+    raise_epoch(store.run("bee"), 1, Claim("../../escape", "job", 1))
+    assert first.writer(store.run("bee")) is None
+    first.close()
+    second.close()
+
+
 def test_a_heartbeat_of_a_controller_that_died_long_ago_is_cleared_away(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

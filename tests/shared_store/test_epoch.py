@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -84,19 +85,22 @@ def test_no_epoch_follows_the_largest(tmp_path: Path) -> None:
     run = Run(tmp_path)
     raise_epoch(run, LARGEST_EPOCH)
     with pytest.raises(ValueError, match=f"EPOCH: no epoch is left after {LARGEST_EPOCH}"):
-        take_epoch(run, 0, Claim("a", "job", 1))
+        take_epoch(run, LARGEST_EPOCH, Claim("a", "job", 1))
     assert read_epoch(run) == LARGEST_EPOCH
 
 
 TAKE = """
 import sys
 from pathlib import Path
-from shared_store.epoch import Claim, StaleEpoch, take_epoch
+from shared_store.epoch import Claim, StaleEpoch, read_epoch, take_epoch
 from shared_store.layout import Run
+run = Run(Path(sys.argv[1]))
 sys.stdin.readline()
-for attempt in range(40):
+taken = 0
+while taken < 30:
     try:
-        print(take_epoch(Run(Path(sys.argv[1])), 0, Claim(sys.argv[2], "job", attempt)), flush=True)
+        print(take_epoch(run, read_epoch(run), Claim(sys.argv[2], "job", taken)), flush=True)
+        taken += 1
     except StaleEpoch:
         pass
 """
@@ -118,7 +122,7 @@ def test_controllers_that_take_epochs_at_once_never_get_the_same(tmp_path: Path)
         taker.stdin.write("go\n")
         taker.stdin.flush()
     taken = [int(line) for taker in takers for line in taker.communicate(timeout=60)[0].split()]
-    assert len(taken) == len(set(taken)) >= 40
+    assert len(taken) == len(set(taken)) == 90
     run = Run(tmp_path / "run")
     assert read_epoch(run) in taken
     claims = {int(path.suffix[1:]) for path in run.path.glob("EPOCH.*")}
@@ -131,8 +135,30 @@ def test_an_epoch_that_another_controller_claimed_but_did_not_publish_is_passed_
     (tmp_path / "EPOCH.5").touch()
     with pytest.raises(StaleEpoch, match="another attempt has epoch 5"):
         raise_epoch(run, 5)
-    assert take_epoch(run, 0, Claim("a", "job", 1)) == 6
+    assert take_epoch(run, 4, Claim("a", "job", 1)) == 6
     assert read_epoch(run) == 6
+
+
+def test_a_controller_that_claims_second_leaves_the_run_to_the_first(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    raise_epoch(run, 4)
+    (tmp_path / "EPOCH.5").write_text('{"controller": "b", "job": "job", "attempt": 1}')
+    first = threading.Timer(0.2, lambda: (tmp_path / "EPOCH").write_text("5\n"))
+    first.start()
+    with pytest.raises(StaleEpoch, match=r"another controller has just taken run .* with epoch 5"):
+        take_epoch(run, 4, Claim("a", "job", 1))
+    first.join()
+    assert read_epoch(run) == 5
+    with pytest.raises(StaleEpoch, match="has just taken"):
+        take_epoch(run, 4, Claim("a", "job", 1))  # decided before the other controller had published
+
+
+def test_an_own_claim_of_before_a_crash_is_passed_over_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shared_store.epoch._PUBLICATION", 600.0)
+    run, claim = Run(tmp_path), Claim("a", "job", 1)
+    raise_epoch(run, 4)
+    (tmp_path / "EPOCH.5").write_text('{"controller": "a", "job": "other", "attempt": 1}')
+    assert take_epoch(run, 4, claim) == 6
 
 
 def test_of_two_that_publish_at_the_same_instant_one_alone_owns_the_run(tmp_path: Path) -> None:
