@@ -6,8 +6,14 @@ import fcntl
 import json
 import logging
 import os
+import re
 from pathlib import Path
 from typing import IO
+
+_OURS = re.compile(
+    r"controller\.(json|lock)|muster\.db(-.*)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
+)
+"""Names in the home directory: database, keys, bus, the engines' directories, and what a volume has of itself."""
 
 log = logging.getLogger("muster.home")
 
@@ -31,22 +37,20 @@ def local_url() -> str | None:
         return None
 
 
-def make_private(directory: Path, is_ours: bool = True) -> None:
-    """Create a directory for its user alone (0700); one that others can enter is closed to them, which is logged.
+def make_private(home: Path) -> None:
+    """Create the home directory for its user alone (0700); one that others can enter is closed to them, which is logged.
 
-    ``is_ours``: it was made for Muster. Another one is closed only while it is empty: who knows who else uses it. Raises OSError.
+    One that holds anything but what Muster puts there is left as it is, which is logged too: others may need it. Raises OSError.
     """
-    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = directory.stat()
+    home.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = home.stat()
     if not found.st_mode & 0o077:
         return
-    if found.st_uid == os.geteuid() and (is_ours or not any(directory.iterdir())):
-        directory.chmod(found.st_mode & 0o700)
-        log.warning("%s was open to other users; it is closed to them now (chmod 700)", directory)
+    if found.st_uid == os.geteuid() and all(_OURS.fullmatch(entry.name) for entry in home.iterdir()):
+        home.chmod(found.st_mode & 0o700)
+        log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
     else:
-        log.warning(
-            "%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", directory
-        )
+        log.warning("%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", home)
 
 
 class ControllerRuns(ServerError):
@@ -57,7 +61,7 @@ class HomeLock:
     """One controller a home directory: a lock that the kernel drops when the process dies, however it dies."""
 
     def __init__(self, home: Path) -> None:
-        make_private(home, is_ours=(home / "controller.lock").exists())
+        make_private(home)
         self.path = home / "controller.json"
         self._file: IO[str] = open(home / "controller.lock", "a")  # noqa: SIM115 - held until release()
         try:

@@ -96,6 +96,7 @@ class Operation(StrEnum):
     START_LIVE_TAIL = "StartLiveTail"
     READ_HEALTH = "GET /healthz"
     READ_FRONT_PAGE = "GET /"
+    READ_DOCUMENTATION = "GET /api/docs"
     READ_CAPACITY = "GET /api/capacity"
     PLAN = "POST /api/plan"
     READ_JOB = "GET /api/jobs/{reference}"

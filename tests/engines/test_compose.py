@@ -29,7 +29,7 @@ class Cluster:
     """A project of docker-compose: the file that users get, over an image made of this machine's files."""
 
     def __init__(self, folder: Path) -> None:
-        self.port, self.token = free_port(), secrets.token_hex(8)
+        self.port, self.token = free_port(), secrets.token_hex(16)
         self.project = f"mustertest{os.getpid()}"
         mounts = host_files()
         sources = {volume["name"]: volume["host"]["sourcePath"] for volume in mounts["volumes"]}
@@ -40,7 +40,7 @@ class Cluster:
         services = {"head": changes, "controller": changes, "worker": worker}
         (folder / "override.yaml").write_text(yaml.safe_dump({"services": services}))
         environment = {
-            "RAY_AUTH_TOKEN": secrets.token_hex(8),
+            "RAY_AUTH_TOKEN": secrets.token_hex(16),
             "MUSTER_TOKEN": self.token,
             "MUSTER_WORK": str(REPOSITORY),
             "MUSTER_PORT": str(self.port),
