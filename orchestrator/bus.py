@@ -90,8 +90,8 @@ class Bus:
         """Called (on the network's thread) when a node came or went."""
         self._home, self._addresses = home, addresses
         self._lock = threading.Lock()
-        self._expected: set[tuple[str, int]] = set()
-        """The open attempts; what is said of others is dropped."""
+        self._expected: dict[tuple[str, int], int] = {}
+        """The open attempts and how many nodes each has; what is said of others is dropped."""
         self._gone: dict[Node, float | None] = {}
         """Since when (monotonic [s]) each node that was ever here is gone; None while it is here."""
         self._progress: dict[Node, dict[str, Any]] = {}
@@ -110,7 +110,7 @@ class Bus:
             kept = read_json(self._home / "bus.json") or {}
         except ValueError:
             log.warning(
-                "%s is damaged: the bus starts anew, and nodes that run now can't find it", self._home / "bus.json"
+                "%s is damaged: the bus starts with a new key, which running nodes do not have", self._home / "bus.json"
             )
             kept = {}
         self._master = str(kept.get("key") or secrets.token_hex(32))
@@ -161,10 +161,10 @@ class Bus:
             self._session.close()
             self._session = None
 
-    def expect(self, job: str, attempt: int) -> None:
+    def expect(self, job: str, attempt: int, nodes: int) -> None:
         """Listen to the attempt's nodes from now on, until :meth:`forget`."""
         with self._lock:
-            self._expected.add((job, attempt))
+            self._expected[job, attempt] = nodes
 
     def token(self, job: str, attempt: int) -> str | None:
         """``MUSTER_BUS_TOKEN`` of the attempt's nodes; None with the bus off."""
@@ -192,7 +192,7 @@ class Bus:
     def forget(self, job: str, attempt: int) -> None:
         """The attempt is closed."""
         with self._lock:
-            self._expected.discard((job, attempt))
+            self._expected.pop((job, attempt), None)
             for table in (self._gone, self._progress):
                 for node in [node for node in table if node[:2] == (job, attempt)]:
                     del table[node]
@@ -255,10 +255,10 @@ class Bus:
                 self._progress[node] = progress
 
     def _sender(self, key: str) -> Node | None:
-        """The node whose key this is, if its attempt is open."""
+        """The node whose key this is, if its attempt is open and has such a node."""
         node = node_of(key)
         with self._lock:
-            return node if node is not None and node[:2] in self._expected else None
+            return node if node is not None and 0 <= node[2] < self._expected.get(node[:2], 0) else None
 
 
 def _message(payload: bytes) -> dict[str, Any]:

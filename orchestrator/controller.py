@@ -95,7 +95,7 @@ class Controller:
             self.clock.restore(session)
             self.roster.load(session)
             for job, attempt in open_attempts(session, self.roster.active()):
-                bus.expect(job.id, attempt.number)  # before the router is there for their nodes
+                bus.expect(job.id, attempt.number, len(attempt.nodes))  # before the router is there for their nodes
 
     def start(self) -> None:
         self._thread.start()

@@ -135,7 +135,7 @@ class Gangs:
             plan = self.engine.plan(self.gang(session, job, attempt, gang_needs(job.node_properties)))
             return self.engine.with_secrets(plan)
 
-        self.bus.expect(job.id, attempt.number)
+        self.bus.expect(job.id, attempt.number, len(attempt.nodes))
         try:
             attempt.handle = self.engine.launch(_name(attempt), [str(node["host"]) for node in attempt.nodes], plan)
         except NotYet as wait:

@@ -35,7 +35,7 @@ bus.tend(None)
 def bus(tmp_path: Path) -> Iterator[Bus]:
     bus = Bus(tmp_path)
     bus.open()
-    bus.expect("j", 1)
+    bus.expect("j", 1, nodes=2)
     yield bus
     bus.close()
 
@@ -149,7 +149,7 @@ def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_p
     other = Bus(tmp_path / "other")
     other._home.mkdir()
     other.open()
-    other.expect("j", 1)
+    other.expect("j", 1, nodes=2)
     node = start_node(bus, "time.sleep(60)")
     time.sleep(1.0)
     assert other._gone == {} and other.endpoint != bus.endpoint

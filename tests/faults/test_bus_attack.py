@@ -44,8 +44,8 @@ class Victim:
 def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     bus = Bus(tmp_path_factory.mktemp("home"))
     bus.open()
-    bus.expect("victim", 1)
-    bus.expect("mallory", 1)
+    bus.expect("victim", 1, nodes=2)
+    bus.expect("mallory", 1, nodes=2)
     yield bus
     bus.close()
 
@@ -203,7 +203,10 @@ def test_invented_keys_leave_nothing_in_the_controller(bus: Bus, victim: Victim)
     for number in range(20_000):
         key = f"muster/invented-{number}/1/0/progress"
         session.put(key, "{}", attachment=own(bus).prove("progress", key, "{}"))
+        own_key = f"muster/mallory/1/{number + 2}/progress"  # of nodes that the attempt does not have
+        session.put(own_key, "{}", attachment=own(bus).prove("progress", own_key, "{}"))
         if number % 100 == 0:
+            tokens.append(session.liveliness().declare_token(presence_key(own(bus), "mallory", 1, number + 2)))
             tokens.append(session.liveliness().declare_token(presence_key(own(bus), f"invented-{number}", 1, 0)))
     settled(bus, session)
     assert (set(bus._gone), set(bus._progress)) == before
@@ -214,8 +217,8 @@ def test_what_an_attempt_says_after_it_is_closed_is_dropped(tmp_path: Path) -> N
     bus = Bus(tmp_path)
     bus.open()
     try:
-        bus.expect("victim", 1)
-        bus.expect("mallory", 1)
+        bus.expect("victim", 1, nodes=2)
+        bus.expect("mallory", 1, nodes=2)
         victim, session = Victim(bus), attacker(bus)
         wait_for(lambda: bus.progress("victim", 1, 0) is not None, 10, "the victim's progress")
         bus.forget("victim", 1)
@@ -259,7 +262,8 @@ print(f"answers: {len(list(session.get('muster/VICTIM/1/0/command/stop', timeout
 """
 
 
-def test_a_job_that_takes_its_supervisors_credential_stops_no_other_job(server: Serving) -> None:
+def test_a_job_that_takes_its_supervisors_credential_stops_no_other_job(shared_server: Serving) -> None:
+    server = shared_server
     victim = server.gang("import time; time.sleep(600)")
     wait_for(lambda: server.muster("stacks", victim).returncode == 0, 30, "the victim on the bus")
     hostile = server.gang(STOP_ANOTHER.replace("VICTIM", victim))
