@@ -90,11 +90,12 @@ def find_run(controller: Controller, name: str) -> Run:
 
 
 def permitted_run(controller: Controller, name: str, operation: Operation) -> Run:
-    """The run called ``name``, where the caller may do this to it. Raises ClientError."""
-    run = find_run(controller, name)
+    """The run called ``name``, where the caller may do this to it; nothing of another's is read. Raises ClientError."""
     with controller.database.session() as session:
-        check(operation, owner_of(session, run) or RunRecord(name=name, queue=""))
-    return run
+        owner = owner_of(session, Context(session, controller).run(name))
+    if owner is not None:
+        check(operation, owner)
+    return find_run(controller, name)
 
 
 def visible_runs(session: Session, store: Store, after: str = "", most: int | None = None) -> list[Run]:

@@ -37,7 +37,7 @@ class Folder:
 
     def make(self) -> None:
         """Make the folder, for its owner only (plans hold the job's environment), and the pipe."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.path.chmod(0o700)
         if not (self.pipe.exists() and stat.S_ISFIFO(self.pipe.stat().st_mode)):
             with contextlib.suppress(FileExistsError):
