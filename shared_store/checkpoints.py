@@ -74,7 +74,7 @@ class Checkpoint:
             raise NewerFormat(
                 f"checkpoint {self.name}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
             )
-        for key in ("created", "reward", "worlds", "world_size"):
+        for key in ("created", "reward", "score", "worlds", "world_size"):
             if isinstance(manifest.get(key), str | list | dict):
                 raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json: {key} is not a number")
         return manifest
@@ -207,7 +207,7 @@ class CheckpointWriter:
 
         Args:
             facts: What else the manifest says (world size, worlds, reward, versions); JSON values.
-            keep: How many of the newest checkpoints to keep; None keeps all. The best by ``reward`` is always kept.
+            keep: How many of the newest checkpoints to keep; None keeps all. The best by ``score`` is always kept.
             digests: ``{name: {"size", "sha256"}}`` of every file, as those who wrote them know them; read back where None.
 
         Raises:
@@ -249,11 +249,11 @@ class CheckpointWriter:
 
 
 def retain(run: Run, keep: int) -> list[str]:
-    """Delete all but the newest ``keep`` checkpoints, the best one (greatest ``reward``) and those that an evaluation or an export
+    """Delete all but the newest ``keep`` checkpoints, the best one (greatest ``score``) and those that an evaluation or an export
     was made of; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
-    scored = [(score, c.name) for c in checkpoints if (score := _reward(c)) is not None]
+    scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
     kept = {c.name for c in checkpoints[-max(1, keep) :]} | ({max(scored)[1]} if scored else set())
     kept |= {path.stem for path in run.evaluations.glob("*.json")} | {path.name for path in run.exports.glob("*")}
     deleted = [checkpoint for checkpoint in checkpoints if checkpoint.name not in kept]
@@ -262,12 +262,14 @@ def retain(run: Run, keep: int) -> list[str]:
     return [checkpoint.name for checkpoint in deleted]
 
 
-def _reward(checkpoint: Checkpoint) -> float | None:
+def _score(checkpoint: Checkpoint) -> float | None:
+    """How good the policy was: ``score`` of the manifest, or ``reward`` of one that an older Muster wrote."""
     try:
-        reward = checkpoint.manifest.get("reward")
+        manifest = checkpoint.manifest
     except DamagedCheckpoint:
         return None
-    return float(reward) if isinstance(reward, int | float) and math.isfinite(reward) else None
+    score = manifest.get("score", manifest.get("reward"))
+    return float(score) if isinstance(score, int | float) and math.isfinite(score) else None
 
 
 def _is_size(value: object) -> bool:

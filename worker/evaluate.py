@@ -21,7 +21,7 @@ def main() -> int:
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from worker.learning.evaluation import evaluate
     from worker.learning.ppo import PPO, Share
-    from worker.learning.randomness import seed_generators
+    from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.runner import build_task
     from worker.learning.trained import choose_checkpoint, load_learner
     from worker.tasks import find_task
@@ -31,7 +31,7 @@ def main() -> int:
     with user_errors("task"):
         task_type = find_task(facts["task"])
     config = configure(task_type, facts["train"])
-    seed = job.setting("seed", 0, least=0)
+    seed = job.setting("seed", held_out_seed(facts["train"].get("seed", 0)), least=0)
     seed_generators(seed)
     share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
     task = build_task(task_type, config, share, gang, seed)

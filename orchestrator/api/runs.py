@@ -73,7 +73,12 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
     facts["path"] = str(checkpoint.path)
     try:
         manifest = checkpoint.manifest
-        facts |= {"size": checkpoint.size, "created": manifest.get("created"), "reward": manifest.get("reward")}
+        facts |= {
+            "size": checkpoint.size,
+            "created": manifest.get("created"),
+            "reward": manifest.get("reward"),
+            "score": manifest.get("score"),
+        }
         facts |= {"worlds": manifest.get("worlds"), "worldSize": manifest.get("world_size")}
         if verify:
             checkpoint.verify()

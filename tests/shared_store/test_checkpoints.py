@@ -333,6 +333,12 @@ def test_retention_keeps_the_newest_and_the_best(run: Run) -> None:
     assert names(run) == ["00000020-e1", "00000040-e1", "00000050-e1"]
 
 
+def test_the_best_is_the_one_with_the_best_score_whatever_its_last_iteration_brought(run: Run) -> None:
+    for iteration, score, reward in ((10, None, 99.0), (20, 9.0, 1.0), (30, 3.0, 50.0), (40, 2.0, 2.0), (50, 4.0, 4.0)):
+        commit(run, iteration, keep=2, score=score, reward=reward)
+    assert names(run) == ["00000020-e1", "00000040-e1", "00000050-e1"]
+
+
 def test_retention_deletes_nothing_where_all_are_to_be_kept(run: Run) -> None:
     for iteration in (10, 20, 30, 40):
         commit(run, iteration)

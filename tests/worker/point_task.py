@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from worker.tasks.config import PPOConfig
+from worker.tasks.config import PPOConfig, Randomization
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class PointConfig:
     sleep: float = 0.0
     """How long a step takes [s]."""
     nan_limit: float = 0.1
+    randomize: Randomization = field(default_factory=Randomization)
     curriculum: Mapping[str, list[list[float]]] = field(default_factory=dict)
     ppo: PointPPO = field(default_factory=PointPPO)
 

@@ -12,10 +12,9 @@ import warp as wp
 from tests.worker.test_tasks import observe, play, put, same
 from worker.errors import UserError
 from worker.learning.job import configure
-from worker.simulation.randomization import FACTORS
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import Randomization
+from worker.tasks.config import FACTORS, Randomization
 from worker.tasks.quadruped import Quadruped, QuadrupedConfig
 
 ALL = Randomization(mass=(0.5, 2.0), friction=(0.5, 1.25), damping=(0.5, 3.0), gains=(0.8, 1.2), gravity=(0.9, 1.1))

@@ -14,6 +14,11 @@ def mix_seed(*parts: int) -> int:
     return int(np.random.SeedSequence((len(parts), *parts)).generate_state(1, np.uint64)[0] >> 1)
 
 
+def held_out_seed(seed: int) -> int:
+    """The seed of the worlds on which a policy is evaluated that was trained with ``seed``: they are none of those of its training."""
+    return mix_seed(seed, 4)
+
+
 def seed_generators(seed: int, rank: int | None = None) -> None:
     """Seed torch's, numpy's and Python's global generators: alike on all ranks, or each rank its own."""
     value = mix_seed(seed, 2) if rank is None else mix_seed(seed, 3, rank)

@@ -22,7 +22,7 @@ from worker.learning.evaluation import evaluate
 from worker.learning.faults import die, kill_at
 from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
 from worker.learning.ppo import LOSSES, PPO, Share
-from worker.learning.randomness import seed_generators
+from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.recording import HostCopy, Recorded
 from worker.learning.replay import Replay
 from worker.learning.report import Report, Stopwatch
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
+EVALUATED = 1024
+"""At most so many worlds of each rank are built to evaluate a policy."""
 WARNINGS = 10
 """At most so many iterations with worlds that were reset have a line of their own."""
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
@@ -278,11 +280,19 @@ class Runner:
         finished, returns, lengths, *others = totals
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
+        progress.count(
+            self.config.ppo.steps,
+            finished,
+            returns,
+            worlds=self.ppo.share.total,
+            longest=self.task.max_episode_length,
+        )
         return {
             "iteration": progress.iteration,
             "env_steps": progress.env_steps,
             "reward": progress.reward,
             "episode_length": progress.episode_length,
+            "score": progress.score,
             "episodes": int(finished),
             "steps_per_second": steps / (collect + learn),
             "collect_seconds": collect,
@@ -311,8 +321,7 @@ class Runner:
                 "training is done, but its last checkpoint could not be saved; free space in the store and start again"
             )
         self.beacon.tell(done=True)
-        self._begin_iteration(max(0, self.state.progress.iteration - 1))
-        result = evaluate(self.task, self.ppo, self.gang, checkpoint=name)
+        result = evaluate(self.held_out_worlds(), self.ppo, self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:
             return
@@ -327,6 +336,20 @@ class Runner:
         print(f"last checkpoint: {self.job.run.checkpoints / name}", flush=True)
         if plot:
             print(f"reward plot: {plot}", flush=True)
+
+    def held_out_worlds(self) -> Task:
+        """The worlds on which the policy is evaluated. All ranks call it.
+
+        They are those of training, of which each episode begins at a new random start, unless the worlds themselves were drawn at random:
+        then they are others, drawn from another seed.
+        """
+        worlds, began = self.task, max(0, self.state.progress.iteration - 1)
+        if self.config.randomize.draws_worlds:
+            total = min(self.ppo.share.total, EVALUATED * self.gang.size)
+            share = Share.of(self.gang.rank, self.gang.size, total)
+            worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.seed))
+        worlds.begin_iteration(began, self.state.progress.reward, self.state.progress.episode_length)
+        return worlds
 
     def _say(self, text: str) -> None:
         if self.gang.is_main:

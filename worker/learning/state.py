@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import (
@@ -46,6 +46,37 @@ class Progress:
     """Mean return of the episodes that ended in the last iteration in which any ended; None before the first."""
     episode_length: float | None = None
     """Their mean length [steps]."""
+    score: float | None = None
+    """Mean return of the newest episodes, over enough of them to compare checkpoints; None until there are enough."""
+    recent: list[list[float]] = field(default_factory=list)
+    """The newest iterations, as many as the score needs: steps of each world, episodes that ended, and the sum of their returns."""
+
+    def count(self, steps: int, episodes: float, returns: float, *, worlds: int, longest: int) -> None:
+        """Note what ended in an iteration, and work out the score.
+
+        The score covers at least :data:`EPISODES` episodes, one for each world, and at least as many steps as an episode can have: over
+        less, only those that ended early would count, which are falls.
+
+        Args:
+            steps: Of each world.
+            episodes: How many ended, in the worlds of all ranks.
+            returns: Sum of their returns.
+            worlds: Of all ranks.
+            longest: Steps of the longest episode.
+        """
+        self.recent.append([steps, episodes, returns])
+        span = ended = total = 0.0
+        for index in reversed(range(len(self.recent))):
+            entry = self.recent[index]
+            span, ended, total = span + entry[0], ended + entry[1], total + entry[2]
+            if span >= longest and ended >= max(EPISODES, worlds):
+                self.score = total / ended
+                del self.recent[:index]
+                return
+
+
+EPISODES = 100
+"""A score is the mean over so many episodes, at least."""
 
 
 class TrainingState:
@@ -109,6 +140,7 @@ class TrainingState:
             "worlds": self.share.total,
             "shards": [[share.first, share.count] for share in shares],
             "reward": self.progress.reward,
+            "score": self.progress.score,
             "episode_length": self.progress.episode_length,
             "env_steps": self.progress.env_steps,
             "learning_rate": self.learning_rate,

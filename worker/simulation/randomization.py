@@ -15,14 +15,12 @@ import warp as wp
 
 from worker.simulation.episodes import STEP, STEPS, EpisodeArrays, numbered_stream, random_stream
 from worker.simulation.worlds import WorldArrays, Worlds
+from worker.tasks.config import FACTORS
 
 if TYPE_CHECKING:
     from worker.tasks.config import Randomization
 
 wp.set_module_options({"enable_backward": False})
-
-FACTORS = ("mass", "friction", "damping", "gains", "gravity")
-"""What is drawn once a world, in the order of the columns of :attr:`Randomizer.factors`."""
 
 
 @wp.kernel

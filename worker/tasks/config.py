@@ -98,6 +98,8 @@ _PPO_NUMBERS = (
 """Numbers of :class:`PPOConfig`: name, least, greatest, and the range in words."""
 
 
+FACTORS = ("mass", "friction", "damping", "gains", "gravity")
+"""Factors on the physics of each world."""
 _SCALARS = ("push_interval", "push_velocity")
 _SCENE = ("camera_position", "camera_angle", "colors")
 
@@ -144,8 +146,13 @@ class Randomization:
         """What is on that only a camera sees."""
         return [name for name in _SCENE if getattr(self, name)] + (["light"] if self.light != (1.0, 1.0) else [])
 
+    @property
+    def draws_worlds(self) -> bool:
+        """Whether physics or scene of each world are drawn when it is built."""
+        return bool(self.scene) or any(getattr(self, name) != (1.0, 1.0) for name in FACTORS)
+
     def __post_init__(self) -> None:
-        for name in ("mass", "friction", "damping", "gains", "gravity", "light"):
+        for name in (*FACTORS, "light"):
             ends = getattr(self, name)
             pair = isinstance(ends, list | tuple) and len(ends) == 2 and all(_is_finite(end) for end in ends)
             if not pair or not 0.0 <= ends[0] <= ends[1] or (name == "mass" and ends[0] == 0.0):
