@@ -16,12 +16,9 @@ import torch
 from shared_store.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.layout import Store
 from tests.conftest import Serving
-from tests.worker.point_task import Point
 from tests.worker.ranks import training
-from tests.worker.test_runner import train
-from worker.distributed import Gang, Placement
+from tests.worker.test_runner import runner, train
 from worker.errors import UserError
-from worker.learning.job import Job, StopRequest
 from worker.learning.runner import Runner
 from worker.learning.trained import load_learner
 
@@ -151,8 +148,7 @@ def store(trained: Path, tmp_path: Path) -> Path:
 
 
 def go_on(store: Path, **changes: Any) -> Runner:
-    job = Job.from_env(training(store, iterations=4, epoch=2, **changes), "train")
-    return Runner(job, Gang(Placement(), "cpu", None, ["here"]), Point, StopRequest())  # type: ignore[arg-type]
+    return runner(training(store, iterations=4, epoch=2, **changes))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch
+from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.worker.point_task import Point
@@ -26,16 +26,15 @@ from worker.learning.runner import Runner
 
 
 def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Runner:
-    return Runner(
-        Job.from_env(env, "train"), gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest()
-    )
+    """One attempt, to which the run is given first, as a controller does."""
+    job = Job.from_env(env, "train")
+    if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
+        raise_epoch(job.run, job.epoch)
+    return Runner(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
 
 
 def train(env: dict[str, str], gang: Gang | None = None) -> Runner:
     """Train to the end, as one attempt."""
-    job = Job.from_env(env, "train")
-    if gang is None or gang.is_main:
-        raise_epoch(job.run, job.epoch)
     started = runner(env, gang)
     assert started.train() == 0
     return started
