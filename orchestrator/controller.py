@@ -43,6 +43,8 @@ _PASS_INTERVAL = 1.0
 """Seconds between scheduling passes while nothing changes: shares decay and limits run out by themselves."""
 _PASS_SHARE = 0.2
 """Share of one CPU that passes may take."""
+_WITHOUT_DATABASE = 1.0
+"""Seconds between two looks for a database that can't be used."""
 _SWEEP_INTERVAL = 2.0
 """Seconds between two looks for queues that are gone and history that may be forgotten."""
 
@@ -114,7 +116,7 @@ class Controller:
     def _loop(self) -> None:
         while not self._ending.is_set():
             self._isolated("reconciling", self.tick)
-            if self._wake.wait(self.interval):
+            if self._wake.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
                 self._ending.wait(_GATHERING)
             self._wake.clear()
 
@@ -149,6 +151,7 @@ class Controller:
             self._kept = time.monotonic()
         if self.trouble is not None:
             with self.database.session() as session:
+                self.clock.rewrite(session)  # to be read is not enough: its volume may be full
                 self.roster.load(session)
             self.trouble = None
             log.warning("the database can be used again")
@@ -160,7 +163,7 @@ class Controller:
             self._backoff.worked(what)
         except DatabaseError as error:
             if self.trouble is None:
-                log.error("%s; no job is started or accepted until then", error)
+                log.error("%s; until it can be used again no job is started or accepted", error)
             self.trouble = str(error)
         except Exception as error:
             self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)

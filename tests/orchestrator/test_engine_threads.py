@@ -11,6 +11,7 @@ import os
 import resource
 import socket
 import socketserver
+import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -243,6 +244,50 @@ def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_start
 def _gang_of(pid: int) -> str:
     environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     return next((item[12:].decode() for item in environment if item.startswith(b"MUSTER_GANG=")), "")
+
+
+def test_a_job_that_can_t_be_started_for_now_keeps_its_attempts_and_one_that_never_can_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    popen, number = subprocess.Popen, [errno.EAGAIN]
+
+    def refused(command: Sequence[str], *arguments: Any, **options: Any) -> Any:
+        if number and "worker.supervisor" in command:
+            raise OSError(number[0], os.strerror(number[0]))
+        return popen(command, *arguments, **options)
+
+    monkeypatch.setattr("orchestrator.engines.local.subprocess.Popen", refused)
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+
+            def shows(job: str, *wanted: str) -> dict[str, Any]:
+                def there() -> dict[str, Any] | None:
+                    found: dict[str, Any] = client.get(f"/api/jobs/{job}")
+                    return found if (found["status"], found["statusReason"])[: len(wanted)] == wanted else None
+
+                found: dict[str, Any] = wait_for(there, 30, f"{job} {wanted}")
+                return found
+
+            said = (
+                "the local engine can't start the gang now ([Errno 11] Resource temporarily unavailable); trying again"
+            )
+            job, other = (submit_gang(client, "print('here')", attempts=3) for _ in range(2))
+            shows(job, "STARTING", said)
+            shows(other, "STARTING", said)
+            client.batch("TerminateJob", jobId=other, reason="enough")
+            shows(other, "FAILED", "enough")
+            number[:] = [errno.E2BIG]
+            assert len(shows(job, "FAILED", "can't start the gang: [Errno 7] Argument list too long")["attempts"]) == 1
+            number[:] = [errno.EMFILE]
+            job = submit_gang(client, "print('here')", attempts=3)
+            shows(job, "STARTING")
+            number.clear()
+            assert len(shows(job, "SUCCEEDED")["attempts"]) == 1
+    finally:
+        server.close()
+    assert sum(said in record.getMessage() for record in caplog.records) == 2, "once for each job"
 
 
 class HungDocker(socketserver.ThreadingUnixStreamServer):
