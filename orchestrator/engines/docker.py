@@ -141,8 +141,8 @@ class DockerEngine:
                 with ThreadPoolExecutor(len(found)) as pool:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
             self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
-            while len(self._ended) > _REMEMBERED:
-                del self._ended[next(iter(self._ended))]
+            for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
+                self._ended.pop(gang, None)
             self._remove(facts["gang"])
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from queue import SimpleQueue
 from typing import TypeVar
 
@@ -139,7 +140,7 @@ class Runner:
         with self._lock:
             if handle not in self._looks and not self._backoff.waits(subject):
                 self._looks.add(handle)
-                self._submit(lambda: self._look(handle))
+                self._calls.put(partial(self._look, handle))
         seen = self._seen.get(handle)
         if trouble := self.silence or self._backoff.said(subject):
             seen = seen or [NodeStatus(True, "")] * nodes
@@ -166,7 +167,10 @@ class Runner:
     def _run(self) -> None:
         while (call := self._calls.get()) is not None:
             self._since = time.monotonic()
-            call()
+            try:
+                call()
+            except Exception:  # a bug here must not end the thread
+                log.exception("a call of the %s engine failed", self.engine.name)
             self._since = None
             if self._backoff.worked("silence"):
                 log.warning("the %s engine answers again", self.engine.name)

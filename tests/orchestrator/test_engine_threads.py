@@ -290,6 +290,26 @@ def test_a_job_that_can_t_be_started_for_now_keeps_its_attempts_and_one_that_nev
     assert sum(said in record.getMessage() for record in caplog.records) == 2, "once for each job"
 
 
+DEFINITION = {
+    "jobDefinitionName": "planned",
+    "type": "multinode",
+    "nodeProperties": {
+        "numNodes": 1,
+        "mainNode": 0,
+        "nodeRangeProperties": [
+            {
+                "targetNodes": "0",
+                "container": {
+                    "image": "any",
+                    "command": ["true"],
+                    "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "64"}],
+                },
+            }
+        ],
+    },
+}
+
+
 class HungDocker(socketserver.ThreadingUnixStreamServer):
     """A Docker daemon that says what it is, and from then on takes every request and answers none."""
 
@@ -366,6 +386,8 @@ def test_a_docker_daemon_that_hangs_delays_no_gang_of_another_engine(
                 "localhost",
                 "docker",
             ]
+            plan = client.post("/api/plan", {"definition": DEFINITION, "queue": "docker"})
+            assert (plan["engine"], len(plan["nodes"])) == ("docker", 1)
             client.batch("TerminateJob", jobId=running, reason="enough")
             status(running, "FAILED")
             assert detail(hung)["status"] == "STARTING" and len(daemon.asked) == 1
