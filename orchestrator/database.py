@@ -38,7 +38,7 @@ __all__ = ["Attempt", "Base", "Database", "DatabaseError", "DatabaseFull", "Job"
 MIGRATIONS = Path(__file__).parent / "migrations"
 _RESERVE = 5 << 20
 """Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
-_FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_SHMSIZE")
+_FULL = ("SQLITE_FULL", "SQLITE_IOERR_SHMSIZE")
 _CONTROLLER_LOCK = 0x6D7573746572
 """Key of PostgreSQL's advisory lock: one controller a database."""
 
@@ -190,7 +190,7 @@ class Database:
                 connection.commit()
                 connection.exec_driver_sql("DROP TABLE muster_reserve")
                 connection.commit()
-                connection.exec_driver_sql("PRAGMA wal_checkpoint(RESTART)").close()
+                connection.exec_driver_sql("PRAGMA wal_checkpoint(PASSIVE)").close()
         except OperationalError as error:
             if not _is_full(error):
                 raise

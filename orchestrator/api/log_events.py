@@ -224,11 +224,12 @@ def log_file(path: Path, stream: str) -> LogFile:
 def first_and_last(path: Path) -> tuple[int, int, int] | None:
     """First and last time [ms] and size [bytes] of a log, from its two ends alone; None without an event. Raises OSError."""
     try:
-        sizes = [os.stat(segment.path).st_size for segment in segments_of(path)]
+        segments = segments_of(path)
+        sizes = [os.stat(segment.path).st_size for segment in segments]
         with open(path, "rb") as file:
             head = _STAMPS.search(file.read(_ENDS))
-        with open(segments_of(path)[-1].path, "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
+        with open(segments[-1].path, "rb") as file:
+            file.seek(max(0, sizes[-1] - _ENDS))
             tail = _STAMPS.findall(file.read(_ENDS))
     except (FileNotFoundError, IndexError):
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections import defaultdict
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.conformance.streams import ARN, GROUP, append, client_of, finished, log_of, stream_of, write
@@ -95,6 +97,27 @@ def test_a_line_that_reaches_its_file_late_is_not_lost_to_a_follower(shared_serv
     tail.ending.set()
     tail.join()
     client_of(shared_server.url, "batch").terminate_job(jobId=job, reason="enough")
+
+
+@pytest.mark.parametrize("follow", ["false", "true"])
+def test_a_long_log_comes_in_a_few_pieces_whole_and_in_order(shared_server: Serving, follow: str) -> None:
+    job = finished(shared_server, "for i in range(20_000): print(i)" + MAIN_LAST, 2, f"pieces-{follow}")
+    pieces = []
+    with httpx.stream("GET", f"{shared_server.url}/api/jobs/{job}/logs?follow={follow}", timeout=60) as answer:
+        pieces = list(answer.iter_raw())
+    lines = [json.loads(line) for line in b"".join(pieces).splitlines()]
+    for node in range(2):
+        texts = [line["text"] for line in lines if line["node"] == node and line["rank"] is not None]
+        assert texts == [str(i) for i in range(20_000)]
+    assert [line["time"] for line in lines] == sorted(line["time"] for line in lines)
+    assert len(pieces) < len(lines) / 50, "a line of its own for each would cost a hand-over between threads each"
+    positions = {f"1/{line['node']}": line["position"] for line in lines[: len(lines) // 2]}
+    again = httpx.get(
+        f"{shared_server.url}/api/jobs/{job}/logs", params={"positions": json.dumps(positions)}, timeout=60
+    )
+    assert [json.loads(line) for line in again.text.splitlines()] == lines[len(lines) // 2 :]
+    wrong = httpx.get(f"{shared_server.url}/api/jobs/{job}/logs", params={"positions": "[1]"})
+    assert wrong.status_code == 400 and "positions: expected a JSON object" in wrong.json()["message"]
 
 
 # -- StartLiveTail ----------------------------------------------------------------------------------------------------
