@@ -19,7 +19,7 @@ from orchestrator.engines import aws_batch
 from orchestrator.engines.aws_batch import AwsBatchEngine
 from orchestrator.engines.aws_config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
-from shared_store.epoch import raise_epoch, read_epoch
+from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
@@ -338,6 +338,17 @@ def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: Be
     lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
     assert not any("wrote" in line for line in lines)
     assert any("the run now belongs to epoch 9" in line for line in lines), lines
+
+
+def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(bench: Bench) -> None:
+    volume = bench.volume.run("run")
+    volume.create({"run": "run"})
+    raise_epoch(volume, 1, Claim("", "another-job", 2))
+    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
+    assert node.exit_code == 3
+    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    assert not any("wrote" in line for line in lines)
+    assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
 
 
 def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -> None:
