@@ -12,8 +12,21 @@ from orchestrator.accounting import usage_at
 from orchestrator.clock import Clock
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import Host, Placement, engine_of
+from orchestrator.engines.several import Several
 from orchestrator.pools import pool_engine
-from orchestrator.scheduling import FairShare, Leading, Pool, Queue, Running, Snapshot, TimeLimit, Waiting
+from orchestrator.scheduling import (
+    FairShare,
+    Fit,
+    Leading,
+    Pool,
+    Queue,
+    Running,
+    Shape,
+    Snapshot,
+    TimeLimit,
+    Waiting,
+    fit,
+)
 from orchestrator.tables import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 
 HOSTS_TAG = "muster:hosts"
@@ -73,6 +86,16 @@ def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Atte
         if job is not None and (attempt := job.open_attempt) is not None and attempt.nodes:
             found.append((job, attempt))
     return found
+
+
+def fit_in_queue(session: Session, engine: Several, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
+    """What the queue would have for a gang if nothing ran; ``patience``: seconds to wait for the engines' newest hosts."""
+    first = engine.names[0]
+    rows = [row for name in queue.environments if (row := session.get(ComputeEnvironment, name)) is not None]
+    pools = {row.name: read_pool(row, first) for row in rows}
+    engines = dict.fromkeys(pool.engine for pool in pools.values() if pool.engine is not None)
+    elastic = [name for name, pool in pools.items() if pool.engine is not None and engine.is_elastic([pool.engine])]
+    return fit(shape, read_queue(queue, {}), pools, engine.capacity(engines, patience), elastic)
 
 
 def read_queue(queue: JobQueue, policies: Mapping[str, SchedulingPolicy]) -> Queue:

@@ -17,7 +17,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
-from orchestrator.admission import node_records
+from orchestrator.admission import fit_in_queue, node_records
 from orchestrator.api import permissions, rules, runs
 from orchestrator.api.batch import validate
 from orchestrator.api.context import permitted_run
@@ -26,13 +26,13 @@ from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import find_job
-from orchestrator.definition import gang_needs
+from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.engines.several import FRESH
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.pools import own_queues, queue_engines
-from orchestrator.scheduling.placement import never_fits, place
+from orchestrator.scheduling.placement import needs as needed
 from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower, LogLine
@@ -107,19 +107,16 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
     controller = _controller(request)
-    definition = validate("RegisterJobDefinition", body.definition)
-    if definition["type"] != "multinode" or "nodeProperties" not in definition:
-        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    needs = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
+    needs, definition = _gang_of(body), body.definition
     with controller.database.session() as session:
-        hosts = controller.engine.capacity(queue_engines(session, body.queue, controller.engine.names[0]), FRESH)
-        queue = session.get(JobQueue, body.queue)
-        if queue is None:
-            raise ClientError(f"there is no queue {body.queue!r}")
+        queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
-        placements = place(needs.shape, hosts)
-        if placements is None:
-            raise ClientError(str(never_fits(needs.shape, hosts)))
+        found = fit_in_queue(session, controller.engine, queue, needs.shape, FRESH)
+        if found.seat is None:
+            raise ClientError(
+                found.problem or f"{needed(needs.shape)}; no host that it could have is known now; more may come"
+            )
+        pool, placements = found.seat
         job = Job(
             id="job",
             name=definition["jobDefinitionName"],
@@ -129,7 +126,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
             priority=definition.get("schedulingPriority", 0),
         )
-        attempt = Attempt(number=1, epoch=1, pool=queue.environments[0], nodes=node_records(placements))
+        attempt = Attempt(number=1, epoch=1, pool=pool, nodes=node_records(placements))
         gang = controller.gangs.gang(session, job, attempt, needs)  # neither of them is stored
     planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
@@ -146,7 +143,36 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     ]
     name = engine_of(placements[0].host)
     images = controller.engine.engines[name].images
-    return {"engine": name, "images": images, "nodes": nodes, "document": planned.document}
+    return {"engine": name, "computeEnvironment": pool, "images": images, "nodes": nodes, "document": planned.document}
+
+
+@router.post("/fit")
+def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
+    controller = _controller(request)
+    needs = _gang_of(body)
+    with controller.database.session() as session:
+        queue = _queue(session, body.queue)
+        permissions.check(Operation.FIT, JobsOf(queue.name))
+        return {"problem": fit_in_queue(session, controller.engine, queue, needs.shape, FRESH).problem}
+
+
+def _gang_of(body: PlanRequest) -> GangNeeds:
+    """What the job of a plan needs. Raises ClientError."""
+    definition = validate("RegisterJobDefinition", body.definition)
+    if definition["type"] != "multinode" or "nodeProperties" not in definition:
+        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
+    return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
+
+
+def _queue(session: Session, name: str) -> JobQueue:
+    """The queue of this name. Raises ClientError naming those that the caller may see."""
+    queue = session.get(JobQueue, name)
+    if queue is None or queue.deleting:
+        others = session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
+        there = ", ".join([each for each in others if permissions.is_visible(JobsOf(each))][:10])
+        raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
+    return queue
 
 
 def _planned(controller: Controller, gang: Gang) -> Plan:

@@ -99,6 +99,7 @@ class Operation(StrEnum):
     READ_DOCUMENTATION = "GET /api/docs"
     READ_CAPACITY = "GET /api/capacity"
     PLAN = "POST /api/plan"
+    FIT = "POST /api/fit"
     READ_JOB = "GET /api/jobs/{reference}"
     READ_JOB_LOGS = "GET /api/jobs/{reference}/logs"
     CHECKPOINT_JOB = "POST /api/jobs/{reference}/checkpoint"

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
+from orchestrator.admission import fit_in_queue
 from orchestrator.api import batch, definitions, limits, submission
 from orchestrator.api.context import Context, visible_runs
 from orchestrator.api.errors import ClientError
@@ -18,8 +19,6 @@ from orchestrator.engines.several import FRESH
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
-from orchestrator.pools import queue_engines
-from orchestrator.scheduling import never_fits
 from orchestrator.spec import Spec, SpecError, override, validate
 from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
@@ -148,10 +147,9 @@ def resume(
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
         definition = compile_definition(spec, directory)
-        engines = queue_engines(session, spec.queue, controller.engine.names[0])
-        hosts, elastic = controller.engine.capacity(engines), controller.engine.is_elastic(engines)
-        if impossible := never_fits(gang_needs(definition["nodeProperties"]).shape, hosts, elastic):
-            raise ClientError(f"run {run.name}: {impossible}")
+        shape = gang_needs(definition["nodeProperties"]).shape
+        if problem := fit_in_queue(session, controller.engine, context.queue(spec.queue), shape).problem:
+            raise ClientError(f"run {run.name}: {problem}")
         limits.check_document("RegisterJobDefinition", definition)
         registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
         if chosen and checkpoint is not None:

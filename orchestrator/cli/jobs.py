@@ -17,10 +17,9 @@ from orchestrator import specfile
 from orchestrator.cli.progress import evaluated, follow
 from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client
-from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
-from orchestrator.engines.base import Host, engine_of
-from orchestrator.scheduling import never_fits
+from orchestrator.engines.base import engine_of
 from orchestrator.spec import Spec, SpecError, schema
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -57,16 +56,8 @@ def submit_spec(
     ``environment`` is added on every node.
     """
     definition = compile_definition(spec, os.getcwd())
-    capacity = client.get("/api/capacity", queue=spec.queue)
-    if spec.queue not in capacity["queues"]:
-        raise SpecError(f"{source}: queue: there is no queue {spec.queue!r}; there is {', '.join(capacity['queues'])}")
-    hosts = [
-        Host(host["name"], host["cpus"], tuple(host["gpus"]), host["memory"], host["single"], host["away"])
-        for host in capacity["hosts"]
-    ]
-    shape = gang_needs(definition["nodeProperties"]).shape
-    if impossible := never_fits(shape, hosts, elastic=capacity["elastic"]):
-        raise SpecError(f"{source}: resources: {impossible}; lower nodes or resources (cpus may be a fraction)")
+    if problem := client.post("/api/fit", {"definition": definition, "queue": spec.queue})["problem"]:
+        raise SpecError(f"{source}: resources: {problem}; lower nodes or resources (cpus may be a fraction)")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
 

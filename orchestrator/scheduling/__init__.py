@@ -1,6 +1,7 @@
 """The scheduler: pure decisions over a snapshot. Order, fair share, gang admission, backfill, preemption, reasons for waiting."""
 
 from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
+from orchestrator.scheduling.fit import Fit, fit
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.placement import never_fits, place
 from orchestrator.scheduling.reasons import Board
@@ -22,6 +23,7 @@ __all__ = [
     "Cancel",
     "Decisions",
     "FairShare",
+    "Fit",
     "Leading",
     "NodeShape",
     "Pool",
@@ -35,6 +37,7 @@ __all__ = [
     "Waiting",
     "decayed",
     "decide",
+    "fit",
     "never_fits",
     "place",
 ]

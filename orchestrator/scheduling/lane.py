@@ -7,15 +7,14 @@ from collections import defaultdict
 from collections.abc import Sequence
 from math import inf
 
+from orchestrator.scheduling.fit import examine
 from orchestrator.scheduling.head import Head
-from orchestrator.scheduling.placement import affordable, count_of, needs, never_fits
+from orchestrator.scheduling.placement import affordable, count_of, needs
 from orchestrator.scheduling.quota import Quota
 from orchestrator.scheduling.room import Room, Seat
 from orchestrator.scheduling.snapshot import Pool, Shape
 
 NO_ROOM = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
-TOO_MANY_CPUS = "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE"
-TOO_LARGE = "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT"
 
 
 class Lane:
@@ -86,22 +85,7 @@ class Lane:
         return inf if most is None else most
 
     def _examine(self, shape: Shape) -> None:
-        possible, causes, too_many = [], [], 0
-        for name in self.pools:
-            where = f"compute environment {name}: " if len(self.pools) > 1 else ""
-            most = self._max_cpus(name)
-            if not affordable(shape, most):
-                too_many += 1
-                causes.append(f"compute environment {name} has at most {count_of(most, 'CPU')}")
-            elif cause := never_fits(shape, self.room.totals(name)):
-                causes.append(f"{where}{cause}")
-            else:
-                possible.append(name)
-        self._possible[shape] = tuple(possible)
-        if not possible:
-            code = TOO_MANY_CPUS if too_many == len(self.pools) else TOO_LARGE
-            lead = f"{needs(shape)}; " if too_many else ""
-            self._impossible[shape] = f"{code} - {lead}{'; '.join(causes)}"
+        self._possible[shape], self._impossible[shape] = examine(shape, list(self.pools.values()), self.room)
 
     def barred(self, shape: Shape) -> str | None:
         """Why the queue's quota keeps the shape out of every pool that it would fit into: a reason with its code."""

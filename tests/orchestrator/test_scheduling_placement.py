@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling import NodeShape, Shape, never_fits, place
-from tests.orchestrator.test_scheduling import gang, host, node
+from orchestrator.scheduling import NodeShape, Shape, decide, fit, never_fits, place
+from tests.orchestrator.test_scheduling import gang, host, job, node, pool, queue, reason, snapshot
 
 
 def where(shape: Shape, *hosts: Host) -> str | None:
@@ -168,3 +170,49 @@ def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
         assert sum(placement.memory for placement in here) <= each.memory
         gpus = [gpu for placement in here for gpu in placement.gpus]
         assert len(gpus) == len(set(gpus)) and set(gpus) <= set(each.gpus)
+
+
+def test_one_machine_that_two_engines_serve_is_placed_on_once() -> None:
+    twice = [replace(host("localhost"), machine="pc"), replace(host("docker/pc"), machine="pc")]
+    found = fit(gang(node(3), node(3)), queue(pools=("all",)), {"all": pool()}, twice)
+    assert found.seat is None and found.problem is not None and "all hosts together have 4 CPUs" in found.problem
+
+
+def test_what_has_hosts_still_to_come_is_no_problem_and_has_no_place_yet() -> None:
+    found = fit(gang(*[node(3)] * 3), queue(pools=("all",)), {"all": pool()}, [host()], elastic=["all"])
+    assert (found.seat, found.problem) == (None, None)
+
+
+def test_a_compute_environment_that_is_disabled_is_used_where_no_other_would_do() -> None:
+    pools = {"off": pool("off", enabled=False), "on": pool("on", hosts=("a",))}
+    both = queue(pools=("off", "on"))
+    small = fit(gang(node(2)), both, pools, [host("a", 2), host("b", 8)]).seat
+    large = fit(gang(node(6)), both, pools, [host("a", 2), host("b", 8)]).seat
+    assert small is not None and large is not None and (small.pool, large.pool) == ("on", "off")
+
+
+machines = st.sampled_from(["", "m1", "m2"])
+pools_strategy = st.lists(
+    st.tuples(st.none() | st.sets(st.sampled_from(["h0", "h1", "h2"])), st.none() | st.sampled_from([0, 1, 4])),
+    min_size=1,
+    max_size=3,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(hosts_strategy, st.lists(machines, min_size=4, max_size=4), pools_strategy, nodes, st.integers(1, 4), st.data())
+def test_a_gang_alone_starts_exactly_where_it_is_said_to_fit(
+    hosts: list[Host], on: list[str], pools: list, each: NodeShape, count: int, data: st.DataObject
+) -> None:
+    hosts = [replace(host, machine=machine) for host, machine in zip(hosts, on, strict=False)]
+    known = [
+        pool(f"p{i}", None if names is None else tuple(sorted(names)), max_cpus=most)
+        for i, (names, most) in enumerate(pools)
+    ]
+    shape = gang(*[each] * count, minimum=data.draw(st.integers(1, count)))
+    ordered = queue(pools=tuple(each.name for each in known))
+    found = fit(shape, ordered, {each.name: each for each in known}, hosts)
+    decided = decide(snapshot(hosts, [job("a", shape)], queues=[ordered], pools=known))
+    assert [(start.pool, start.placements) for start in decided.starts] == ([tuple(found.seat)] if found.seat else [])
+    if found.seat is None:
+        assert found.problem is not None and reason(decided, "a").endswith(found.problem)
