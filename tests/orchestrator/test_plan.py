@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
+from orchestrator.cli.jobs import submit_spec
 from orchestrator.client import ApiError, Client
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines.base import Gang, Plan
 from orchestrator.engines.local import LocalEngine
 from orchestrator.server import Server
-from orchestrator.spec import validate
+from orchestrator.spec import SpecError, validate
 from shared_store.files import write_json
 from tests.conftest import Serving, run_muster, wait_for
 
@@ -111,43 +112,37 @@ def test_an_image_that_would_not_be_run_is_passed_over_or_refused_as_the_compute
     assert "image busybox: the local engine" in server.wait(refused)["statusReason"]
 
 
-def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment_allows(
-    server: Serving, tmp_path: Path
-) -> None:
-    batch = server.client.batch
-
-    def queue(name: str, environment: dict[str, Any]) -> str:
-        batch("CreateComputeEnvironment", computeEnvironmentName=name, **environment)
-        order = [{"order": 1, "computeEnvironment": name}]
-        batch("CreateJobQueue", jobQueueName=name, priority=1, computeEnvironmentOrder=order)
-        return name
-
+def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment_allows(inside: Server) -> None:
     resources = {"type": "EC2", "maxvCpus": 1, "subnets": ["none"]}
-    small = queue("small", {"type": "MANAGED", "computeResources": resources})
-    elsewhere = queue("elsewhere", {"type": "UNMANAGED", "tags": {"muster:hosts": "another"}})
+    environments: dict[str, dict[str, Any]] = {
+        "small": {"type": "MANAGED", "computeResources": resources},
+        "elsewhere": {"type": "UNMANAGED", "tags": {"muster:hosts": "another"}},
+    }
     train = {"task": "Cartpole", "worlds": 6, "iterations": 2}
-    document = {"name": "fits", "nodes": 3, "resources": {"cpus": 0.5}, "train": train}
-    for name, said in (
-        (small, "needs 3 nodes with 1.5 CPUs, 0 GPUs, 3 GiB in all; compute environment small has at most 1 CPU"),
-        (elsewhere, "the largest host has nothing: there is no host"),
-        ("nowhere", "there is no queue 'nowhere'; there is default, elsewhere, small"),
-    ):
-        spec = tmp_path / f"{name}.yaml"
-        spec.write_text(json.dumps({**document, "queue": name}))
-        for options in ((), ("--dry-run",)):
-            refused = server.muster("submit", str(spec), *options)
-            assert refused.returncode != 0 and refused.stderr.count("\n") == 1 and said in refused.stderr, (
-                refused.stderr
-            )
-        write_json(
-            server.home / "store" / "runs" / name / "run.json", {"run": name, "spec": {**document, "queue": name}}
-        )
-        resumed = server.muster("resume", name)
-        assert resumed.returncode != 0 and resumed.stderr.count("\n") == 1
-        assert said in resumed.stderr or "Job queue nowhere does not exist" in resumed.stderr, resumed.stderr
-    assert batch("DescribeJobDefinitions")["jobDefinitions"] == [], (
-        "nothing is registered for a job that could never start"
-    )
-    definition = compile_definition(validate({**document, "nodes": {"min": 1, "max": 3}}, "test"), "/")
-    plan = server.client.post("/api/plan", {"definition": definition, "queue": small})
+    document = {"name": "fits", "nodes": 3, "resources": {"cpus": 0.4, "memory": 16}, "train": train}
+    refusals = {
+        "small": "needs 3 nodes with 1.2 CPUs, 0 GPUs, 48 MiB in all; compute environment small has at most 1 CPU",
+        "elsewhere": "the largest host has nothing: there is no host",
+        "nowhere": "there is no queue 'nowhere'; there is default, elsewhere",
+    }
+    with Client(inside.url) as client:
+        for name, facts in environments.items():
+            client.batch("CreateComputeEnvironment", computeEnvironmentName=name, **facts)
+            order = [{"order": 1, "computeEnvironment": name}]
+            client.batch("CreateJobQueue", jobQueueName=name, priority=1, computeEnvironmentOrder=order)
+        for name, said in refusals.items():
+            spec = validate({**document, "queue": name}, "job.yaml")
+            run = {"run": f"fits-{name}", "spec": {**document, "queue": name}}
+            write_json(inside.store.run(f"fits-{name}").path / "run.json", run)
+            with pytest.raises((SpecError, ApiError)) as submitted:
+                submit_spec(client, spec, "job.yaml")
+            with pytest.raises(ApiError) as planned:
+                client.post("/api/plan", {"definition": compile_definition(spec, "/"), "queue": name})
+            assert said in str(submitted.value) and said in str(planned.value)
+            with pytest.raises(ApiError) as resumed:
+                client.post(f"/api/runs/fits-{name}/resume", {})
+            assert said in str(resumed.value) or "Job queue nowhere does not exist" in str(resumed.value)
+        assert client.batch("DescribeJobDefinitions", jobDefinitionName="fits")["jobDefinitions"] == []
+        elastic = compile_definition(validate({**document, "nodes": {"min": 1, "max": 3}}, "job.yaml"), "/")
+        plan = client.post("/api/plan", {"definition": elastic, "queue": "small"})
     assert (plan["computeEnvironment"], len(plan["nodes"])) == ("small", 2), "as many nodes as 1 CPU has room for"
