@@ -161,7 +161,7 @@ class LogWriter:
         last = self._segments[-1]
         self._lines = last.lines + (count_lines(last.path) if last.start else 0)
         self._open(last)
-        self._mend()
+        self._mend(known=False)
 
     @property
     def lines(self) -> int:
@@ -228,10 +228,15 @@ class LogWriter:
         if self._segments[-1].start:
             self._lines += data.count(b"\n")
 
-    def _mend(self) -> int:
-        """Take back half a line at the end of the file; returns the bytes of whole lines that the last write still added."""
+    def _mend(self, known: bool = True) -> int:
+        """Take back half a line at the end of the file; returns the bytes of whole lines that the last write still added.
+
+        ``known``: the file ended with a whole line before that write.
+        """
         try:
             size = os.fstat(self._file).st_size
+            if known and size == self._size:
+                return 0
             with open(self._segments[-1].path, "rb") as file:
                 back = min(size, _CHECK)
                 file.seek(size - back)
