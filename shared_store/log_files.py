@@ -150,9 +150,10 @@ class LogWriter:
     def __init__(self, path: Path, limit: int = LIMIT) -> None:
         """Go on with the log whose head is ``path``, or begin it. Raises OSError.
 
-        ``limit``: bytes to keep: half of them from the log's beginning, half from its end.
+        ``limit``: bytes to keep: half of them from the log's beginning, half from its end. Less where the volume is nearly full: no
+        log takes more than a quarter of what it finds free, so that it has a tail, and its end is kept, whatever comes.
         """
-        self.path, self.limit = path, max(limit, LEAST_LIMIT)
+        self.path = path
         self.error: OSError | None = None
         """Why the last :meth:`append` did not write everything."""
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -161,6 +162,8 @@ class LogWriter:
         last = self._segments[-1]
         self._lines = last.lines + (count_lines(last.path) if last.start else 0)
         self._open(last)
+        free, reserve = self._room()
+        self.limit = max(min(limit, (free - reserve) // 4), LEAST_LIMIT)
         self._mend(known=False)
 
     @property
@@ -278,9 +281,13 @@ class LogWriter:
         self._unchecked += size
         if self._unchecked < self._interval:
             return
-        volume = os.fstatvfs(self._file)
-        reserve = min(_RESERVE, volume.f_blocks * volume.f_frsize // 50)
-        if volume.f_bavail * volume.f_frsize - size < reserve:
+        free, reserve = self._room()
+        if free - size < reserve:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._unchecked = 0
         self._interval = min(_CHECK, reserve // 4)
+
+    def _room(self) -> tuple[int, int]:
+        """Bytes that are free on the volume, and how many of them are not for logs."""
+        volume = os.fstatvfs(self._file)
+        return volume.f_bavail * volume.f_frsize, min(_RESERVE, volume.f_blocks * volume.f_frsize // 50)
