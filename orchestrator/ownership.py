@@ -6,6 +6,8 @@ was lost, still has its owner.
 
 from __future__ import annotations
 
+import os
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -37,12 +39,15 @@ def owner_of(session: Session, run: Run) -> RunRecord | None:
 def record_owner(session: Session, run: Run, job: Job) -> RunRecord:
     """The record of a run that ``job`` is about to create or continue, added to the session where there was none.
 
-    A run that says nothing about its queue belongs to that of ``job`` from now on: only a key with all queues gets that far.
+    A run that exists and says nothing about its queue belongs to that of ``job`` from now on: only a key with all queues gets
+    that far.
     """
-    record = owner_of(session, run)
-    if record is None or not record.queue:
-        record = _record(run, job.queue, job.owner)
-    session.add(record)
+    record = session.get(RunRecord, run.name)
+    if record is None:
+        exists = os.path.lexists(run.path / "run.json")
+        found = owner_of(session, run) if exists else None  # else an earlier job named the run and never started
+        record = found if found and found.queue else _record(run, job.queue, job.owner)
+        session.add(record)
     return record
 
 
