@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -47,10 +48,11 @@ def make_private(home: Path) -> None:
     if not found.st_mode & 0o077:
         return
     if found.st_uid == os.geteuid() and all(_OURS.fullmatch(entry.name) for entry in home.iterdir()):
-        home.chmod(found.st_mode & 0o700)
-        log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
-    else:
-        log.warning("%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", home)
+        with suppress(OSError):  # of a volume without permissions
+            home.chmod(found.st_mode & 0o700)
+            log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
+            return
+    log.warning("%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", home)
 
 
 class ControllerRuns(ServerError):
