@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 LARGEST_MESSAGE = 4 * 2**20
 """Bytes; the router refuses larger messages."""
+LONGEST_ANSWER = 500_000
+"""Characters of the answer to a command; the rest is left out."""
 LARGEST_PROGRESS = 65536
 """Bytes of JSON; the controller drops a larger report."""
 

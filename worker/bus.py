@@ -12,7 +12,7 @@ import queue
 import time
 from typing import TYPE_CHECKING, Any
 
-from shared_store.bus import LARGEST_PROGRESS, Credential, prefix, presence_key
+from shared_store.bus import LARGEST_PROGRESS, LONGEST_ANSWER, Credential, prefix, presence_key
 from shared_store.contract import NodeContract
 from shared_store.files import json_object
 
@@ -34,6 +34,7 @@ class Command:
 
     def reply(self, text: str) -> None:
         """Answer, once."""
+        text = text[:LONGEST_ANSWER]
         proof = self._credential.prove("answer", self._key, self._number, text)
         try:
             self._query.reply(self._key, json.dumps({"text": text, "proof": proof}))

@@ -36,7 +36,8 @@ def visible(text: str, colours: bool = False) -> str:
             return found[0] if colours else "\\x1b" + found[0][1:]
         return found[0].encode("unicode_escape").decode()
 
-    return _UNSAFE.sub(escaped, text) + (_NO_COLOUR if colours and "\x1b[" in text else "")
+    shown = _UNSAFE.sub(escaped, text)
+    return shown + _NO_COLOUR if "\x1b" in shown else shown
 
 
 def one_line(text: str) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.bus import Bus, BusError
+from shared_store.bus import LONGEST_ANSWER
 from shared_store.contract import NodeContract
 from tests.conftest import REPOSITORY, Serving, processes_of, wait_for
 from tests.e2e.test_training import submit, wait_for_iteration
@@ -103,6 +104,13 @@ def test_a_command_to_a_node_that_does_not_answer_ends_in_time_and_says_so(bus: 
     with pytest.raises(BusError, match="did not answer"):
         bus.command("nobody", 1, 0, "stacks", 1)
     assert time.monotonic() - started < 10
+    node.kill()
+    node.wait()
+
+
+def test_an_answer_that_is_too_long_for_the_router_comes_in_part(bus: Bus) -> None:
+    node = start_node(bus, "bus.commands.get().reply('é' * 5_000_000); time.sleep(60)")
+    assert bus.command("j", 1, 0, "stacks", 20) == "é" * LONGEST_ANSWER
     node.kill()
     node.wait()
 

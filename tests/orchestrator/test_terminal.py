@@ -45,7 +45,7 @@ def test_no_text_leaves_a_control_character(text: str) -> None:
 
 def test_colours_of_a_log_line_stay_and_end_with_the_line() -> None:
     assert visible("\x1b[1;31mloss\x1b[K 3", colours=True) == "\x1b[1;31mloss\\x1b[K 3\x1b[0m"
-    assert visible("plain\x07", colours=True) == "plain\\x07"
+    assert visible("plain\x07\x1b[K", colours=True) == "plain\\x07\\x1b[K"
 
 
 def test_a_reason_with_lines_of_its_own_is_one_line() -> None:
