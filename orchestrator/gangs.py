@@ -169,6 +169,7 @@ class Gangs:
             stall_timeout=float(stall) if (stall := needs.setting("MUSTER_STALL_TIMEOUT")) else None,
             log_limit=needs.log_limit,
             is_gang=job.kind == "multinode",
+            isolated=not needs.is_native,
             containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,

@@ -75,6 +75,11 @@ class NodeContract:
     """False for a single-node job: AWS gives it no node variables."""
     array: tuple[int, int] | None = None
     """Index and size, of an array's child."""
+    isolation: str = ""
+    """``image``: a plain process starts as it would in a container: in an empty directory, with few of the machine's variables and a
+    standard PATH. ``muster``: the same with Muster's own environment on PATH, as in Muster's own image. Empty: neither."""
+    user: str | None = None
+    """``UID:GID`` of the program, where that is not the supervisor's."""
     address: str | None = None
     """The node's own address, where the engine gives it one."""
     bus: str | None = None
@@ -124,6 +129,8 @@ class NodeContract:
         stall = None if self.stall_timeout is None else f"{self.stall_timeout:g}"
         optional = {
             "MUSTER_STALL_TIMEOUT": stall,
+            "MUSTER_ISOLATION": self.isolation,
+            "MUSTER_USER": self.user,
             "MUSTER_ADDRESS": self.address,
             "MUSTER_BUS": self.bus,
             "MUSTER_BUS_TOKEN": self.bus_token,
@@ -193,6 +200,8 @@ class NodeContract:
             log_limit=integer("MUSTER_LOG_LIMIT", LIMIT),
             is_gang="AWS_BATCH_JOB_NODE_INDEX" in env,
             array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
+            isolation=env.get("MUSTER_ISOLATION", ""),
+            user=env.get("MUSTER_USER"),
             address=env.get("MUSTER_ADDRESS"),
             bus=env.get("MUSTER_BUS"),
             bus_token=env.get("MUSTER_BUS_TOKEN"),

@@ -80,6 +80,7 @@ def contract_of(told: Mapping[str, Any], meeting: Mapping[str, Any], task: int) 
         master_port=meeting["port"],
         address=meeting["addresses"][task],
         ranks_per_node=told["kinds"][told["kind"][index]]["ranks_per_node"],
+        isolation=told["kinds"][told["kind"][index]]["isolation"],
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import grp
+import pwd
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -111,6 +113,8 @@ class Gang:
     """False for a single-node job, whose environment has no node variables on AWS."""
     array: tuple[int, int] | None = None
     """Index and size, of an array's child."""
+    isolated: bool = False
+    """Its nodes start as containers would, also where they are plain processes: it came through the Batch API."""
     containers: Sequence[Mapping[str, Any]] = ()
     """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
     bus: str | None = None
@@ -173,6 +177,8 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             compute_environment=gang.pool,
             is_gang=gang.is_gang,
             array=gang.array,
+            isolation=_isolation(gang, index),
+            user=_user(gang, index),
             cpus=placement.cpus,
             stall_timeout=gang.stall_timeout,
             log_limit=gang.log_limit,
@@ -182,6 +188,33 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
         )
         plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
     return plans
+
+
+def _isolation(gang: Gang, index: int) -> str:
+    if not gang.isolated:
+        return ""
+    image = gang.containers[index].get("image") if gang.containers else None
+    return "muster" if image in (None, "", "muster") else "image"
+
+
+def _user(gang: Gang, index: int) -> str | None:
+    """``UID:GID`` of the job's ``user``, of the user database here. Raises EngineError where it is not there."""
+    given = gang.containers[index].get("user") if gang.isolated and gang.containers else None
+    if not given:
+        return None
+    name, _, group = str(given).partition(":")
+    try:
+        user = pwd.getpwuid(int(name)) if name.isdigit() else pwd.getpwnam(name)
+        uid, gid = user.pw_uid, user.pw_gid
+    except KeyError:
+        if not name.isdigit():
+            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
+        uid = gid = int(name)
+    try:
+        gid = int(group) if group.isdigit() else grp.getgrnam(group).gr_gid if group else gid
+    except KeyError:
+        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
+    return f"{uid}:{gid}"
 
 
 @dataclass(frozen=True)

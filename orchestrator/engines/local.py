@@ -84,7 +84,12 @@ class LocalEngine:
 
     def plan(self, gang: Gang) -> Plan:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
-        return Plan(gang, node_plans(gang, addresses, _FIRST_PORT))
+        nodes = node_plans(gang, addresses, _FIRST_PORT)
+        if os.geteuid() != 0 and (user := next((node.contract.user for node in nodes if node.contract.user), None)):
+            raise EngineError(
+                f"user {user}: only a controller that runs as root can run a job as another user; leave user out"
+            )
+        return Plan(gang, nodes)
 
     def launch(self, plan: Plan) -> str:
         gang = plan.gang

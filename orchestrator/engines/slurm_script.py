@@ -146,6 +146,7 @@ def _told(gang: Gang) -> dict[str, Any]:
             "command": list(plan.command),
             "environment": dict(plan.environment),
             "ranks_per_node": plan.contract.ranks_per_node,
+            "isolation": plan.contract.isolation,
         }
         if kind not in kinds:
             kinds.append(kind)
