@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -85,14 +86,30 @@ class Rank:
             "TORCHELASTIC_ERROR_FILE": str(self.error_file),
         }
 
-    def start(self, command: list[str], env: dict[str, str]) -> None:
-        """Start ``command`` in a session of its own, tied to this process's life. Raises OSError where it can't be started."""
-        if shutil.which(command[0], path=env.get("PATH", os.defpath)) is None:
-            problem = errno.EACCES if os.path.exists(command[0]) else errno.ENOENT
+    def start(
+        self,
+        command: list[str],
+        env: dict[str, str],
+        *,
+        directory: Path | None = None,
+        prefix: Sequence[str] = (),
+    ) -> None:
+        """Start ``command`` in a session of its own, tied to this process's life. Raises OSError where it can't be started.
+
+        Args:
+            command: What to run.
+            env: All its variables.
+            directory: Its working directory; None: that of this process.
+            prefix: A command that becomes ``command``.
+        """
+        program = os.path.join(directory or "", command[0]) if "/" in command[0] else command[0]
+        if shutil.which(program, path=env.get("PATH", os.defpath)) is None:
+            problem = errno.EACCES if os.path.exists(program) else errno.ENOENT
             raise OSError(problem, os.strerror(problem))
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._process = subprocess.Popen(
-            tied(command),
+            tied([*prefix, *command]),
+            cwd=directory,
             env={**env, "MUSTER_PROGRESS_FD": str(write_end)},
             pass_fds=(write_end,),
             stdin=subprocess.DEVNULL,

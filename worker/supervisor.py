@@ -12,13 +12,14 @@ import os
 import re
 import selectors
 import signal
+import socket
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract, rank_variables
+from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
@@ -32,6 +33,7 @@ from worker.network import interface_of
 from worker.processes import adopt_orphans, kill_group
 from worker.rank import Rank
 from worker.stacks import dump_stacks, state_of
+from worker.surroundings import Surroundings
 
 _PEER_GRACE = 5.0
 """Seconds that the other ranks of a node get after one of them failed: their collectives are broken, there is nothing to save."""
@@ -69,6 +71,8 @@ class Supervisor:
         self._log = LogWriter(run.log(contract.job, contract.attempt, contract.node_index), contract.log_limit)
         self._lost = (0, 0, "")
         """Lines and bytes that the log could not take since the last one that it could, and why."""
+        self._kept: Path | None = None
+        """Directory that the job keeps when it is over."""
         self._complain = 0.0
         """When standard error may be told again of a log that can't be written (monotonic [s])."""
 
@@ -102,6 +106,8 @@ class Supervisor:
                 self.write(None, "e", unkillable(left))
             self._drain()
             outcome = self._outcome(started)
+        if self._kept:
+            self.write(None, "o", f"the job's directories are kept: {self._kept} on {socket.gethostname()}")
         self.write(None, "o", END_LINE.format(node=self.contract.node_index, reason=outcome.reason))
         code = self._commit(outcome)
         self.bus.close()
@@ -130,7 +136,8 @@ class Supervisor:
     # -- ranks --------------------------------------------------------------------------------------------------------
 
     def _start_ranks(self, scratch: Path) -> None:
-        contract = self.contract
+        contract, found = self.contract, Surroundings(self.contract, scratch)
+        self._kept = found.kept
         threads = max(1, int(contract.cpus / contract.ranks_per_node))
         shared = {
             "OMP_NUM_THREADS": str(threads),
@@ -142,8 +149,9 @@ class Supervisor:
         for local in range(contract.ranks_per_node):
             rank = Rank(contract, local, scratch / f"error-{local}.json")
             # what the user set in the job's environment stands; the bus is the supervisor's alone
-            given = {name: value for name, value in rank_variables(os.environ).items() if name not in BUS_VARIABLES}
-            rank.start(self.command, {**shared, **given, **rank.environment()})
+            given = {name: value for name, value in found.environment.items() if name not in BUS_VARIABLES}
+            env = {**shared, **given, **rank.environment()}
+            rank.start(self.command, env, directory=found.directory, prefix=found.prefix)
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))

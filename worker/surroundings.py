@@ -7,8 +7,10 @@ variables those only that say where things are: language, time zone, proxies, ce
 
 from __future__ import annotations
 
+import errno
 import os
 import pwd
+import shutil
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -78,4 +80,6 @@ class Surroundings:
         except KeyError:
             groups = "--clear-groups"
         # a change of the user takes back the tie to the supervisor's life: setpriv ties anew
-        self.prefix = ["setpriv", f"--reuid={uid}", f"--regid={gid}", groups, "--pdeathsig=KILL", "--"]
+        if (setpriv := shutil.which("setpriv")) is None:
+            raise FileNotFoundError(errno.ENOENT, "setpriv is not installed, which the job's user needs")
+        self.prefix = [setpriv, f"--reuid={uid}", f"--regid={gid}", groups, "--pdeathsig=KILL", "--"]

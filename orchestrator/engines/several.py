@@ -101,7 +101,9 @@ class Several:
         if engine.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
         elif engine.name != "local" and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
-            raise EngineError(f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out")
+            raise EngineError(
+                f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
+            )
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)
