@@ -320,7 +320,7 @@ def _latencies(muster: Muster, arrays: list[str]) -> Iterator[tuple[str, str]]:
     )
     for name, query in (
         ("of the queue", {"jobQueue": "bench", "jobStatus": "RUNNABLE"}),
-        ("of an array", {"arrayJobId": arrays[-1]}),
+        ("of an array", {"arrayJobId": arrays[-1], "jobStatus": "RUNNABLE"}),
     ):
         pages, token = [], {}
         while True:

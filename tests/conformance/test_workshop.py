@@ -71,7 +71,7 @@ def node_properties() -> dict[str, Any]:
         "MUSTER_RANKS_PER_NODE": ours["MUSTER_RANKS_PER_NODE"],
     }
     container = {
-        "image": "000000000000.dkr.ecr.us-east-1.amazonaws.com/isaaclab-batch:latest",
+        "image": "muster",
         "command": ["bash", "-c", COMMAND],
         "environment": pairs(environment),
         "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "1024"}],

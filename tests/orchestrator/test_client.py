@@ -68,7 +68,8 @@ def proxy(shared_server: Serving) -> Iterator[LossyProxy]:
 
 
 def test_a_submission_whose_answer_was_lost_is_submitted_once(shared_server: Serving, proxy: LossyProxy) -> None:
-    container = {"image": "x", "command": ["true"], "resourceRequirements": [{"type": "VCPU", "value": "0.1"}]}
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+    container = {"image": "x", "command": ["true"], "resourceRequirements": needs}
     shared_server.client.batch(
         "RegisterJobDefinition", jobDefinitionName="lossy", type="container", containerProperties=container
     )
