@@ -12,7 +12,6 @@ shim then calls itself ``STUCK``, for the engine to see, and stays until that pr
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import sys
@@ -76,11 +75,13 @@ def _become(shim: int, group: str, command: Sequence[str]) -> None:
 
     os.setsid()
     if group:
-        with contextlib.suppress(OSError):  # without a group the shim itself finds what is left
-            with contextlib.suppress(FileExistsError):
+        try:
+            if not os.path.isdir(group):
                 os.mkdir(group)
             with open(os.path.join(group, "cgroup.procs"), "w") as file:
                 file.write("0")
+        except OSError:
+            pass  # without a group the shim itself finds what is left
     tied.main(str(shim), "", *command)
 
 
