@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Sequence
 
 from shared_store.processes import Process, find_process, kill
+
+_TRIES = 25
 
 
 def own_group() -> str:
@@ -52,6 +55,10 @@ def kill_group(group: str, processes: Sequence[Process] = ()) -> None:
 
 def remove_group(group: str) -> None:
     """Remove the group and those below it; one that is not empty, or not there, is left alone."""
-    for directory, _, _ in os.walk(group, topdown=False):
-        with contextlib.suppress(OSError):
-            os.rmdir(directory)
+    for _ in range(_TRIES):
+        for directory, _, _ in os.walk(group, topdown=False):
+            with contextlib.suppress(OSError):
+                os.rmdir(directory)
+        if not os.path.isdir(group):
+            return
+        time.sleep(0.02)  # processes that have just died still count for a moment

@@ -437,6 +437,7 @@ def test_stopping_one_gang_leaves_the_others_alone(bench: Bench) -> None:
     bench.engine.stop(handle, 5.0)
     assert [node.running for node in bench.engine.observe(handle)] == [False, False]
     assert [node.running for node in bench.engine.observe(other)] == [True, True]
+    bench.engine.stop(other, 5.0)
 
 
 def test_stopping_twice_and_stopping_what_has_ended_is_nothing(bench: Bench) -> None:

@@ -1,0 +1,76 @@
+"""What Ray's actor does on a node, without Ray: it starts the supervisor, and nothing of the node outlives its stop or its own death."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from orchestrator.engines.ray_node import Node
+from shared_store.contract import NodeContract
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower
+from shared_store.outcomes import read_outcome
+from shared_store.processes import end_all, find_process
+from tests.conftest import alive, frozen, wait_for
+
+ESCAPE = "echo $$; env -i setsid sh -c 'echo $$; exec sleep 600' & exec sleep 600"
+ACTOR = """
+import json, sys, time
+from orchestrator.engines.ray_node import Node
+node = Node({"MUSTER_GANG": "ray-node/1/1", "NODE_RANK": "0"}, 1e9)
+print(node.start([], sys.argv[2:], {}, json.loads(sys.argv[1]), 0, None), flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def contract(tmp_path: Path) -> NodeContract:
+    store = Store(tmp_path).open()
+    raise_epoch(store.run("run"), 1)
+    facts = {"node_index": 0, "node_count": 1, "main_index": 0, "master_address": "127.0.0.1", "master_port": 29500}
+    return NodeContract(
+        job="ray-node", attempt=1, run="run", store=str(tmp_path), epoch=1, job_epoch=1, grace=5.0, **facts
+    )
+
+
+def pids(contract: NodeContract) -> list[int]:
+    """What the rank and what escaped of it printed."""
+
+    def both() -> list[int] | None:
+        lines = [line.text for line in LogFollower(Store(contract.store).run("run"), "ray-node").drain()]
+        found = [int(line) for line in lines if line.isdigit()]
+        return found if len(found) == 2 else None
+
+    found: list[int] = wait_for(both, 20, "two processes")
+    return found
+
+
+def test_a_stopped_node_leaves_nothing_and_what_can_not_be_killed_is_named(
+    contract: NodeContract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
+    node = Node({"MUSTER_GANG": contract.gang, "NODE_RANK": "0"}, 1e9)
+    user = {"PYTHONPATH": str(tmp_path), "MUSTER_EPOCH": "9"}
+    (tmp_path / "queue.py").write_text("MINE = True")
+    assert node.start([], ["sh", "-c", ESCAPE], user, contract.to_env(), 0, None) == ""
+    _, escaped = found = pids(contract)
+    wait_for(lambda: (process := find_process(escaped)) and process.name == "sleep", 20, "it sleeps")
+    with frozen(escaped):
+        assert node.stop(1.0).startswith(f"SIGKILL does not end process {escaped} (sleep), state D")
+    assert node.stop(5.0) == ""
+    assert not any(alive(pid) for pid in found)
+    node.wait()
+
+
+def test_a_node_leaves_nothing_when_its_actor_is_killed(contract: NodeContract) -> None:
+    command = [sys.executable, "-P", "-c", ACTOR, json.dumps(contract.to_env()), "sh", "-c", ESCAPE]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as actor:
+        found = pids(contract)
+        actor.kill()
+    wait_for(lambda: not any(alive(pid) for pid in found), 20, "the end of the node")
+    assert read_outcome(Store(contract.store).run("run"), "ray-node", 1, 0) is None
