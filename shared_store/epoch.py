@@ -16,7 +16,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from shared_store.files import sync_directory, write_atomic
+from shared_store.files import open_regular, sync_directory, write_atomic
 from shared_store.layout import Run, StoreError
 
 LARGEST_EPOCH = 10**15 - 1
@@ -47,7 +47,7 @@ def read_epoch(run: Run) -> int:
     """The epoch that may write to ``run``; 0 before the first attempt. Raises ValueError where the file is damaged."""
     path = run.path / "EPOCH"
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             text = file.read(32).decode(errors="replace").strip()
     except FileNotFoundError:
         return 0
@@ -88,7 +88,7 @@ def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
 def read_claim(run: Run, epoch: int) -> Claim | None:
     """Which open attempt has ``epoch``; None where that is closed, unknown or damaged. Raises OSError."""
     try:
-        with open(_claim_path(run, epoch), "rb") as file:
+        with open_regular(_claim_path(run, epoch)) as file:
             value = json.loads(file.read(_LONGEST_CLAIM))
         return Claim(str(value["controller"]), str(value["job"]), int(value["attempt"]))
     except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):

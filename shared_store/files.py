@@ -15,7 +15,7 @@ import stat
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 LARGEST_JSON = 16 << 20
 """Bytes of a JSON file; what is larger was not written by Muster."""
@@ -103,8 +103,11 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     return value
 
 
-def _read_regular(path: Path, largest: int) -> bytes:
-    """The content of a file. A link could lead out of the store, and a pipe would never end."""
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file of the store to read it: any job may have put a link there, which leads out of the store, or a pipe, which never ends.
+
+    Raises DamagedFile where it is no regular file, OSError as ``open`` does.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError as error:
@@ -114,7 +117,11 @@ def _read_regular(path: Path, largest: int) -> bytes:
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise DamagedFile(f"{path}: not a regular file")
-    with open(descriptor, "rb") as file:
+    return open(descriptor, "rb")
+
+
+def _read_regular(path: Path, largest: int) -> bytes:
+    with open_regular(path) as file:
         data = file.read(largest + 1)
     if len(data) > largest:
         raise DamagedFile(f"{path}: more than {largest} bytes")

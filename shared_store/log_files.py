@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from shared_store.files import open_regular
+
 LIMIT = 1 << 30
 """Bytes of a node's log in one attempt that are kept where nothing else is asked for."""
 LEAST_LIMIT = 1 << 20
@@ -61,11 +63,12 @@ class Chunk(NamedTuple):
 
 
 def log_segments(directory: Path) -> dict[str, list[Segment]]:
-    """The files of every log in ``directory`` by the name of its head, in order; empty where there is no such directory."""
+    """The regular files of every log in ``directory`` by the name of its head, in order; empty where there is no such directory."""
     found: dict[str, list[Segment]] = {}
     try:
-        names = os.listdir(directory)
-    except FileNotFoundError:
+        with os.scandir(directory) as entries:
+            names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
+    except (FileNotFoundError, NotADirectoryError):
         return found
     for name in names:
         if match := _TAIL.fullmatch(name):
@@ -96,7 +99,7 @@ def read_log(
     """
     place = max((place for place, segment in enumerate(segments) if segment.start <= position), default=0)
     start, _, path = segments[place]
-    with open(path, "rb") as file:  # anew each time: what a network file system keeps honest
+    with open_regular(path) as file:  # anew each time: what a network file system keeps honest
         end, last = start + os.fstat(file.fileno()).st_size, place == len(segments) - 1
         if position >= end and not last:
             start, lines, _ = segments[place + 1]
@@ -218,7 +221,7 @@ class LogWriter:
         return data[start:end] if end > start else b""
 
     def _open(self, segment: Segment) -> None:
-        self._file = os.open(segment.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self._file = os.open(segment.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         self._size = os.fstat(self._file).st_size
 
     def _write(self, piece: bytes) -> None:

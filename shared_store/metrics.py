@@ -18,9 +18,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from shared_store.files import DamagedFile, json_object, open_regular
 from shared_store.layout import Run
 
-_NAME = re.compile(r"metrics-e(\d+)\.jsonl")
+_NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
 _BLOCK = 16 << 10
 """Bytes between two marks."""
 _IDENTITY = 256
@@ -91,7 +92,7 @@ class _File:
 
     def refresh(self) -> None:
         """Take up what was added."""
-        with open(self.path, "rb") as file:
+        with open_regular(self.path) as file:
             head = file.read(_IDENTITY)
             if os.fstat(file.fileno()).st_size < self.end or not head.startswith(self.identity):
                 self.end, self.sections = 0, []
@@ -118,7 +119,7 @@ class _File:
     def read(self, section: _Section, after: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """The section's records from the last mark before ``after`` on, by iteration."""
         place = max(0, bisect_right(section.marks, after, key=lambda mark: mark[0]) - 1)
-        with open(self.path, "rb") as file:
+        with open_regular(self.path) as file:
             file.seek(section.marks[place][1])
             for line in file.read(section.end - section.marks[place][1]).split(b"\n"):
                 record = _record(line)
@@ -166,16 +167,16 @@ class MetricsHistory:
 
 def _files(run: Run) -> list[tuple[int, Path]]:
     try:
-        entries = list(run.metrics.iterdir())
-    except FileNotFoundError:
+        with os.scandir(run.metrics) as entries:
+            names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
+    except (FileNotFoundError, NotADirectoryError):
         return []
-    return [(int(match[1]), path) for path in entries if (match := _NAME.fullmatch(path.name))]
+    return [(int(match[1]), run.metrics / name) for name in names if (match := _NAME.fullmatch(name))]
 
 
 def _record(line: bytes) -> dict[str, Any]:
     """The record of a line; empty where it is damaged."""
     try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
+        return json_object(line, "record")
+    except DamagedFile:
         return {}
-    return record if isinstance(record, dict) else {}

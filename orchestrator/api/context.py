@@ -18,6 +18,9 @@ from orchestrator.ownership import owner_of
 from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
 from shared_store.layout import Run, Store, StoreError
 
+_COMPARED = 1000
+"""Names of runs among which the nearest to an unknown one is looked for."""
+
 
 @dataclass(frozen=True)
 class Context:
@@ -81,7 +84,7 @@ def find_run(controller: Controller, name: str) -> Run:
                 over = Status(job.status).is_terminal
                 what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
                 raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
-            runs = [each.name for each in visible_runs(session, controller.store)]
+            runs = [each.name for each in visible_runs(session, controller.store, most=_COMPARED)]
         nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
         others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"
         hint = f"; did you mean {nearest[0]}?" if nearest else others

@@ -20,6 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+from shared_store.files import open_regular
 from shared_store.log_files import Segment, left_out, read_log, segments_of
 from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED
 
@@ -208,7 +209,7 @@ class View:
     def _read(self, offset: int, size: int) -> bytes:
         start, _, path = self.segments[bisect_right(self.segments, offset, key=lambda each: each.start) - 1]
         try:
-            with open(path, "rb") as file:
+            with open_regular(path) as file:
                 file.seek(offset - start)
                 return file.read(size)
         except FileNotFoundError:  # deleted since the look
@@ -226,9 +227,9 @@ def first_and_last(path: Path) -> tuple[int, int, int] | None:
     try:
         segments = segments_of(path)
         sizes = [os.stat(segment.path).st_size for segment in segments]
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             head = _STAMPS.search(file.read(_ENDS))
-        with open(segments[-1].path, "rb") as file:
+        with open_regular(segments[-1].path) as file:
             file.seek(max(0, sizes[-1] - _ENDS))
             tail = _STAMPS.findall(file.read(_ENDS))
     except (FileNotFoundError, IndexError):

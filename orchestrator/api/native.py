@@ -192,7 +192,7 @@ def job_detail(request: Request, reference: str) -> Any:
         attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
         owner = owner_of(session, run)
         is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
-        described = runs.describe_run(controller, session, run) if is_visible and run.description() else None
+        described = runs.results_of(controller, session, run) if is_visible else None
         needs = gang_needs(job.node_properties)
         detail = {
             "id": job.id,

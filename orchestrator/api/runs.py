@@ -42,6 +42,14 @@ def list_runs(controller: Controller, session: Session, after: str, most: int) -
     return found
 
 
+def results_of(controller: Controller, session: Session, run: Run) -> dict[str, Any] | None:
+    """:func:`describe_run` for the page of a job, which a damaged run must not take away; None where nothing can be read."""
+    try:
+        return describe_run(controller, session, run) if run.description() else None
+    except (DamagedFile, OSError):
+        return None
+
+
 def describe_run(controller: Controller, session: Session, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     description = run.description() or {}
@@ -179,7 +187,10 @@ def _resumed(context: Context, run: Run) -> dict[str, Any] | None:
 
 def last_metrics(run: Run) -> dict[str, Any] | None:
     """The newest record of the run's metrics."""
-    return history_of(run).last()
+    try:
+        return history_of(run).last()
+    except (DamagedFile, OSError):
+        return None
 
 
 NETWORK = (

@@ -11,11 +11,15 @@ import httpx
 import pytest
 from sqlalchemy import select
 
+from orchestrator.client import Client
 from orchestrator.database import Database, DatabaseError
 from orchestrator.server import Server
 from orchestrator.tables import Job, JobQueue
-from shared_store.files import write_json
-from tests.conftest import run_muster
+from shared_store.epoch import read_epoch
+from shared_store.files import DamagedFile, write_json
+from shared_store.layout import Run
+from shared_store.log_files import LogWriter
+from tests.conftest import run_muster, submit_gang, wait_for
 
 SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
 NODES = {
@@ -187,3 +191,43 @@ def test_a_damaged_page_that_is_met_while_serving_is_said_to_each_request(tmp_pa
     with pytest.raises(DatabaseError, match="is damaged"), database.session() as session:
         session.scalars(select(JobQueue)).all()  # of pages that can still be read: nothing more is written to this file
     database.close()
+
+
+def test_a_job_and_its_log_can_be_read_whatever_it_put_in_place_of_its_files(
+    inside: Server, http: httpx.Client, runs: Path, tmp_path: Path
+) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("2026-01-01T00:00:00.000Z 0 o not yours\n")
+    job = submit_gang(Client(inside.url), "print('said')")
+    wait_for(lambda: http.get(f"/api/jobs/{job}").json()["status"] == "SUCCEEDED", 60, "its end")
+    run = inside.store.run(http.get(f"/api/jobs/{job}").json()["run"])
+    (run.path / "run.json").write_text("{")
+    log = run.log(job, 1, 0)
+    (log.parent / "node-1.log").symlink_to(secret)
+    os.mkfifo(log.parent / "node-2.log")
+    run.metrics.mkdir()
+    os.mkfifo(run.metrics / "metrics-e1.jsonl")
+    (run.metrics / "metrics-e2.jsonl").write_text('{"iteration": 1, "reward": 1e999}\n' + "[" * 5000 + "\n")
+    (run.metrics / "metrics-e3.jsonl").symlink_to(secret)
+    detail = http.get(f"/api/jobs/{job}").json()
+    assert (detail["status"], detail["results"], detail["progress"]) == ("SUCCEEDED", None, None)
+    for follow in ("false", "true"):
+        lines = http.get(f"/api/jobs/{job}/logs", params={"follow": follow}).text
+        assert "said" in lines and "not yours" not in lines
+
+
+def test_an_epoch_that_is_a_pipe_is_damage_and_not_waited_for(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run")
+    run.path.mkdir()
+    os.mkfifo(run.path / "EPOCH")
+    with pytest.raises(DamagedFile, match="EPOCH: not a regular file"):
+        read_epoch(run)
+
+
+def test_a_node_s_log_is_not_written_through_a_link(tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    target.write_text("kept")
+    (tmp_path / "node-0.log").symlink_to(target)
+    with pytest.raises(OSError):
+        LogWriter(tmp_path / "node-0.log")
+    assert target.read_text() == "kept"
