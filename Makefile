@@ -66,7 +66,7 @@ bits: $(READY)
 	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/e2e tests/engines
 
 fuzz: $(READY)
-	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py
+	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py tests/conformance/test_hostile_clients.py
 
 env: $(READY)
 

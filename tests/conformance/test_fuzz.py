@@ -56,6 +56,8 @@ def share(part: float) -> settings:
 class Fuzzed(Serving):
     """A server with a token (so that odd Host headers get past the guard), whose errors are kept in a file."""
 
+    command: tuple[str, ...] = (MUSTER,)
+
     def __init__(self, home: Path, *options: str) -> None:
         self.names: dict[str, str] = {}
         """Ids for the placeholders of drawn requests."""
@@ -68,7 +70,7 @@ class Fuzzed(Serving):
         self.errors = self.home.parent / "stderr"
         with open(self.errors, "ab") as errors:
             self.process = subprocess.Popen(
-                [MUSTER, "serve", "--port", "0", *self.options],
+                [*self.command, "serve", "--port", "0", *self.options],
                 env={**os.environ, "MUSTER_HOME": str(self.home), "MUSTER_TOKEN": TOKEN},
                 stdout=subprocess.PIPE,
                 stderr=errors,
@@ -161,7 +163,7 @@ class Fuzzed(Serving):
 
 
 @pytest.fixture(scope="module")
-def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
+def fuzzed(tmp_path_factory: pytest.TempPathFactory, fuzz_report: Counter[str]) -> Iterator[Fuzzed]:
     """A server that has seen a gang, a single job and a run with logs, and has no room for anything more."""
     server = Fuzzed(tmp_path_factory.mktemp("fuzz") / "home", "--cpus", "2")
     batch = server.client.batch
@@ -178,8 +180,8 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
     server.restart("--cpus", "0.1", "--rate-limit", "0")
     server.restore()
     yield server
-    if IS_LONG:
-        print(f"\n{sum(server.counts.values())} requests to {server.url}: {dict(sorted(server.counts.items()))}")
+    for status, count in sorted(server.counts.items()):
+        fuzz_report[f"malformed requests, answered with {status}"] += count
     server.close()
 
 

@@ -27,8 +27,9 @@ class Broken(Exception):
 class Home:
     """``muster serve`` on ``path``, started again whenever it is asked to be there. Not thread-safe: one owner."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, *options: str, **env: str) -> None:
+        """``options`` of ``muster serve``, ``env``: further variables of its environment."""
+        self.path, self.options, self.env = path, options, env
         path.mkdir(parents=True, exist_ok=True)
         self.starts = 0
         self.process: subprocess.Popen[bytes] | None = None
@@ -55,8 +56,8 @@ class Home:
         self.starts += 1
         with open(self._said, "wb") as said, open(self.errors, "ab") as errors:
             self.process = subprocess.Popen(
-                [MUSTER, "serve", "--port", "0", "--cpus", "16"],
-                env={**os.environ, "MUSTER_HOME": str(self.path)},
+                [MUSTER, "serve", "--port", "0", "--cpus", "16", *self.options],
+                env={**os.environ, "MUSTER_HOME": str(self.path), **self.env},
                 cwd=REPOSITORY,
                 stdin=subprocess.DEVNULL,
                 stdout=said,
@@ -73,6 +74,11 @@ class Home:
                 last = self.errors.read_text(errors="replace").strip().splitlines()[-1:]
                 raise Broken(f"`muster serve` did not start again: {last[0] if last else 'it says nothing'}")
             time.sleep(0.02)
+
+    @property
+    def url(self) -> str:
+        """Where the controller that answered last listens."""
+        return self._said.read_text().partition("Muster serves ")[2].split()[0]
 
     def strike(self, number: int) -> bool:
         """Send signal ``number`` to the controller; after SIGKILL it is gone on return. False where there is none."""
