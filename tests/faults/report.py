@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from tests.faults.fire import Result
+from tests.faults.rounds import Class, class_table
 from tests.faults.schedule import SHARES
 
 
@@ -40,9 +41,12 @@ def table(results: Sequence[Result], seconds: float) -> str:
     return "\n".join(lines)
 
 
-def summary(results: Sequence[Result], seconds: float, seed: int, iterations: int, jobs: int) -> str:
+def summary(
+    results: Sequence[Result], classes: Sequence[Class], seconds: float, seed: int, iterations: int, jobs: int
+) -> str:
     """The page."""
     wrong = [f"- run {r.plan.seed}: {violation}" for r in results for violation in r.verdict.violations]
+    wrong += [f"- {violation}" for each in classes for violation in each.violations]
     total = sum(len(result.hits) for result in results)
     return f"""# Kill anything, at any instant
 
@@ -54,4 +58,11 @@ checkpoints that it has left; every metrics record that was ever written must be
 doubled; attempts, launches and epochs must agree; every attempt must have its reason; no process and no hidden file may be left.
 
 {table(results, seconds)}
+
+## Besides killing
+
+Each round brings up a controller of its own and does its worst: jobs that fork, flood, ignore signals and try to escape; a volume without
+a free byte; a wall clock that jumps by up to 90 days; a second controller that takes the same run at the same moment.
+
+{class_table(classes)}
 {"" if not wrong else chr(10) + "## What was wrong" + chr(10) + chr(10) + chr(10).join(wrong) + chr(10)}"""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -48,7 +48,7 @@ class Class:
         self.violations += [f"{self.name}, round {seed}: {violation}" for violation in violations]
 
 
-def class_table(classes: list[Class]) -> str:
+def class_table(classes: Sequence[Class]) -> str:
     """A Markdown table: a line for each class."""
     lines = ["| class | rounds | what was done | violations |", "|---|--:|---|--:|"]
     for each in classes:

@@ -3,7 +3,8 @@
 A job is run straight, once for each size of its gang. Then the same job is run again and again while SIGKILL, and now and then
 SIGSTOP, hits its ranks, supervisors, writers and the controller at moments drawn from the seed, some of them inside a commit.
 Every run must end as the straight one did: tensors bit for bit, metrics iteration by iteration, with every attempt accounted for
-and no process or file left. The table goes to ``benchmarks/torture.md``; exit code 1 where anything was wrong.
+and no process or file left. Then come the other classes (:mod:`tests.faults.rounds`): hostile jobs, a full disk, a wall clock that
+jumps, a second controller. The table goes to ``benchmarks/torture.md``; exit code 1 where anything was wrong.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from tests.faults.fire import Fire, Result, run_straight
 from tests.faults.home import Home
 from tests.faults.processes import end_all
 from tests.faults.report import summary, table
+from tests.faults.rounds import ROUNDS, Class, class_table
 from tests.faults.schedule import JOB_NODES, draw_plan
 
 BLOWS = 12
@@ -115,6 +117,20 @@ class Torture:
         )
 
 
+def run_classes(directory: Path, seed: int, rounds: int) -> list[Class]:
+    """So many rounds of every class, each in a directory of its own that is kept where something was wrong."""
+    classes = [Class(name) for name in ROUNDS]
+    for each in classes:
+        for number in range(1, rounds + 1):
+            place = directory / each.name.replace(" ", "-") / str(number)
+            before = len(each.violations)
+            each.run(place, f"{seed}.{number}")
+            print(f"{each.name}, round {number}: {dict(each.done)}, {len(each.violations)} violations", flush=True)
+            if len(each.violations) == before:
+                shutil.rmtree(place, ignore_errors=True)
+    return classes
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The command; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.torture", description=(__doc__ or "").splitlines()[0])
@@ -122,6 +138,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of targets and moments (default 1)")
     parser.add_argument("--jobs", type=int, default=2, help="homes at once, each with a controller (default 2)")
     parser.add_argument("--iterations", type=int, default=400, help="length of the job (default 400)")
+    parser.add_argument("--rounds", type=int, default=10, help="of each class besides killing (default 10)")
     parser.add_argument("--directory", type=Path, help="where the homes go, and stay (default: a temporary directory)")
     parser.add_argument("--report", type=Path, default=REPOSITORY / "benchmarks" / "torture.md", help="the table")
     given = parser.parse_args(arguments)
@@ -133,12 +150,17 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(number, lambda _number, _frame: torture.stop())
     results = torture.run()
     seconds = time.monotonic() - started
-    print("\n" + table(results, seconds))
-    given.report.write_text(summary(results, seconds, given.seed, given.iterations, given.jobs))
-    wrong = [result for result in results if result.verdict.violations]
-    for result in wrong:
-        for violation in result.verdict.violations:
-            print(f"VIOLATION in run {result.plan.seed} (--seed {given.seed}): {violation}")
+    classes = run_classes(directory.resolve(), given.seed, given.rounds)
+    print("\n" + table(results, seconds) + "\n\n" + class_table(classes))
+    given.report.write_text(summary(results, classes, seconds, given.seed, given.iterations, given.jobs))
+    wrong = [
+        f"in run {result.plan.seed} (--seed {given.seed}): {violation}"
+        for result in results
+        for violation in result.verdict.violations
+    ]
+    wrong += [violation for each in classes for violation in each.violations]
+    for violation in wrong:
+        print(f"VIOLATION {violation}")
     if wrong:
         print(f"homes: {directory}")
     elif given.directory is None:

@@ -17,12 +17,12 @@ import httpx
 import pytest
 
 from orchestrator.cli.jobs import _gpus
-from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
+from tests.conftest import MUSTER, REPOSITORY, Serving, call_muster, run_muster, wait_for
 
 
 def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
     """The command exits with ``code`` and one line on stderr that holds all ``parts``."""
-    done = run_muster(*arguments, home=home, **env)
+    done = call_muster(*arguments, home=home, **env)
     assert done.returncode == code, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
@@ -199,10 +199,10 @@ def test_a_run_that_no_spec_started_is_not_resumed_blindly(shared_server: Servin
 
 
 def test_help_has_examples_for_every_command(tmp_path: Path) -> None:
-    listing = run_muster("--help", home=tmp_path).stdout
+    listing = call_muster("--help", home=tmp_path).stdout
     for command in ("run", "serve", "submit", "list", "show", "stop", "schema", "logs", "resume", "checkpoints"):
         assert f" {command} " in listing
-        assert "Example" in run_muster(command, "--help", home=tmp_path).stdout or command == "schema"
+        assert "Example" in call_muster(command, "--help", home=tmp_path).stdout or command == "schema"
 
 
 def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server: Serving, tmp_path: Path) -> None:
