@@ -114,20 +114,28 @@ class Bus:
             )
             kept = {}
         self._master = str(kept.get("key") or secrets.token_hex(32))
-        for port in (kept.get("port"), _free_port()):
-            if isinstance(port, int) and self._try(port):
-                self.endpoint = f"tcp/127.0.0.1:{port}"
-                self._opened = time.monotonic() if port == kept.get("port") else None
-                write_json(self._home / "bus.json", {"port": port, "key": self._master}, mode=0o600)
-                return
-        log.warning("the bus is off: no router could be started; jobs run, commands to them do not")
+        try:
+            for port in (kept.get("port"), _free_port()):
+                if isinstance(port, int) and self._try(port):
+                    self.endpoint = f"tcp/127.0.0.1:{port}"
+                    self._opened = time.monotonic() if port == kept.get("port") else None
+                    if (facts := {"port": port, "key": self._master}) != kept:
+                        write_json(self._home / "bus.json", facts, mode=0o600)
+                    return
+            trouble = "no router could be started"
+        except OSError as error:  # the volume is full, say; what runs can be stopped all the same
+            trouble = f"{self._home} can't be written ({error.strerror})"
+            self.close()
+        log.warning("the bus is off: %s; jobs run, commands to them do not", trouble)
 
     def _try(self, port: int) -> bool:
         import zenoh
 
         zenoh.init_log_from_env_or("off")
         users = self._home / "bus-users"
-        write_atomic(users, f"muster:{self._credential('', 0).password}\n".encode(), mode=0o600)
+        line = f"muster:{self._credential('', 0).password}\n".encode()
+        if not users.exists() or users.read_bytes() != line:
+            write_atomic(users, line, mode=0o600)
         config = zenoh.Config()
         settings = {
             "mode": "router",

@@ -77,7 +77,10 @@ class HomeLock:
 
     def publish(self, url: str) -> None:
         """Say where the controller listens, for commands on this machine."""
-        self.path.write_text(json.dumps({"pid": os.getpid(), "url": url}))
+        try:
+            self.path.write_text(json.dumps({"pid": os.getpid(), "url": url}))
+        except OSError as error:
+            log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 
     def release(self) -> None:
         self.path.unlink(missing_ok=True)

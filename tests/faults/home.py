@@ -30,7 +30,7 @@ class Home:
     def __init__(self, path: Path, *options: str, **env: str) -> None:
         """``options`` of ``muster serve``, ``env``: further variables of its environment."""
         self.path, self.options, self.env = path, options, env
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.starts = 0
         self.process: subprocess.Popen[bytes] | None = None
 
