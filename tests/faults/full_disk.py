@@ -41,7 +41,7 @@ def small_volume(directory: Path, size: int = VOLUME) -> Iterator[Path]:
         subprocess.run(["umount", "-l", directory], check=True)
 
 
-def full_disk_round(directory: Path, seed: str) -> tuple[Counter[str], list[str]]:
+def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
     """Fill the volume, ask for everything, make room: a job can always be stopped, and what was taken on ends."""
     rng = random.Random(seed)
     done, wrong = Counter[str](), list[str]()

@@ -14,10 +14,12 @@ from pathlib import Path
 
 # FULL
 # HOSTILE
+from tests.faults.full_disk import full_disk_round
+from tests.faults.hostile import hostile_round
 from tests.faults.second_controller import second_controller_round
 from tests.faults.wall_clock import wall_clock_round
 
-Round = Callable[[Path, str], tuple[Counter[str], list[str]]]
+Round = Callable[[Path, int], tuple[Counter[str], list[str]]]
 
 ROUNDS: Mapping[str, Round] = {
     "hostile jobs": hostile_round,
@@ -36,7 +38,7 @@ class Class:
     done: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
 
-    def run(self, directory: Path, seed: str) -> None:
+    def run(self, directory: Path, seed: int) -> None:
         """One more round; a defect of the harness counts as a violation."""
         self.rounds += 1
         try:

@@ -26,7 +26,7 @@ while time.monotonic() < end:
 """
 
 
-def second_controller_round(directory: Path, seed: str) -> tuple[Counter[str], list[str]]:
+def second_controller_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
     """Submit runs to both at once; every attempt of a run must have an epoch of its own, and every job must end."""
     rng = random.Random(seed)
     homes = [Home(directory / f"home-{name}", "--store", str(directory / "store")) for name in "ab"]

@@ -124,7 +124,7 @@ def run_classes(directory: Path, seed: int, rounds: int) -> list[Class]:
         for number in range(1, rounds + 1):
             place = directory / each.name.replace(" ", "-") / str(number)
             before = len(each.violations)
-            each.run(place, f"{seed}.{number}")
+            each.run(place, 1000 * seed + number)
             print(f"{each.name}, round {number}: {dict(each.done)}, {len(each.violations)} violations", flush=True)
             if len(each.violations) == before:
                 shutil.rmtree(place, ignore_errors=True)

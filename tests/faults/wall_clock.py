@@ -48,7 +48,7 @@ class WallClock:
             file.write(struct.pack("q", int(seconds * 1e9)))
 
 
-def wall_clock_round(directory: Path, seed: str) -> tuple[Counter[str], list[str]]:
+def wall_clock_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
     """A job with a time limit of an hour runs while the clock jumps, the controller perhaps restarts; nothing may come of it."""
     rng = random.Random(seed)
     clock = WallClock(directory / "clock")
