@@ -1,8 +1,8 @@
 """Connections, before anything is known of who is there: how many, and how long each may take to send a request.
 
 uvicorn bounds the time between two requests and nothing else. Here a connection that does not send its request in time is closed,
-and when there are too many, those that have waited longest without one give way. A connection whose request is complete is never
-cut: who follows a log may stay for days.
+and when there are too many, those that have waited longest for their client give way. A client that reads its answer is never cut
+off: a log may be followed for days.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Connections:
         self.most_of_a_peer = self.most * 3 // 4
         self._peers: dict[str, int] = {}
         self._waiting: dict[str, dict[Connection, None]] = {}
-        """By peer, the longest first: those whose request is not complete."""
+        """By peer, the longest first: those whose request is not complete, or whose answer is not read."""
         self._count, self._said = 0, -_SAID
 
     def admit(self, connection: Connection) -> bool:
@@ -71,7 +71,7 @@ class Connections:
         if time.monotonic() - self._said > _SAID:
             self._said = time.monotonic()
             log.warning(
-                "%d connections are open, %d of them from %s; those that have waited longest without sending a request are closed",
+                "%d connections are open, %d of them from %s; those that have waited longest for their client are closed",
                 *(self._count, self._peers.get(peer, 0), peer),
             )
         if victim is None:
@@ -97,7 +97,7 @@ class Connections:
         if not self._peers[connection.peer]:
             del self._peers[connection.peer]
 
-    def awaits_request(self, connection: Connection) -> None:
+    def awaits_client(self, connection: Connection) -> None:
         """From now on it may give way to others."""
         if connection.counted:
             self._waiting.setdefault(connection.peer, {})[connection] = None
@@ -145,6 +145,18 @@ class Connection(H11Protocol):
         super().on_response_complete()
         self._look()
 
+    def pause_writing(self) -> None:
+        """The client has stopped reading its answer: it has a minute to go on, and gives way to others meanwhile."""
+        super().pause_writing()
+        self._set_deadline(_FLUSH_TIMEOUT)
+        self._connections.awaits_client(self)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._phase == "answer":
+            self._set_deadline(None)
+            self._connections.has_request(self)
+
     def give_way(self) -> None:
         """Close, since others need the place."""
         self._set_deadline(None)
@@ -164,7 +176,7 @@ class Connection(H11Protocol):
             self._connections.has_request(self)
         else:
             self._set_deadline(HEADER_TIMEOUT if phase == "header" else BODY_TIMEOUT)
-            self._connections.awaits_request(self)
+            self._connections.awaits_client(self)
 
     def _set_deadline(self, seconds: float | None) -> None:
         if self._deadline is not None:
