@@ -25,6 +25,10 @@ class Backoff:
         self._troubles: dict[Hashable, _Trouble] = {}
         self._lock = threading.Lock()
 
+    def __bool__(self) -> bool:
+        """Whether anything fails at present."""
+        return bool(self._troubles)
+
     def failed(self, subject: Hashable, said: str, error: BaseException | None = None) -> bool:
         """Note a failure; returns whether it differs from the subject's last one, and only then logs it.
 

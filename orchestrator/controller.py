@@ -286,7 +286,9 @@ class Controller:
         if idle < pause or (version == self.roster.version and idle < _PASS_INTERVAL):
             return
         started, version = time.monotonic(), self.roster.version
-        waiting = [each for each in self.roster.waiting() if not self._backoff.waits(("start", each.job))]
+        waiting = self.roster.waiting()
+        if self._backoff:  # seldom: there may be very many of them
+            waiting = [each for each in waiting if not self._backoff.waits(("start", each.job))]
         if not waiting:
             self._board, self._passed = None, (version, started, 0.0)
             return

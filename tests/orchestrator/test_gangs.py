@@ -142,6 +142,8 @@ def test_a_job_waits_for_room_and_says_why(server: Serving) -> None:
 def test_a_program_that_can_not_start_fails_with_the_reason(shared_server: Serving) -> None:
     job = shared_server.gang("pass")
     shared_server.wait(job)
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+    container = {"image": "muster", "command": ["no-such-program"], "resourceRequirements": needs}
     registered = shared_server.client.batch(
         "RegisterJobDefinition",
         jobDefinitionName="nothing",
@@ -149,7 +151,7 @@ def test_a_program_that_can_not_start_fails_with_the_reason(shared_server: Servi
         nodeProperties={
             "numNodes": 1,
             "mainNode": 0,
-            "nodeRangeProperties": [{"targetNodes": "0", "container": {"command": ["no-such-program"]}}],
+            "nodeRangeProperties": [{"targetNodes": "0", "container": container}],
         },
     )
     job = shared_server.client.batch(
