@@ -30,6 +30,12 @@ def policy_arn(name: str) -> str:
     return f"{PREFIX}scheduling-policy/{name}"
 
 
+def ecs_arn(kind: str, environment: str, name: str = "") -> str:
+    """ARN of the ECS ``cluster`` that a compute environment would have, or with ``name`` of what is in it (``task`` …)."""
+    below = f"/{name}" if name else ""
+    return f"arn:aws:ecs:{REGION}:{ACCOUNT}:{kind}/AWSBatch-{environment}{below}"
+
+
 def plain_name(reference: str, kind: str) -> str:
     """The name in an ARN of this controller's ``kind`` (``job``, ``job-queue`` …); what is no ARN, as it is. Raises ClientError."""
     if not reference.startswith("arn:"):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Mapping
 from typing import Any
 
-from orchestrator.api.arns import environment_arn, job_arn, queue_arn
+from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.api.ecs import to_ecs
 from orchestrator.definition import target_nodes
 from orchestrator.jobs import Status, main_container
@@ -210,13 +211,13 @@ def _attempt(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
 
 
 def _container(job: Job, attempt: Attempt, node: int) -> dict[str, Any]:
-    record = main_container(attempt.nodes, node)
+    record, pool = main_container(attempt.nodes, node), attempt.pool or "local"
     detail = {
         "exitCode": record.get("exitCode"),
         "reason": str(record["reason"])[:255] if record.get("reason") else None,
         "logStreamName": stream_name(job, attempt.number, node) if attempt.started_at else None,
-        "containerInstanceArn": f"{environment_arn(attempt.pool or 'local')}/{record['host']}" if record else None,
-        "taskArn": f"{job_arn(job.id)}/{attempt.number}/{node}",
+        "containerInstanceArn": ecs_arn("container-instance", pool, record["host"]) if record else None,
+        "taskArn": ecs_arn("task", pool, uuid.uuid5(uuid.NAMESPACE_OID, f"{job.id}/{attempt.number}/{node}").hex),
         "networkInterfaces": [{"privateIpv4Address": record["address"]}] if record.get("address") else [],
     }
     return {key: value for key, value in detail.items() if value is not None}

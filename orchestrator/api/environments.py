@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api import permissions, rules
-from orchestrator.api.arns import ACCOUNT, REGION, environment_arn, plain_name, policy_arn
+from orchestrator.api.arns import ACCOUNT, ecs_arn, environment_arn, plain_name, policy_arn
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
@@ -213,11 +213,10 @@ def _matches(pattern: str, name: str) -> bool:
 
 
 def _describe(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
-    identifier = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}"))
     document: dict[str, Any] = {
         "containerOrchestrationType": "ECS",
-        "uuid": identifier,
-        "ecsClusterArn": f"arn:aws:ecs:{REGION}:{ACCOUNT}:cluster/AWSBatch-{environment.name}-{identifier}",
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}")),
+        "ecsClusterArn": ecs_arn("cluster", environment.name),
         **environment.document,
         "computeEnvironmentName": environment.name,
         "computeEnvironmentArn": environment_arn(environment.name),

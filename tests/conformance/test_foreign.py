@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pwd
+import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -100,8 +101,8 @@ def test_the_built_in_compute_environment_looks_like_one_of_awss(batch: Batch) -
     assert resources["type"] == "EC2", "Metaflow reads it unguarded"
     assert resources["minvCpus"] == resources["desiredvCpus"] == resources["maxvCpus"] == 8
     assert resources["instanceTypes"] == ["optimal"] and resources["subnets"] == [] == resources["securityGroupIds"]
-    assert found["ecsClusterArn"].startswith("arn:aws:ecs:us-east-1:000000000000:cluster/AWSBatch-local-")
-    assert found["uuid"] in found["ecsClusterArn"] and found["serviceRole"] and found["updatePolicy"]
+    assert found["ecsClusterArn"] == "arn:aws:ecs:us-east-1:000000000000:cluster/AWSBatch-local"
+    assert found["uuid"] and found["serviceRole"] and found["updatePolicy"]
     batch.api.create_compute_environment(computeEnvironmentName="unmanaged", type="UNMANAGED", unmanagedvCpus=4)
     [found] = batch.api.describe_compute_environments(computeEnvironments=["unmanaged"])["computeEnvironments"]
     assert (found["type"], found["unmanagedvCpus"]) == ("UNMANAGED", 4)
@@ -217,7 +218,8 @@ def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: B
     detail = batch.wait(job)
     [task] = detail["ecsProperties"]["taskProperties"]
     [container] = task["containers"]
-    assert detail["container"] == {} and task["taskArn"] and task["taskRoleArn"] == "arn:aws:iam::1:role/any"
+    assert re.fullmatch(r"arn:aws:ecs:us-east-1:000000000000:task/AWSBatch-local/[0-9a-f]{32}", task["taskArn"])
+    assert detail["container"] == {} and task["taskRoleArn"] == "arn:aws:iam::1:role/any"
     assert (container["name"], container["exitCode"]) == ("main", 0)
     assert batch.stream(container["logStreamName"]) == ["1 2"]
     [attempt] = detail["attempts"]
