@@ -85,5 +85,5 @@ def test_after_a_commit_that_failed_nothing_is_tried_again(crowd: Crowd) -> None
         raise OperationalError("COMMIT", {}, Exception("the connection broke"))
 
     event.listen(crowd.database.engine, "commit", lost)
-    assert [type(each).__name__ for each in crowd.call(adds("one"), adds("two"))] == ["OperationalError"] * 2
+    assert [type(each).__name__ for each in crowd.call(adds("one"), adds("two"))] == ["DatabaseError"] * 2
     assert len(calls) == 1
