@@ -27,7 +27,7 @@ from docker.errors import APIError, DockerException, ImageNotFound, NotFound
 from docker.models.containers import Container
 from docker.models.images import Image
 from docker.models.networks import Network
-from docker.types import DeviceRequest, IPAMConfig, IPAMPool, Mount, Ulimit
+from docker.types import IPAMConfig, IPAMPool, Mount
 
 from orchestrator.engines.base import (
     HERE,
@@ -43,6 +43,7 @@ from orchestrator.engines.base import (
 )
 from orchestrator.engines.docker_answers import NoAnswer, answered, unanswered
 from orchestrator.engines.docker_logs import LogCopy
+from orchestrator.engines.docker_options import limits, linux
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store import __version__
@@ -59,8 +60,6 @@ _GANG, _NODE = "muster.gang", "muster.node"
 """Labels of containers and networks."""
 _VERSION = "muster.version"
 """Label of images that have Muster in them."""
-_PERMISSIONS = {"READ": "r", "WRITE": "w", "MKNOD": "m"}
-"""Of devices, and their letters in Docker."""
 _REMEMBERED = 256
 """Gangs whose nodes' exit codes are told after their containers are gone: the controller asks once more when all has ended."""
 _PORT = 29500
@@ -238,7 +237,7 @@ class DockerEngine:
         container = gang.containers[node.contract.node_index]
         supervised = _VERSION in (image.labels or {})
         entrypoint = list((image.attrs.get("Config") or {}).get("Entrypoint") or [])
-        options = {**_limits(container, node, self._cores), **_linux(container)}
+        options = {**limits(container, node, self._cores), **linux(container)}
         mounts = [Mount(m.target, m.source, "bind", read_only=m.read_only) for m in mounts_of(container, gang.store)]
         environment = {**node.environment, **node.contract.to_env()}
         if supervised:
@@ -402,52 +401,6 @@ def _addresses(subnet: str, count: int) -> list[str]:
     if count > 250:
         raise EngineError(f"{count} nodes: the docker engine has room for 250 on a gang's network")
     return [f"{subnet.rpartition('.')[0]}.{index + 2}" for index in range(count)]
-
-
-def _limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[str, Any]:
-    """Cores, memory and GPUs of a node, as Docker's options."""
-    placement = node.placement
-    options: dict[str, Any] = {
-        "nano_cpus": int(min(placement.cpus, cores) * 1e9),
-        "mem_limit": f"{placement.memory}m",
-    }
-    if placement.gpus:
-        options["device_requests"] = [DeviceRequest(device_ids=list(placement.gpus), capabilities=[["gpu"]])]
-    linux = container.get("linuxParameters") or {}
-    if (swap := linux.get("maxSwap")) is not None:  # as on AWS, swappiness counts only beside it
-        options["memswap_limit"] = f"{placement.memory + swap}m"
-        options["mem_swappiness"] = linux.get("swappiness", 60)
-    ulimits = container.get("ulimits") or []
-    options["ulimits"] = [Ulimit(name=u["name"], soft=u["softLimit"], hard=u["hardLimit"]) for u in ulimits]
-    return options
-
-
-def _linux(container: Mapping[str, Any]) -> dict[str, Any]:
-    """What else ``containerProperties`` say, as Docker's options."""
-    linux = container.get("linuxParameters") or {}
-    options: dict[str, Any] = {"init": bool(linux.get("initProcessEnabled"))}
-    if size := linux.get("sharedMemorySize"):
-        options["shm_size"] = f"{size}m"
-    if tmpfs := linux.get("tmpfs"):
-        options["tmpfs"] = {
-            entry["containerPath"]: ",".join([f"size={entry['size']}m", *(entry.get("mountOptions") or [])])
-            for entry in tmpfs
-        }
-    if devices := linux.get("devices"):
-        options["devices"] = [_device(device) for device in devices]
-    if user := container.get("user"):
-        options["user"] = user
-    if container.get("privileged"):
-        options["privileged"] = True
-    if container.get("readonlyRootFilesystem"):
-        options["read_only"] = True
-    return options
-
-
-def _device(device: Mapping[str, Any]) -> str:
-    permissions = device.get("permissions") or list(_PERMISSIONS)
-    letters = "".join(letter for name, letter in _PERMISSIONS.items() if name in permissions)
-    return f"{device['hostPath']}:{device.get('containerPath') or device['hostPath']}:{letters}"
 
 
 def _stop(container: Container, grace: float) -> None:
