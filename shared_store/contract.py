@@ -25,6 +25,11 @@ def sealed(job: Mapping[str, str], contract: Mapping[str, str]) -> dict[str, str
     return {**{f"{_FOR_RANKS}{name}": value for name, value in job.items() if name not in contract}, **contract}
 
 
+def sealed_in_image(job: Mapping[str, str], contract: Mapping[str, str]) -> dict[str, str]:
+    """The same for a container: a job's ``PATH`` is kept in its place as well, since the image's Python is looked for in it."""
+    return {**sealed(job, contract), **{name: value for name, value in job.items() if name == "PATH"}}
+
+
 def job_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """The job's own variables among those of its supervisor."""
     return {name[len(_FOR_RANKS) :]: value for name, value in environment.items() if name.startswith(_FOR_RANKS)}

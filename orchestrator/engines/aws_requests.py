@@ -14,7 +14,7 @@ from typing import Any
 from orchestrator.engines.aws_config import AwsConfig
 from orchestrator.engines.base import EngineError, Gang, NodePlan
 from shared_store import __version__
-from shared_store.contract import sealed
+from shared_store.contract import sealed_in_image
 
 DIGEST, GANG = "muster:digest", "muster:gang"
 """Tags: of a definition, of what it says; of a job, the attempt that it is."""
@@ -181,7 +181,7 @@ def _supervised(environment: Mapping[str, str], config: AwsConfig) -> dict[str, 
     own = {name: value for name, value in environment.items() if name.startswith("MUSTER_")}
     rest = {name: value for name, value in environment.items() if name not in own}
     kernels = {"WARP_CACHE_PATH": f"{config.store}/kernels"}  # compiled once a kind of GPU, not once an instance
-    return {**sealed(kernels | rest, {}), "MUSTER_ENVIRONMENT": json.dumps(own, separators=(",", ":"))}
+    return {**sealed_in_image(kernels | rest, {}), "MUSTER_ENVIRONMENT": json.dumps(own, separators=(",", ":"))}
 
 
 def _node(gang: Gang, node: NodePlan, config: AwsConfig) -> str:

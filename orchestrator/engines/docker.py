@@ -47,7 +47,7 @@ from orchestrator.engines.docker_options import limits, linux
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store import __version__
-from shared_store.contract import BUS_VARIABLES, sealed
+from shared_store.contract import BUS_VARIABLES, sealed_in_image
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
@@ -244,7 +244,7 @@ class DockerEngine:
             self._kernels.mkdir(parents=True, exist_ok=True)
             mounts += [Mount(STORE, gang.store, "bind"), Mount(KERNELS, str(self._kernels), "bind")]
             job = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **node.environment}
-            environment = {"HOME": "/tmp", **sealed(job, node.contract.to_env())}
+            environment = {"HOME": "/tmp", **sealed_in_image(job, node.contract.to_env())}
             # whoever owns the store writes it; that is seldom the user that the image names
             owner = Path(gang.store).stat()
             options.setdefault("user", f"{owner.st_uid}:{owner.st_gid}")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared_store.contract import ContractError, NodeContract
+from shared_store.contract import ContractError, NodeContract, rank_variables, sealed, sealed_in_image
 
 
 def contract(**changes: Any) -> NodeContract:
@@ -158,3 +158,18 @@ def test_a_single_node_job_has_no_node_variables_and_an_array_s_child_its_index(
     assert env["AWS_BATCH_JOB_ID"] == "1f2e" and not any("NODE" in name for name in env if name.startswith("AWS"))
     assert (env["AWS_BATCH_JOB_ARRAY_INDEX"], env["AWS_BATCH_JOB_ARRAY_SIZE"]) == ("2", "5")
     assert NodeContract.from_env(env).array == (2, 5)
+
+
+def test_a_job_s_variables_pass_the_supervisor_unread_and_never_replace_the_contract() -> None:
+    ours = contract().to_env()
+    job = {"PYTHONPATH": "/mine", "LD_PRELOAD": "x.so", "PATH": "/mine/bin", "MUSTER_EPOCH": "99", "MINE": "\n="}
+    supervisor = {"PATH": "/bin", "HOME": "/root", **sealed(job, ours)}
+    assert {name: supervisor.get(name) for name in ("PYTHONPATH", "LD_PRELOAD", "PATH", "MINE")} == {
+        "PYTHONPATH": None,
+        "LD_PRELOAD": None,
+        "PATH": "/bin",
+        "MINE": None,
+    }
+    assert NodeContract.from_env(supervisor) == NodeContract.from_env(ours)
+    assert rank_variables(supervisor) == {"HOME": "/root", **job, **ours}
+    assert sealed_in_image(job, ours)["PATH"] == "/mine/bin", "where a container's Python is looked for"
