@@ -68,14 +68,8 @@ class Gangs:
     def __init__(
         self, engine: Several, store: Store, bus: Bus, peers: Peers, clock: Clock, changed: Callable[[], None]
     ) -> None:
-        self.engine, self.store, self.bus, self.peers, self.clock, self.changed = (
-            engine,
-            store,
-            bus,
-            peers,
-            clock,
-            changed,
-        )
+        self.engine, self.store, self.bus = engine, store, bus
+        self.peers, self.clock, self.changed = peers, clock, changed
         self._stops: dict[tuple[str, int], Future[GangStatus]] = {}
         self._finished: dict[tuple[str, int], float] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
@@ -142,7 +136,7 @@ class Gangs:
             if job.stop_reason is not None and not wait.unknown:  # nothing of it was started: there is nothing to stop
                 self._close(session, job, attempt, Verdict(Ending.STOPPED, job.stop_reason), [])
             elif str(wait):
-                job.status_reason = str(wait)[:1024]
+                job.status_reason = str(wait)
         except EngineError as error:
             self._close(session, job, attempt, Verdict(Ending.FATAL, f"can't start the gang: {error}"), [])
         session.commit()
@@ -327,7 +321,7 @@ class Gangs:
             expected = isinstance(error, EngineError) and not isinstance(error, EngineFault)
             self._denied.failed(key, f"job {job.id}: {said}", None if expected else error)
         if said_last := self._denied.said(key):
-            job.status_reason = said_last.removeprefix(f"job {job.id}: ")[:1024]
+            job.status_reason = said_last.removeprefix(f"job {job.id}: ")
         return None
 
     @contextmanager
