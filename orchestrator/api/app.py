@@ -54,7 +54,7 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
         except DatabaseError as error:
             trouble = str(error)
         if trouble is not None:
-            return JSONResponse({"status": "unavailable", "reason": trouble, "version": __version__}, 503)
+            return JSONResponse({"status": "unavailable", "message": trouble, "version": __version__}, 503)
         return JSONResponse({"status": "ok", "version": __version__})
 
     @app.post("/v1/{operation}", include_in_schema=False)

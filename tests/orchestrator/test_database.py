@@ -357,7 +357,11 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.
                 serving.gang("pass")
             assert away.value.status == 503
             health = f"{serving.url}/healthz"
-            wait_for(lambda: (a := httpx.get(health)).status_code == 503 and "reason" in a.json(), 30, "its trouble")
+            wait_for(
+                lambda: (a := httpx.get(health)).status_code == 503 and "postgresql" in a.json()["message"],
+                30,
+                "its trouble",
+            )
         wait_for(lambda: httpx.get(health).status_code == 200, 30, "that it serves again")
         assert serving.wait(serving.gang("print('again')"))["status"] == "SUCCEEDED"
         assert serving.detail(running)["status"] == "RUNNING"
