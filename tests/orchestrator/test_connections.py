@@ -16,7 +16,7 @@ from orchestrator.api import connections
 from orchestrator.api.connections import raise_descriptor_limit
 from orchestrator.client import Client
 from orchestrator.server import Server
-from tests.conftest import MUSTER, Serving
+from tests.conftest import MUSTER, Serving, wait_for
 
 DESCRIPTORS = 1024
 HALF_OPEN = 1100
@@ -120,3 +120,23 @@ def test_the_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
         assert raise_descriptor_limit() == resource.getrlimit(resource.RLIMIT_NOFILE)[0] == min(hard, 65_536)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_clients_that_take_no_answer_give_way_and_when_none_can_a_new_one_is_told_why(
+    inside: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: connections.Connections = inside._uvicorn.config.http.args[0]  # type: ignore[union-attr]
+    request = b"GET /api/openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    stalled = [half_open(inside.url, request * 200) for _ in range(3)]
+    try:
+        wait_for(lambda: sum(map(len, held._waiting.values())) >= 3, 60, "that the server can send no more")
+        monkeypatch.setattr(held, "most_of_a_peer", held._peers["127.0.0.1"])
+        with httpx.Client(base_url=inside.url, timeout=60) as fresh:
+            assert fresh.get("/healthz").status_code == 200
+        monkeypatch.setattr(held, "most_of_a_peer", 0)
+        monkeypatch.setattr(held, "_waiting", {})
+        answer = httpx.get(f"{inside.url}/healthz", timeout=60)
+        assert answer.status_code == 503 and answer.json()["message"].startswith("too many connections are open")
+    finally:
+        for connection in stalled:
+            connection.close()
