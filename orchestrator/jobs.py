@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from orchestrator.excerpts import LONGEST_REASON, excerpt
 from shared_store.outcomes import EX_TEMPFAIL, first_cause
 
 
@@ -74,6 +75,9 @@ class NodeEnd:
     """Nobody saw the end: the node vanished, with its host as far as anyone knows."""
     asked: bool = False
     """The node was told to end: why is to be found elsewhere."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reason", excerpt(self.reason, LONGEST_REASON))  # an engine passes on what it was told
 
 
 @dataclass(frozen=True)
