@@ -50,6 +50,7 @@ class Surroundings:
         """Put before the command."""
         self.kept: Path | None = None
         """What is not removed at the end."""
+        made = [scratch]
         if contract.isolation:
             if own.get(KEEP) == "1":
                 self.kept = Path(tempfile.mkdtemp(prefix=f"muster-kept-{contract.job[:8]}-{contract.node_index}-"))
@@ -65,18 +66,20 @@ class Surroundings:
                 name: value for name, value in environment.items() if name in kept or name.startswith(_KEPT_PREFIXES)
             }
             self.environment = {**inherited, "PATH": path, "HOME": str(home), **own}
+            made += [above, home, work]
         if contract.user:
-            self._become(contract.user, [scratch, *([above, home, work] if contract.isolation else [])])
+            self._become(contract, contract.user, made)
 
-    def _become(self, user: str, directories: list[Path]) -> None:
+    def _become(self, contract: NodeContract, user: str, directories: list[Path]) -> None:
         """Have the program run as ``UID:GID``, and these directories belong to it."""
         uid, gid = (int(part) for part in user.split(":"))
         for directory in directories:
             os.chown(directory, uid, gid)
         try:
-            name = pwd.getpwuid(uid).pw_name
+            found = pwd.getpwuid(uid)
             groups = "--init-groups"
-            self.environment = {"USER": name, "LOGNAME": name, **self.environment}
+            own = {} if contract.isolation else {"HOME": found.pw_dir}
+            self.environment |= {"USER": found.pw_name, "LOGNAME": found.pw_name, **own}
         except KeyError:
             groups = "--clear-groups"
         # a change of the user takes back the tie to the supervisor's life: setpriv ties anew

@@ -91,7 +91,7 @@ def check_nodes(properties: Mapping[str, Any], kind: str, *, complete: bool = Fa
         raise ClientError(f"{len(ranges)} node ranges; a multi-node parallel job has 1 to {_MOST_RANGES}")
     for entry in ranges:
         target = entry["targetNodes"]
-        where = f"node range {target[:20]}" if kind == "multinode" else "the container"
+        where = _where(entry, kind)
         check_container(entry["container"], where)
         if complete and not entry["container"].get("command"):
             raise ClientError(f"{where}: has no command; give one in the definition or in the overrides")
@@ -192,19 +192,30 @@ def _check_resource(entry: Mapping[str, str], where: str) -> None:
 
 
 def node_properties(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What a definition runs as ``nodeProperties`` whose ranges have a ``container`` each, and ``ecs``, its name, where it came as
-    ``ecsProperties``. A single-node job is the gang of one node that it is here. Raises ClientError."""
+    """What a definition runs, as ``nodeProperties``: a single-node job is a gang of one node here.
+
+    Every range has a ``container``, and where it came as ``ecsProperties`` also ``ecs``, the container's name. Raises ClientError.
+    """
     check_consumables(document, "the job definition")
     if document["type"] == "multinode":
         nodes = document["nodeProperties"]
-        return {**nodes, "nodeRangeProperties": [_in_container(entry) for entry in nodes["nodeRangeProperties"]]}
+        return {
+            **nodes,
+            "nodeRangeProperties": [
+                _in_container(entry, _where(entry, "multinode")) for entry in nodes["nodeRangeProperties"]
+            ],
+        }
     entry = {"targetNodes": "0:0", "container": document.get("containerProperties")}
     entry["ecsProperties"] = document.get("ecsProperties")
-    return {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [_in_container(entry)]}
+    return {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [_in_container(entry, _where(entry, "container"))]}
 
 
-def _in_container(entry: Mapping[str, Any]) -> dict[str, Any]:
-    where = f"node range {entry['targetNodes'][:20]}"
+def _where(entry: Mapping[str, Any], kind: str) -> str:
+    """How a node range is called in a refusal; a definition of type container has none."""
+    return f"node range {entry['targetNodes'][:20]}" if kind == "multinode" else "the container"
+
+
+def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
     given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
     if given not in (["container"], ["ecsProperties"]):
         raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
@@ -267,15 +278,15 @@ def override_nodes(properties: Mapping[str, Any], overrides: Mapping[str, Any]) 
                 "NodeOverride targets should match job definition. "
                 f"Non matching targets - {override['targetNodes'][:50]}"
             )
-        override_range(ranges[override["targetNodes"]], override)
+        override_range(ranges[override["targetNodes"]], override, "multinode")
         if override.get("instanceTypes"):
             ranges[override["targetNodes"]]["instanceTypes"] = list(override["instanceTypes"])
     return result
 
 
-def override_range(entry: dict[str, Any], changes: Mapping[str, Any]) -> None:
+def override_range(entry: dict[str, Any], changes: Mapping[str, Any], kind: str) -> None:
     """``containerOverrides`` or ``ecsPropertiesOverride`` on a node range, whichever the definition has. Raises ClientError."""
-    where = f"node range {entry['targetNodes'][:20]}"
+    where = _where(entry, kind)
     check_consumables(changes, where)
     right, wrong = ("ecsPropertiesOverride", "containerOverrides")
     if "ecs" not in entry:

@@ -157,7 +157,7 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
         return rules.override_nodes(properties, request.get("nodeOverrides") or {})
     if request.get("nodeOverrides"):
         raise ClientError("nodeOverrides is for multi-node parallel jobs; use containerOverrides")
-    rules.override_range(properties["nodeRangeProperties"][0], request)
+    rules.override_range(properties["nodeRangeProperties"][0], request, "container")
     return properties
 
 

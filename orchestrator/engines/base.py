@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import grp
-import pwd
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -178,7 +176,6 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             is_gang=gang.is_gang,
             array=gang.array,
             isolation=_isolation(gang, index),
-            user=_user(gang, index),
             cpus=placement.cpus,
             stall_timeout=gang.stall_timeout,
             log_limit=gang.log_limit,
@@ -195,26 +192,6 @@ def _isolation(gang: Gang, index: int) -> str:
         return ""
     image = gang.containers[index].get("image") if gang.containers else None
     return "muster" if image in (None, "", "muster") else "image"
-
-
-def _user(gang: Gang, index: int) -> str | None:
-    """``UID:GID`` of the job's ``user``, of the user database here. Raises EngineError where it is not there."""
-    given = gang.containers[index].get("user") if gang.isolated and gang.containers else None
-    if not given:
-        return None
-    name, _, group = str(given).partition(":")
-    try:
-        user = pwd.getpwuid(int(name)) if name.isdigit() else pwd.getpwnam(name)
-        uid, gid = user.pw_uid, user.pw_gid
-    except KeyError:
-        if not name.isdigit():
-            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
-        uid = gid = int(name)
-    try:
-        gid = int(group) if group.isdigit() else grp.getgrnam(group).gr_gid if group else gid
-    except KeyError:
-        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
-    return f"{uid}:{gid}"
 
 
 @dataclass(frozen=True)

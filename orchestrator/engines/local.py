@@ -7,17 +7,19 @@ the gang's name in its environment.
 
 from __future__ import annotations
 
+import grp
 import hashlib
 import json
 import logging
 import os
+import pwd
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orchestrator.engines.base import (
@@ -85,10 +87,9 @@ class LocalEngine:
     def plan(self, gang: Gang) -> Plan:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
         nodes = node_plans(gang, addresses, _FIRST_PORT)
-        if os.geteuid() != 0 and (user := next((node.contract.user for node in nodes if node.contract.user), None)):
-            raise EngineError(
-                f"user {user}: only a controller that runs as root can run a job as another user; leave user out"
-            )
+        for index, container in enumerate(gang.containers):
+            if user := container.get("user"):
+                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=_user(user)))
         return Plan(gang, nodes)
 
     def launch(self, plan: Plan) -> str:
@@ -213,6 +214,27 @@ class LocalEngine:
 
     def _said(self, gang: str, index: int) -> Path:
         return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.err"
+
+
+def _user(given: str) -> str:
+    """``UID:GID`` of ``user`` in a job definition. Raises EngineError where it is not there, or can't be taken on."""
+    if os.geteuid() != 0:
+        raise EngineError(
+            f"user {given}: only a controller that runs as root can run a job as another user; leave user out"
+        )
+    name, _, group = given.partition(":")
+    try:
+        user = pwd.getpwuid(int(name)) if name.isdigit() else pwd.getpwnam(name)
+        uid, gid = user.pw_uid, user.pw_gid
+    except KeyError:
+        if not name.isdigit():
+            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
+        uid = gid = int(name)
+    try:
+        gid = int(group) if group.isdigit() else grp.getgrnam(group).gr_gid if group else gid
+    except KeyError:
+        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
+    return f"{uid}:{gid}"
 
 
 def _address(gang: Gang, index: int) -> str:

@@ -160,6 +160,20 @@ def old(name: str) -> dict[str, Any]:
     return {**single(name), "containerProperties": container}
 
 
+def ecs(name: str) -> dict[str, Any]:
+    """One node, the newer way; with what is checked by a rule of its own."""
+    container = {
+        **_container(),
+        "name": "main",
+        "user": "nobody",
+        "logConfiguration": {"logDriver": "awslogs", "options": {}},
+    }
+    tasks = [
+        {"containers": [container], "taskRoleArn": "any", "volumes": [{"name": "v", "host": {"sourcePath": "/v"}}]}
+    ]
+    return {"jobDefinitionName": name, "type": "container", "ecsProperties": {"taskProperties": tasks}}
+
+
 def submission(definition: str, queue: str = "fuzz", **more: Any) -> dict[str, Any]:
     return {"jobName": "fuzz", "jobQueue": queue, "jobDefinition": definition, **more}
 
@@ -190,7 +204,7 @@ _FILTERS = {
 }
 POLICY = f"{PREFIX}scheduling-policy/fuzz"
 GOOD: dict[str, tuple[dict[str, Any], ...]] = {
-    "RegisterJobDefinition": (gang("made"), single("made"), old("made")),
+    "RegisterJobDefinition": (gang("made"), single("made"), old("made"), ecs("made")),
     "DescribeJobDefinitions": (
         {"jobDefinitions": ["gang", "single:1"]},
         {"maxResults": 1, "nextToken": ""},
@@ -217,6 +231,8 @@ GOOD: dict[str, tuple[dict[str, Any], ...]] = {
     ),
     "TerminateJob": ({"jobId": "<waiting>", "reason": "enough"},),
     "CancelJob": ({"jobId": "<array>", "reason": "enough"},),
+    "TerminateJobs": ({"jobs": ["<waiting>", "no-such-job"], "reason": "enough"},),
+    "CancelJobs": ({"jobs": ["<array>", "<gang>#1"], "reason": "enough"},),
     "CreateJobQueue": (
         queue("<new>", jobStateTimeLimitActions=[{**_LIMIT, "action": "CANCEL"}]),
         queue("<new>", schedulingPolicyArn=f"{PREFIX}scheduling-policy/fuzz"),

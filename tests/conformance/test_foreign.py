@@ -176,6 +176,9 @@ def test_a_job_runs_as_the_user_that_it_names(batch: Batch) -> None:
     os.kill(parent(rank), signal.SIGKILL)
     wait_for(lambda: not alive(rank), what="the end of the program, whose supervisor is gone")
     assert batch.wait(job)["status"] == "FAILED"
+    ours = {"MUSTER_ON_CHILD_FAILURE": "restart"}  # a job of our own kind, which has no directory of its own
+    job = batch.submit(batch.single("iso-ours", "id -u; echo $HOME", env=ours, container={"user": "nobody"}))
+    assert batch.wait(job)["status"] == "SUCCEEDED" and batch.lines(job) == [str(nobody.pw_uid), nobody.pw_dir]
     job = batch.submit(batch.single("iso-nobody", "true", container={"user": "no-such-user"}))
     assert "there is no user 'no-such-user' on this machine" in batch.wait(job)["statusReason"]
 
