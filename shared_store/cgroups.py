@@ -25,7 +25,7 @@ def own_group() -> str:
             mounts = [line.partition(" - ") for line in file]
         root, point = next(head.split()[3:5] for head, _, tail in mounts if tail.startswith("cgroup2 "))
         directory = os.path.normpath(os.path.join(point, os.path.relpath(path, root)))
-        trial = os.path.join(directory, f"muster-trial-{os.getpid()}")
+        trial = os.path.join(directory, f"muster-trial-{os.getpid()}-{time.monotonic_ns()}")
         os.mkdir(trial)
         os.rmdir(trial)
     except (OSError, StopIteration):

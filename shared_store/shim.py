@@ -4,9 +4,10 @@ It outlives whatever the node does. Everything the node starts is re-parented to
 subreaper), and where control groups can be made it puts the node into one. When the supervisor ends, however it ends, the shim kills
 and reaps all that is left and leaves with the supervisor's exit code. It passes on SIGTERM, SIGINT and SIGHUP.
 
-What this promises. With a control group: nothing survives, also where a job kills the shim itself (the engine finds the group). Without
-one: nothing survives the supervisor's end; of a job that kills the shim *and* has taken the node's marks out of its environment, what
-it started in a session of its own does. A process that SIGKILL does not end (state D) is named on standard error after ten seconds; the
+What this promises. Nothing survives the supervisor's end. Where a job kills the shim itself, too, the engine ends the node: by its control
+group, else by the marks in its environment. So one thing is left: a job that kills the shim and whose processes have left both behind,
+the marks (``env -i``) and the group (where there is none, or where the job's user may move processes out of it).
+A process that SIGKILL does not end (state D) is named on standard error after ten seconds; the
 shim then calls itself ``STUCK``, for the engine to see, and stays until that process is gone. Linux only.
 """
 
