@@ -119,9 +119,8 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
 def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
     known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "ppo"}
-    by_name = {
-        f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")
-    }  # a number, or one for each name
+    # settings that are a number, or a number for each name
+    by_name = {f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")}
     changes: dict[str, Any] = {}
     for key, value in values.items():
         if key not in known:

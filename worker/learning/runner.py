@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
-EVALUATED = 1024
-"""At most so many worlds of each rank are built to evaluate a policy."""
+EVALUATED = 256
+"""At most so many worlds of each rank are built to evaluate a policy: those of training still hold their memory."""
 WARNINGS = 10
 """At most so many iterations with worlds that were reset have a line of their own."""
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
