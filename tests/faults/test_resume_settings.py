@@ -12,6 +12,7 @@ import torch
 
 from orchestrator.api import runs
 from orchestrator.spec import PPO as Written
+from orchestrator.spec import Train
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
 from tests.worker.point_task import Point
@@ -73,7 +74,10 @@ REFUSED: dict[str, Any] = {
 """Of each setting that it can't change: another value."""
 
 
-def test_every_setting_is_in_one_of_the_two_tables() -> None:
+def test_every_setting_is_in_one_of_the_two_tables(unchanged: Runner) -> None:
+    refused = {"task", "seed", "config", "worlds"}  # test_refusals.py
+    assert Train.model_fields.keys() == {*refused, "iterations", "ppo"}
+    assert unchanged.iterations == 4, "the run was started with 2"
     settings = {item.name for item in dataclasses.fields(PPOConfig)}
     assert settings == Written.model_fields.keys() == APPLIED.keys() | REFUSED.keys()
     assert set(runs.NETWORK) == set(state.NETWORK) == REFUSED.keys()
