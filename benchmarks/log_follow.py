@@ -30,7 +30,7 @@ PAUSE = 0.02
 """Seconds between two lines of a node."""
 POLL = 0.2
 """Seconds between two polls of a FilterLogEvents follower."""
-MANY = 300_000
+MANY = 100_000
 """Lines of a job whose log is read whole."""
 _FLOOD = "for i in range({lines}): print('line', i, 'of the log of a program that prints much')"
 _LAST = "\nimport os, time\nif os.environ['NODE_RANK'] == '0': time.sleep(5)"
@@ -117,8 +117,8 @@ def finish(client: Client, job: str) -> None:
         time.sleep(0.1)
 
 
-def rates(url: str, home: str) -> list[tuple[str, int, float]]:
-    """What reads, how many lines, and how many in a second, at the best of three times."""
+def rates(url: str, home: str, controller: int) -> list[tuple[str, int, float, float]]:
+    """What reads, how many lines, how many in a second, and CPU seconds of the controller a line, at the best of three times."""
     rows = []
     with Client(url) as client:
         for nodes in (1, NODES):
@@ -131,13 +131,19 @@ def rates(url: str, home: str) -> list[tuple[str, int, float]]:
                 ("orchestrator.client", lambda job=job: sum(map(len, client.log_batches(job)))),
                 ("muster logs", lambda job=job: printed(url, home, job)),
             ):
-                took = []
+                took, worked = [], []
                 for _ in range(3):
-                    began = time.monotonic()
+                    began, before = time.monotonic(), cpu_seconds(controller)
                     count = read()
                     took.append(time.monotonic() - began)
-                rows.append((f"{name}, {what}", count, count / min(took)))
+                    worked.append(cpu_seconds(controller) - before)
+                rows.append((f"{name}, {what}", count, count / min(took), min(worked) / count))
     return rows
+
+
+def cpu_seconds(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def received(url: str, job: str, **query: str) -> int:
@@ -184,7 +190,7 @@ def main() -> None:
         try:
             assert server.stdout is not None
             url = server.stdout.readline().split()[2]
-            rows, read = measure(url, lines), rates(url, home)
+            rows, read = measure(url, lines), rates(url, home, server.pid)
         finally:
             server.terminate()
             server.wait()
@@ -196,10 +202,10 @@ def main() -> None:
         middle, high = values[len(values) // 2] * 1000, values[int(len(values) * 0.99)] * 1000
         print(f"| {name} | {len(values)} | {middle:.0f} ms | {high:.0f} ms |")
     print()
-    print("| a whole log read by | lines | lines/s |")
-    print("|---|---|---|")
-    for name, count, rate in read:
-        print(f"| {name} | {count} | {round(rate, -3):.0f} |")
+    print("| a whole log read by | lines | lines/s | controller's CPU for a line |")
+    print("|---|---|---|---|")
+    for name, count, rate, work in read:
+        print(f"| {name} | {count} | {round(rate, -3):,.0f} | {work * 1e6:.1f} µs |")
 
 
 if __name__ == "__main__":
