@@ -15,6 +15,7 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import page, page_size
 from orchestrator.api.permissions import Operation, Shared
+from orchestrator.engines.several import FRESH
 from orchestrator.pools import is_built_in
 from orchestrator.tables import ComputeEnvironment, JobQueue, SchedulingPolicy
 
@@ -237,7 +238,7 @@ def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[st
     """``computeResources`` of a built-in environment: the hosts that its engine has now."""
     engine = context.controller.engine
     served = [environment.name] if environment.name in engine.names else []
-    cpus = int(sum(host.cpus for host in engine.capacity(served)))
+    cpus = int(sum(host.cpus for host in engine.capacity(served, FRESH)))
     return {
         "type": "EC2",
         "allocationStrategy": "BEST_FIT_PROGRESSIVE",

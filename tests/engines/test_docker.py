@@ -161,7 +161,11 @@ def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> Non
             1,
             user="1234",
             ulimits=[{"name": "nofile", "softLimit": 321, "hardLimit": 321}],
-            linuxParameters={"sharedMemorySize": 96},
+            linuxParameters={
+                "sharedMemorySize": 96,
+                "maxSwap": 64,
+                "devices": [{"hostPath": "/dev/zero", "containerPath": "/dev/nothing", "permissions": ["READ"]}],
+            },
             readonlyRootFilesystem=True,
             **files,
         )
@@ -169,6 +173,9 @@ def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> Non
     [container] = bench.engine._containers(f"{JOB}/1/1").values()
     host = container.attrs["HostConfig"]
     assert (host["NanoCpus"], host["Memory"]) == (500_000_000, 256 * 2**20)
+    assert host["MemorySwap"] in (320 * 2**20, -1), "a kernel that counts no swap has no limit of it"
+    [device] = host["Devices"]
+    assert device == {"PathOnHost": "/dev/zero", "PathInContainer": "/dev/nothing", "CgroupPermissions": "r"}
     assert [node.exit_code for node in bench.ended(handle)] == [0]
     assert bench.log() == ["found", "runs", "store.json", "1234", "321", str(96 * 1024), "read-only"]
 
