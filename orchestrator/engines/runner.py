@@ -73,11 +73,13 @@ class Runner:
         """Since when the present call is being carried out (monotonic [s])."""
         with suppress(EngineError):
             self._hosts = self._tell_hosts()
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"engine {engine.name}", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Give the present call a few seconds, then close the engine; its gangs go on."""
+        """Give the present call a few seconds, drop those that wait, and close the engine; its gangs go on."""
+        self._closing.set()
         self._calls.put(None)
         self._thread.join(_CLOSING)
         self.engine.close()
@@ -165,7 +167,7 @@ class Runner:
     # -- on the engine's thread ---------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (call := self._calls.get()) is not None:
+        while (call := self._calls.get()) is not None and not self._closing.is_set():
             self._since = time.monotonic()
             try:
                 call()
