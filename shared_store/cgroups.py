@@ -9,9 +9,8 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Sequence
 
-from shared_store.processes import Process, find_process, kill
+from shared_store.processes import Process, find_process
 
 _TRIES = 25
 
@@ -42,15 +41,16 @@ def members(group: str) -> list[Process]:
     return found
 
 
-def kill_group(group: str, processes: Sequence[Process] = ()) -> None:
-    """SIGKILL to all of the group at once, where the kernel can (Linux 5.14), and to each of ``processes``."""
+def kill_group(group: str) -> None:
+    """SIGKILL to all of the group at once, where the kernel can (Linux 5.14); nothing where ``group`` is empty."""
+    if not group:
+        return
     with contextlib.suppress(OSError):
         file = os.open(f"{group}/cgroup.kill", os.O_WRONLY)  # not open(): it must not make one
         try:
             os.write(file, b"1")
         finally:
             os.close(file)
-    kill(processes)
 
 
 def remove_group(group: str) -> None:

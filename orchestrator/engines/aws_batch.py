@@ -63,6 +63,8 @@ class _Watched:
     status: GangStatus | None = None
     over_since: float | None = None
     """When AWS first said that the job is over (monotonic [s])."""
+    main_stopped: int | None = None
+    """When the main node stopped, as AWS says (Unix time [ms]): AWS ends the others then."""
     ended: dict[int, float] = field(default_factory=dict)
     """By node: when it was first seen to have ended (monotonic [s])."""
     logs: GangLogs | None = None
@@ -258,6 +260,7 @@ class AwsBatchEngine:
             return [NodeStatus(False, "", None, f"AWS Batch has no job {facts['aws']} any more")] * count
         if parent["status"] in _OVER and watched.over_since is None:
             watched.over_since = time.monotonic()
+        watched.main_stopped = (nodes.get(main) or {}).get("stoppedAt")
         status = [self._node(facts, watched, index, nodes.get(index) or parent, parent) for index in range(count)]
         failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
         if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
@@ -294,7 +297,8 @@ class AwsBatchEngine:
         code = 0 if code is None and status == "SUCCEEDED" else code
         reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
         ended = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
-        seen = Outcome(index, facts["epoch"], code or 0, None, str(reason) or _exited(code), None, ended, ended)
+        asked = bool(watched.main_stopped) and detail.get("stoppedAt", 0) > (watched.main_stopped or 0)
+        seen = Outcome(index, facts["epoch"], code or 0, None, str(reason) or _exited(code), None, ended, ended, asked)
         if code is not None and not self._settled(facts, watched, log, seen):
             return NodeStatus(True, address)  # it has ended, but how is still on its way
         return NodeStatus(False, address, code, str(reason))
