@@ -67,7 +67,7 @@ class Server:
         trusted_proxies: Sequence[str] = (),
         min_free: MinFree = DEFAULT,
     ) -> None:
-        """Take the lock, the port, the store, the database and the engines, in this order; nothing runs until :meth:`start`.
+        """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
@@ -89,6 +89,8 @@ class Server:
             stack.callback(self._lock.release)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
+            nodes = _make_engines(engines, home, cpus, gpus)  # before anything is made in the home directory
+            stack.callback(nodes.close)
             if store is None:
                 with suppress(OSError):  # said by open()
                     (home / "store").mkdir(mode=0o700)
@@ -96,12 +98,10 @@ class Server:
             try:
                 found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)
-                nodes = _make_engines(engines, home, cpus, gpus)
-                stack.callback(nodes.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
                     ensure_pools(session, nodes.names)
-            except (DatabaseError, EngineError, SecretsError) as error:
+            except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None
             self.bus = Bus(home, nodes.addresses)
             stack.callback(self.bus.close)
@@ -173,11 +173,14 @@ def _take_lock(home: Path) -> HomeLock:
 
 
 def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Sequence[str] | None) -> Several:
-    """The engines; where one can't be made, those before it are closed. Raises EngineError."""
+    """The engines; where one can't be made, those before it are closed. Raises ServerError."""
     with ExitStack() as stack:
         made = []
         for name in dict.fromkeys(names):
-            made.append(make_engine(name, home, cpus, gpus))
+            try:
+                made.append(make_engine(name, home, cpus, gpus))
+            except EngineError as error:
+                raise ServerError(str(error)) from None
             stack.callback(made[-1].close)
         several = Several(made)
         stack.pop_all()
