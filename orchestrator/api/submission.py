@@ -228,9 +228,11 @@ def _add_array(context: Context, parent: Job, request: Mapping[str, Any]) -> Non
     context.session.add(parent)
     context.session.flush()
     free = size if not waits else 1 if all(each.kind == "SEQUENTIAL" for each in waits) else 0
-    ready = {"status": Status.RUNNABLE, "status_reason": WAITING, "runnable_at": parent.created_at}
+    # as the controller would set it at its first look, which then has nothing to write
+    since = {"queued_since": parent.created_at - context.controller.clock.drift}
+    ready = {**since, "status": Status.RUNNABLE, "status_reason": WAITING, "runnable_at": parent.created_at}
     _insert_children(context.session, parent, range(free), ready)
-    _insert_children(context.session, parent, range(free, size), {"status": Status.SUBMITTED})
+    _insert_children(context.session, parent, range(free, size), {**since, "status": Status.SUBMITTED})
     for each in waits:
         _insert_waits(context.session, parent, each, size)
     note_changed(context.session, (f"{parent.id}:{index}" for index in range(size)))
