@@ -103,7 +103,7 @@ def follow(url: str, lines: int, texts: Callable[[str], Iterator[str]], sources:
 def submit(client: Client, name: str, script: str, nodes: int) -> str:
     container = {
         "image": "any",
-        "command": ["python", "-u" if name == "ticker" else "-P", "-c", script],
+        "command": [sys.executable, "-u" if name == "ticker" else "-P", "-c", script],
         "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
     }
     ranges = [{"targetNodes": "0:", "container": container}]

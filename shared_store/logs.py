@@ -126,10 +126,10 @@ class _Source:
         self.inside = not whole and len(chunk.data) == most
         if self.inside:
             whole = len(chunk.data)
-        found = list(_LINES.finditer(chunk.data, 0, whole))
         if chunk.left_out or chunk.replaced:
-            self._explain(chunk, found[0][1].decode(errors="replace") if found else timestamp(time.time()))
-        for match in found:
+            first = _LINES.search(chunk.data, 0, whole)
+            self._explain(chunk, first[1].decode(errors="replace") if first else timestamp(time.time()))
+        for match in _LINES.finditer(chunk.data, 0, whole):
             written, number, stream, text = match.groups()
             stamp = written.decode(errors="replace")
             if stamp > self.newest:
