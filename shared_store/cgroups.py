@@ -13,6 +13,8 @@ import time
 from shared_store.processes import Process, find_process
 
 _TRIES = 25
+_NEW = 60.0
+"""Seconds within which a process is about to enter a group that was made."""
 
 
 def own_group() -> str:
@@ -62,3 +64,11 @@ def remove_group(group: str) -> None:
         if not os.path.isdir(group):
             return
         time.sleep(0.02)  # processes that have just died still count for a moment
+
+
+def remove_abandoned_groups(directory: str) -> None:
+    """Remove groups of nodes below ``directory`` that are empty and not new: of shims that were killed, and nobody stopped the gang."""
+    for entry in os.scandir(directory) if directory else ():
+        with contextlib.suppress(OSError):  # the kernel refuses where a process is in it
+            if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:
+                os.rmdir(entry.path)

@@ -36,7 +36,7 @@ from orchestrator.engines.base import (
 )
 from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of, with_mounts
-from shared_store.cgroups import own_group
+from shared_store.cgroups import own_group, remove_abandoned_groups
 from shared_store.contract import sealed
 from shared_store.layout import Store
 from shared_store.nodes import NodeProcesses, end_nodes
@@ -79,6 +79,7 @@ class LocalEngine:
         self._children: dict[int, subprocess.Popen[bytes]] = {}
         self._groups = own_group()
         """Directory in which control groups of nodes are made; empty where they can't be."""
+        remove_abandoned_groups(self._groups)
         self._ended: dict[str, GangStatus] = {}
 
     def capacity(self) -> Sequence[Host]:

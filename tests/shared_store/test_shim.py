@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.cgroups import own_group, remove_group
+from shared_store.cgroups import own_group, remove_abandoned_groups, remove_group
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.processes import end_all, find_process, marked
 from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
@@ -217,3 +217,23 @@ def _holds(path: Path, text: bytes) -> bool:
 def test_marks_that_would_fit_every_process_are_refused(marks: list[str]) -> None:
     with pytest.raises(ValueError, match="no process can be told by the marks"):
         marked(marks)
+
+
+def test_abandoned_groups_are_removed_and_neither_those_in_use_nor_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not (groups := own_group()):
+        pytest.skip("this process can't make control groups")
+    directory = f"{groups}/muster-test-{os.getpid()}"
+    os.mkdir(directory)
+    shim = start("exec sleep 600", f"{directory}/muster-busy")
+    node = known(shim, directory)
+    wait_for(lambda: os.path.exists(f"{directory}/muster-busy/cgroup.procs"), 20, "the group")
+    wait_for(lambda: Path(f"{directory}/muster-busy/cgroup.procs").read_text(), 20, "a process in the group")
+    os.mkdir(f"{directory}/muster-empty")
+    remove_abandoned_groups(directory)
+    assert os.path.exists(f"{directory}/muster-empty"), "it is new"
+    monkeypatch.setattr("shared_store.cgroups._NEW", -60.0)
+    remove_abandoned_groups(directory)
+    assert not os.path.exists(f"{directory}/muster-empty") and os.path.exists(f"{directory}/muster-busy")
+    assert not end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
+    shim.wait(20)
+    assert not os.path.exists(directory)
