@@ -1,4 +1,4 @@
-"""Hostile jobs against a real controller and its local engine: ``python -m tests.faults.hostile --rounds 10 --seed 1``
+"""Hostile jobs against a real controller and its local engine.
 
 Each job tries one thing that must not work: to outlive its end, to stop or confuse what supervises it, to fill what others need. All of
 a round run side by side with an honest neighbour. After a job's end nothing of it may be left, its reason must be right, and the
@@ -7,13 +7,10 @@ neighbour must not have noticed. Whatever a job starts ends by itself after a mi
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import re
 import signal
-import sys
-import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -205,24 +202,3 @@ def _left(token: str) -> list[int]:
         except OSError:
             continue
     return found
-
-
-def main() -> int:
-    """Entry point; 1 where anything was wrong."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    total, wrong = Counter[str](), 0
-    for number in range(options.rounds):
-        with tempfile.TemporaryDirectory(prefix="muster-hostile-") as directory:
-            counts, violations = hostile_round(Path(directory) / "home", options.seed + number)
-        total += counts
-        wrong += len(violations)
-        print(f"round {number + 1}: {counts.total()} jobs, {'; '.join(violations) or 'nothing wrong'}", flush=True)
-    print(f"{total.total()} hostile jobs of {len(total)} kinds: {wrong} violations")
-    return 1 if wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A round of hostile jobs with a fixed seed; many rounds are ``python -m tests.faults.hostile``."""
+"""A round of hostile jobs with a fixed seed; many rounds are ``make torture``."""
 
 from __future__ import annotations
 
