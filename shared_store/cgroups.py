@@ -7,6 +7,7 @@ Delegate=yes``). Whether it may is found out by trying. No controller is enabled
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import time
 
@@ -38,8 +39,14 @@ def members(group: str) -> list[Process]:
     """Processes in the group and in groups below it; none where there is no such group."""
     found = []
     for directory, _, _ in os.walk(group):
-        with contextlib.suppress(FileNotFoundError), open(os.path.join(directory, "cgroup.procs")) as file:
-            found += [process for pid in file.read().split() if (process := find_process(int(pid)))]
+        try:
+            with open(os.path.join(directory, "cgroup.procs")) as file:
+                pids = file.read().split()
+        except OSError as error:
+            if error.errno in (errno.ENOENT, errno.ENODEV):  # it was removed, before or after it was opened
+                continue
+            raise
+        found += [process for pid in pids if (process := find_process(int(pid)))]
     return found
 
 
