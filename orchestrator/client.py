@@ -39,6 +39,10 @@ class Unreachable(Exception):
     """No controller answers; the message says where one was looked for and how to start one."""
 
 
+class NotServing(ApiError, Unreachable):
+    """The controller answers that it can't serve now (503), and why; followers wait for it as for one that is away."""
+
+
 def _unnamable(text: str) -> ApiError:
     return ApiError(f"{text!r} names nothing; jobs and runs are named with letters, digits, '.', '_' and '-'", 400)
 
@@ -175,7 +179,7 @@ class Client:
             message = answer.json()["message"]
         except (ValueError, KeyError, TypeError):
             message = f"{answer.request.url} answered {answer.status_code}; is that a Muster controller?"
-        raise ApiError(message, answer.status_code)
+        raise (NotServing if answer.status_code == 503 else ApiError)(message, answer.status_code)
 
     def _unreachable(self, error: httpx.HTTPError) -> Unreachable:
         return Unreachable(

@@ -146,15 +146,13 @@ class Connection(H11Protocol):
         self._look()
 
     def pause_writing(self) -> None:
-        """The client has stopped reading its answer: it has a minute to go on, and gives way to others meanwhile."""
+        """The client has stopped reading its answer, such as a pager at rest: it may stay until others need the place."""
         super().pause_writing()
-        self._set_deadline(_FLUSH_TIMEOUT)
         self._connections.awaits_client(self)
 
     def resume_writing(self) -> None:
         super().resume_writing()
         if self._phase == "answer":
-            self._set_deadline(None)
             self._connections.has_request(self)
 
     def give_way(self) -> None:

@@ -17,7 +17,7 @@ from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, on_engine, submit_spec
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
-from orchestrator.client import Client, Unreachable
+from orchestrator.client import Client, NotServing, Unreachable
 from orchestrator.disk import DEFAULT, MinFree
 from orchestrator.home import ServerError, local_url, muster_home
 from orchestrator.spec import SpecError, seconds_of
@@ -191,6 +191,8 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
                     )
                 yield client
             return
+        except NotServing:
+            raise
         except Unreachable:
             if os.environ.get("MUSTER_URL"):
                 raise

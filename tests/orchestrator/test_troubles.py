@@ -151,14 +151,23 @@ def test_without_its_database_the_controller_says_so_and_accepts_nothing_until_i
                 ask()
             assert (refused.value.status, str(refused.value).count(said)) == (503, 1), refused.value
         wait_for(lambda: any(said in record.getMessage() for record in caplog.records), 30, "a line in the log")
+        waited: list[str] = []
+        follower = Client(url)
+        follower.told = waited.append
+        following = threading.Thread(target=lambda: list(follower.logs(running, follow=True)), daemon=True)
+        following.start()
+        wait_for(lambda: waited, 30, "a follower waits")
         assert how == "replaced" or not database.exists(), "no empty file was made in its place"
         assert set(before) <= set(processes_of(home))
         away.rename(database)
         wait_for(lambda: httpx.get(f"{url}/healthz").status_code == 200, 30, "that it serves again")
         await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
         assert detail(client, running)["status"] == "RUNNING" and set(before) <= set(processes_of(home))
+        assert following.is_alive()
         client.batch("TerminateJob", jobId=running, reason="enough")
         await_status(client, running, "FAILED")
+        following.join(60)
+        assert not following.is_alive()
     assert sum(said in record.getMessage() for record in caplog.records) == 1
 
 
