@@ -1,0 +1,106 @@
+"""A server with objects of two queues and a caller of every kind."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from orchestrator.api import logs
+from orchestrator.api.permissions import Operation
+from orchestrator.client import Client
+from orchestrator.definition import compile_definition, compile_submission
+from orchestrator.keys import KeyStore
+from orchestrator.spec import validate
+from tests.conftest import Serving
+
+TOKEN = "a-token-for-tests-alone"
+KEYS = ("admin", "token", "robots", "lab", "reader", "robots-reader", "lab-reader")
+"""The callers: keys for all queues, MUSTER_TOKEN, keys kept to the queues robots and lab, and the same three read-only."""
+SECRET, MARK = "hunter2-the-secret", "robots line"
+
+
+class World:
+    """A server with a queue ``robots``, whose key made all that there is in it, and a queue ``lab``."""
+
+    def __init__(self, home: Path) -> None:
+        kept = {"robots": ("robots",), "robots-reader": ("robots",), "lab": ("lab",), "lab-reader": ("lab",)}
+        self.tokens = {"token": TOKEN}
+        for name in (name for name in KEYS if name != "token"):
+            key = KeyStore(home).create(name, kept.get(name), read_only=name.endswith("reader"))
+            self.tokens[name] = f"{key.access_key_id}:{key.secret}"
+        os.environ["MUSTER_TOKEN"] = TOKEN
+        try:
+            self.server = Serving(home, "--cpus", "4")
+        finally:
+            del os.environ["MUSTER_TOKEN"]
+        self.url, self.http = self.server.url, httpx.Client(timeout=60)
+        self.clients = {name: Client(self.url, token) for name, token in self.tokens.items()}
+        self.server.client = self.clients["admin"]
+        admin = self.clients["admin"]
+        for queue in ("robots", "lab"):
+            order = [{"order": 1, "computeEnvironment": "local"}]
+            admin.batch("CreateJobQueue", jobQueueName=queue, priority=1, computeEnvironmentOrder=order)
+        self.counted = 0
+        self.definition = self.register("robots", "theirs")
+        self.job, self.run = self.native("robots", "robots")
+        self.server.wait(self.job)
+        self.stream = f"theirs/{self.job}/1/node-0"
+
+    def native(self, key: str, queue: str, **changes: Any) -> tuple[str, str]:
+        """Submit a job from YAML; its id and its run."""
+        document = {"name": "theirs", "queue": queue, "command": ["echo", MARK], "environment": {"SECRET": SECRET}}
+        spec = validate({**document, "resources": {"cpus": 0.1}, **changes}, "job.yaml")
+        name = self.register(key, f"native-{self.fresh()}", **compile_definition(spec, ""))
+        job = self.clients[key].batch("SubmitJob", **compile_submission(spec, name))["jobId"]
+        return job, f"{spec.name}-{job[:8]}"
+
+    def register(self, key: str, name: str, **request: Any) -> str:
+        """Register a definition as ``key``; its ARN."""
+        request = {**definition(name), **request, "jobDefinitionName": name}
+        return str(self.clients[key].batch("RegisterJobDefinition", **request)["jobDefinitionArn"])
+
+    def fresh(self) -> str:
+        self.counted += 1
+        return f"made-{self.counted}"
+
+    def made(self, operation: str, member: str, **request: Any) -> str:
+        """The name of something new that admin made."""
+        name = self.fresh()
+        self.clients["admin"].batch(operation, **{member: name, **request})
+        return name
+
+    def send(self, key: str, operation: str, **request: Any) -> httpx.Response:
+        """One of AWS's operations, as ``key``."""
+        bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
+        if operation.endswith(("Resource", "ForResource")):
+            method = {"TagResource": "POST", "UntagResource": "DELETE"}.get(operation, "GET")
+            query = {"tagKeys": request.get("tagKeys", [])}
+            url = f"{self.url}/v1/tags/{request['resourceArn']}"
+            content = {"tags": request["tags"]} if method == "POST" else None
+            return self.http.request(method, url, json=content, params=query, headers=bearer)
+        if operation in logs.OPERATIONS:
+            bearer["X-Amz-Target"] = f"Logs_20140328.{operation}"
+            return self.http.post(self.url, json=request, headers=bearer)
+        return self.http.post(f"{self.url}/v1/{operation.lower()}", json=request, headers=bearer)
+
+    def native_call(self, key: str, operation: Operation, body: dict[str, Any] | None = None) -> httpx.Response:
+        method, _, path = operation.partition(" ")
+        path = path.format(reference=self.job, name=self.run)
+        return self.http.request(
+            method, self.url + path, json=body, headers={"Authorization": f"Bearer {self.tokens[key]}"}
+        )
+
+
+def definition(name: str) -> dict[str, Any]:
+    container = {
+        "image": "any",
+        "command": ["echo", MARK],
+        "resourceRequirements": [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}],
+        "environment": [{"name": "SECRET", "value": SECRET}],
+    }
+    ranges = [{"targetNodes": "0:", "container": container}]
+    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
+    return {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
