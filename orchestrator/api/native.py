@@ -44,6 +44,9 @@ IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 """Makes a submission safe to repeat after a lost answer."""
 
 RUNS_A_PAGE = 100
+METRICS_A_PAGE = 10_000
+_LARGEST_PLAN = 4 << 20
+"""Characters of all nodes' variables together."""
 _POLL = 0.05
 """Seconds between two looks at a log that is followed."""
 _HEARTBEAT = 5.0
@@ -141,6 +144,12 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         }
         for node in planned.nodes
     ]
+    size = sum(len(name) + len(value) for node in nodes for name, value in node["environment"].items())
+    if size > _LARGEST_PLAN:
+        raise ClientError(
+            f"the plan's {len(nodes)} nodes have {size >> 20} MiB of variables, more than {_LARGEST_PLAN >> 20}; "
+            "plan the job with fewer nodes"
+        )
     name = engine_of(placements[0].host)
     images = controller.engine.engines[name].images
     return {"engine": name, "computeEnvironment": pool, "images": images, "nodes": nodes, "document": planned.document}
@@ -331,9 +340,14 @@ def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[d
 
 
 @router.get("/runs/{name}/metrics")
-def run_metrics(request: Request, name: str, after: int = 0) -> list[dict[str, Any]]:
-    """The run's metrics, one record an iteration, for iterations greater than ``after``."""
-    return history_of(permitted_run(_controller(request), name, Operation.READ_METRICS)).after(after)
+def run_metrics(
+    request: Request,
+    name: str,
+    after: int = 0,
+    most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
+) -> list[dict[str, Any]]:
+    """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``."""
+    return history_of(permitted_run(_controller(request), name, Operation.READ_METRICS)).after(after)[:most]
 
 
 @router.post("/runs/{name}/resume")

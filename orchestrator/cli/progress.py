@@ -36,19 +36,15 @@ def follow(client: Client, job_id: str) -> int:
                     reason = job.get("statusReason")
                     attempts = client.get(f"/api/jobs/{job_id}")["attempts"]
                     display.nodes = len(attempts[-1]["nodes"]) if attempts else display.nodes
-                records = (
-                    client.get(f"/api/runs/{detail['run']}/metrics", after=seen)
-                    if attempts  # a job that never started, even one that is over, has no run
-                    else []
-                )
+                records = []
+                # a job that never started, even one that is over, has no run
+                while attempts and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
+                    records, seen = page, page[-1]["iteration"]
             except Unreachable:
                 client.await_return()
                 continue
-            if records:
-                seen = records[-1]["iteration"]
-                records = [
-                    each for each in records if each["time"] * 1000 >= detail["createdAt"]
-                ]  # not those before a resume
+            # not those before a resume
+            records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
             display.show(job, records[-1] if records else None)
             if over:
                 break

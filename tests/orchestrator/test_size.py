@@ -106,3 +106,24 @@ def test_a_request_beyond_a_limit_is_refused_by_the_limits_name(http: httpx.Clie
         target = {"X-Amz-Target": "Logs_20140328.GetLogEvents", "Content-Type": "application/x-amz-json-1.1"}
         answer = http.post("/", content=body, headers=target)
         assert answer.status_code == 400 and said in answer.json()["message"] and len(answer.text) < 500
+
+
+def test_metrics_come_in_pages_and_no_plan_is_longer_than_a_limit(inside: Server, http: httpx.Client) -> None:
+    run = inside.store.run("long")
+    run.create({"run": "long"})
+    run.metrics.mkdir(exist_ok=True)
+    records = "".join(f'{{"iteration": {number}, "time": 1.0}}\n' for number in range(1, 10_003))
+    (run.metrics / "metrics-e1.jsonl").write_text(records)
+    page = http.get("/api/runs/long/metrics").json()
+    assert (len(page), page[-1]["iteration"]) == (10_000, 10_000)
+    assert [each["iteration"] for each in http.get("/api/runs/long/metrics?after=10000").json()] == [10_001, 10_002]
+    assert [each["iteration"] for each in http.get("/api/runs/long/metrics?max=2").json()] == [1, 2]
+    assert http.get("/api/runs/long/metrics?max=20000").status_code == 400
+
+    resources = [{"type": "VCPU", "value": "0.001"}, {"type": "MEMORY", "value": "4"}]
+    container = {"image": "muster", "command": ["true"], "environment": LARGE, "resourceRequirements": resources}
+    ranges = [{"targetNodes": "0:", "container": container}]
+    properties = {"numNodes": 1000, "mainNode": 0, "nodeRangeProperties": ranges}
+    definition = {"jobDefinitionName": "wide", "type": "multinode", "nodeProperties": properties}
+    answer = http.post("/api/plan", json={"queue": "default", "definition": definition})
+    assert answer.status_code == 400 and "MiB of variables, more than 4" in answer.json()["message"]
