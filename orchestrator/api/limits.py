@@ -17,6 +17,8 @@ LARGEST_BODY = 1 << 20
 """Bytes of any request's body."""
 LARGEST = {"submitjob": 30 << 10, "registerjobdefinition": 24 << 10}
 """Bytes of the body of these operations (lower case), as on AWS."""
+LARGEST_COMMANDS = 64 << 10
+"""Bytes of the commands of all node ranges of a job, with its parameters substituted."""
 MOST_VALUES = 10_000
 """Texts, numbers, lists and objects of a request."""
 DEEPEST = 50

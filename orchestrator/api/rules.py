@@ -10,6 +10,7 @@ from typing import Any
 
 from orchestrator.api.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.errors import ClientError
+from orchestrator.api.limits import LARGEST_COMMANDS
 from orchestrator.api.members import check_consumables, check_members
 from orchestrator.definition import GangNeeds, gang_needs, target_nodes
 from orchestrator.excerpts import shown
@@ -228,16 +229,34 @@ def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def substitute(properties: Mapping[str, Any], parameters: Mapping[str, str]) -> dict[str, Any]:
-    """Replace ``Ref::name`` in every command by its parameter. Raises ClientError for one that is not given."""
+    """Replace ``Ref::name`` in every command by its parameter.
+
+    Raises ClientError for a parameter that is not given, and as soon as all commands together exceed LARGEST_COMMANDS: a
+    parameter may be referred to thousands of times, so a small request could ask for a text that fills the memory.
+    """
+    sizes = {name: len(value.encode()) for name, value in parameters.items()}
+    total = 0
+
+    def add(size: int) -> None:
+        nonlocal total
+        total += size
+        if total > LARGEST_COMMANDS:
+            raise ClientError(
+                f"the commands exceed {LARGEST_COMMANDS} bytes with their parameters substituted; shorten the parameters, or "
+                "refer to them less often"
+            )
 
     def replace(match: re.Match[str]) -> str:
         if match[1] not in parameters:
             raise ClientError(f"Unable to substitute value. No parameter found for reference {match[1]}")
+        add(sizes[match[1]] - len(match[0]))
         return parameters[match[1]]
 
     result = copy.deepcopy(dict(properties))
     for entry in result["nodeRangeProperties"]:
         command = entry["container"].get("command") or []
+        for part in command:
+            add(len(part.encode()))
         entry["container"]["command"] = [_REFERENCE.sub(replace, part) for part in command]
     return result
 

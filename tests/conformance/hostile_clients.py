@@ -22,12 +22,13 @@ HEAD = b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\n"
 
 @dataclass(frozen=True)
 class Target:
-    """A server, a token that may do everything, and a run that can be resumed."""
+    """A server, a token that may do everything, a run that can be resumed, and a definition (type container)."""
 
     host: str
     port: int
     token: str
     run: str
+    definition: str
 
     @property
     def authorization(self) -> bytes:
@@ -108,6 +109,13 @@ def alias_bomb(levels: int) -> str:
     return "train.config={" + ", ".join(parts) + "}"
 
 
+def references(definition: str, count: int) -> dict[str, Any]:
+    """A SubmitJob whose command would be ``count`` times 14,000 bytes long once its parameter is substituted."""
+    submission = {"jobName": "references", "jobQueue": "default", "jobDefinition": definition}
+    override = {"command": ["echo", "Ref::a " * count]}
+    return {**submission, "containerOverrides": override, "parameters": {"a": "x" * 14_000}}
+
+
 def _bodies(target: Target, rng: random.Random) -> Iterator[tuple[str, Any]]:
     """Paths with bodies that grow when they are read or answered."""
     deep = "[" * rng.choice((50, 5_000, 100_000))
@@ -115,6 +123,7 @@ def _bodies(target: Target, rng: random.Random) -> Iterator[tuple[str, Any]]:
         yield f"/api/runs/{target.run}/resume", json.dumps({"set": [alias_bomb(rng.randrange(2, LEVELS))]})
         yield "/v1/describejobs", json.dumps({"jobs": ["0"] * rng.choice((101, 10_000, 200_000))})
         yield "/v1/submitjob", json.dumps({"jobName": "x" * rng.choice((200, 500_000))})
+        yield "/v1/submitjob", json.dumps(references(target.definition, rng.choice((1_000, 2_000))))
         yield "/v1/terminatejob", json.dumps({"jobId": "0", "reason": "\x1b]0;x\x07" * rng.choice((1, 100_000))})
         yield "/v1/listjobs", deep
         yield "/v1/listjobs", '{"jobQueue": ' + "9" * rng.choice((5_000, 900_000)) + "}"

@@ -37,7 +37,12 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Fuzzed, T
         '{"run": "crafted", "spec": {"name": "crafted", "train": {"task": "Cartpole", "worlds": 8, "iterations": 9}}}'
     )
     url = httpx.URL(server.url)
-    yield server, Target(url.host, url.port or 0, TOKEN, "crafted")
+    resources = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+    container = {"image": "any", "command": ["true"], "resourceRequirements": resources}
+    server.client.batch(
+        "RegisterJobDefinition", jobDefinitionName="small", type="container", containerProperties=container
+    )
+    yield server, Target(url.host, url.port or 0, TOKEN, "crafted", "small")
     server.close()
 
 

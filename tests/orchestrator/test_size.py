@@ -8,6 +8,7 @@ import httpx
 import pytest
 from sqlalchemy import func, select
 
+from orchestrator.api.limits import LARGEST_COMMANDS
 from orchestrator.server import Server
 from orchestrator.tables import Job
 from tests.conftest import wait_for
@@ -127,3 +128,20 @@ def test_metrics_come_in_pages_and_no_plan_is_longer_than_a_limit(inside: Server
     definition = {"jobDefinitionName": "wide", "type": "multinode", "nodeProperties": properties}
     answer = http.post("/api/plan", json={"queue": "default", "definition": definition})
     assert answer.status_code == 400 and "MiB of variables, more than 4" in answer.json()["message"]
+
+
+def test_references_to_a_parameter_can_t_make_a_command_larger_than_the_limit(http: httpx.Client, waiting: str) -> None:
+    command = ["echo", "Ref::a " * 3_200]
+    container = {"image": "any", "command": command, "resourceRequirements": RESOURCES}
+    call(http, "RegisterJobDefinition", jobDefinitionName="refs", type="container", containerProperties=container)
+    submission = {"jobName": "refs", "jobQueue": waiting, "jobDefinition": "refs"}
+    refused = http.post("/v1/submitjob", json={**submission, "parameters": {"a": "x" * 28_000}})
+    assert refused.status_code == 400 and len(refused.content) < 1_000
+    assert "the commands exceed 65536 bytes with their parameters substituted" in refused.json()["message"]
+    most = (LARGEST_COMMANDS - len("echo") - 3_200) // 3_200
+    job = call(http, "SubmitJob", **submission, parameters={"a": "x" * most})["jobId"]
+    [detail] = call(http, "DescribeJobs", jobs=[job])["jobs"]
+    assert detail["container"]["command"][1] == ("x" * most + " ") * 3_200
+    refused = http.post("/v1/submitjob", json={**submission, "parameters": {"a": "x" * (most + 1)}})
+    assert refused.status_code == 400, refused.text
+    call(http, "TerminateJob", jobId=job, reason="enough")
