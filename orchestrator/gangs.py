@@ -35,6 +35,7 @@ from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
+from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import read_outcome
 
@@ -343,7 +344,9 @@ class Gangs:
         self._uncertain.pop(key, None)
         self._denied.worked(key)
         self.bus.forget(*key)
-        with suppress(OSError):  # while this controller lives, another one may then say that the run is written
+        with suppress(
+            OSError, DamagedFile
+        ):  # while this controller lives, another one may then say that the run is written
             close_claim(self.store.run(job.run), attempt.epoch)
         self.engine.forget(str(attempt.nodes[0]["host"]), _name(attempt), attempt.handle)
 

@@ -11,7 +11,6 @@ import hashlib
 import math
 import os
 import re
-import stat
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,7 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.epoch import StaleEpoch, check_epoch
-from shared_store.files import read_json, remove_tree, sync_directory, write_atomic, write_json
+from shared_store.files import (
+    DamagedFile,
+    open_regular,
+    read_json,
+    remove_tree,
+    sync_directory,
+    write_atomic,
+    write_json,
+)
 from shared_store.layout import Run
 
 FORMAT = 1
@@ -89,17 +96,18 @@ class Checkpoint:
         for name, entry in sorted(self.manifest["files"].items()):
             path = self.path / name
             try:
-                found = path.lstat()
-                if not stat.S_ISREG(found.st_mode):
-                    raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is not a regular file")
-                if found.st_size != entry["size"]:
-                    raise DamagedCheckpoint(
-                        f"checkpoint {self.name}: {name} has {found.st_size} bytes, {entry['size']} were written"
-                    )
-                if _digest(path) != entry["sha256"]:
-                    raise DamagedCheckpoint(
-                        f"checkpoint {self.name}: the content of {name} was altered (SHA-256 differs)"
-                    )
+                with open_regular(path) as file:
+                    size = os.fstat(file.fileno()).st_size
+                    if size != entry["size"]:
+                        raise DamagedCheckpoint(
+                            f"checkpoint {self.name}: {name} has {size} bytes, {entry['size']} were written"
+                        )
+                    if hashlib.file_digest(file, "sha256").hexdigest() != entry["sha256"]:
+                        raise DamagedCheckpoint(
+                            f"checkpoint {self.name}: the content of {name} was altered (SHA-256 differs)"
+                        )
+            except DamagedFile:
+                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is not a regular file") from None
             except FileNotFoundError:
                 raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is missing") from None
             except OSError as error:

@@ -16,7 +16,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from shared_store.files import open_regular, sync_directory, write_atomic
+from shared_store.files import open_regular, refuse_links, sync_directory, write_atomic
 from shared_store.layout import Run, StoreError
 
 LARGEST_EPOCH = 10**15 - 1
@@ -46,6 +46,7 @@ class Claim:
 def read_epoch(run: Run) -> int:
     """The epoch that may write to ``run``; 0 before the first attempt. Raises ValueError where the file is damaged."""
     path = run.path / "EPOCH"
+    refuse_links(run.path, 1)
     try:
         with open_regular(path) as file:
             text = file.read(32).decode(errors="replace").strip()
@@ -96,8 +97,12 @@ def read_claim(run: Run, epoch: int) -> Claim | None:
 
 
 def close_claim(run: Run, epoch: int) -> None:
-    """Note that the attempt with ``epoch`` is closed. The file stays, empty: the number is never given again. Raises OSError."""
-    with contextlib.suppress(FileNotFoundError), open(_claim_path(run, epoch), "rb+") as file:
+    """Note that the attempt with ``epoch`` is closed. The file stays, empty: the number is never given again.
+
+    Raises OSError, DamagedFile where the run or the file is a link or anything else than what was made.
+    """
+    refuse_links(run.path, 1)
+    with contextlib.suppress(FileNotFoundError), open_regular(_claim_path(run, epoch), write=True) as file:
         file.truncate()
         os.fsync(file.fileno())
 
@@ -143,6 +148,7 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
     """Create ``EPOCH.<epoch>``; False where it exists: the number is taken."""
     if epoch > LARGEST_EPOCH:
         raise ValueError(f"{run.path / 'EPOCH'}: no epoch is left after {LARGEST_EPOCH}")
+    refuse_links(run.path, 1)
     run.path.mkdir(parents=True, exist_ok=True)
     try:
         descriptor = os.open(_claim_path(run, epoch), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)

@@ -14,8 +14,9 @@ import shutil
 import stat
 import uuid
 from collections.abc import Mapping
+from io import BufferedRandom, BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 LARGEST_JSON = 16 << 20
 """Bytes of a JSON file; what is larger was not written by Muster."""
@@ -103,21 +104,32 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     return value
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file of the store to read it: any job may have put a link there, which leads out of the store, or a pipe, which never ends.
+def refuse_links(path: Path, levels: int) -> None:
+    """Raise DamagedFile where directory ``path`` is a link, or one of the ``levels - 1`` above it: it leads out of the run."""
+    for each in (path, *path.parents[: levels - 1]):
+        if each.is_symlink():
+            raise DamagedFile(
+                f"{each}: a link, and links inside a run are not followed; put the directory in its place"
+            )
 
-    Raises DamagedFile where it is no regular file, OSError as ``open`` does.
+
+def open_regular(path: Path, *, write: bool = False) -> BufferedReader | BufferedRandom:
+    """Open a file of the store: any job may have put a link there, which leads out of the store, or a pipe, which never ends.
+
+    To read it; with ``write`` also to write it where it exists. Raises DamagedFile where it is no regular file, OSError as
+    ``open`` does.
     """
+    access = os.O_RDWR if write else os.O_RDONLY
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, access | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO):
+        if error.errno in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
             raise DamagedFile(f"{path}: not a regular file") from None
         raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise DamagedFile(f"{path}: not a regular file")
-    return open(descriptor, "rb")
+    return open(descriptor, "rb+") if write else open(descriptor, "rb")
 
 
 def _read_regular(path: Path, largest: int) -> bytes:

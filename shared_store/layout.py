@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from shared_store.files import DamagedFile, read_json, write_json
+from shared_store.files import DamagedFile, read_json, refuse_links, write_json
 
 FORMAT = 1
 """Version of the layout; a store with a newer one is refused."""
@@ -64,11 +64,17 @@ class Run:
     def outcome(self, job: str, attempt: int, node: int) -> Path:
         return self.path / "outcomes" / job / str(attempt) / f"node-{node}.json"
 
+    def check_links(self) -> None:
+        """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
+        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes"):
+            refuse_links(self.path / name, 2)
+
     def description(self) -> dict[str, Any] | None:
         """The content of ``run.json`` (spec, code versions, creation time); None where the run does not exist.
 
-        Raises DamagedFile where it is no such description, OSError where the volume can't be read.
+        Raises DamagedFile where it is no such description or :meth:`check_links` refuses, OSError where the volume can't be read.
         """
+        self.check_links()
         path = self.path / "run.json"
         found = read_json(path, LARGEST_DESCRIPTION)
         if found is not None and not isinstance(found.get("spec"), dict | None):
@@ -78,7 +84,8 @@ class Run:
         return found
 
     def create(self, description: dict[str, Any]) -> None:
-        """Write ``run.json`` once; a run that exists keeps the one it has."""
+        """Write ``run.json`` once; a run that exists keeps the one it has. Raises as :meth:`check_links`, OSError."""
+        self.check_links()
         if not (self.path / "run.json").exists():
             write_json(self.path / "run.json", description)
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from shared_store.files import open_regular
+from shared_store.files import DamagedFile, open_regular, refuse_links
 
 LIMIT = 1 << 30
 """Bytes of a node's log in one attempt that are kept where nothing else is asked for."""
@@ -25,6 +25,8 @@ LEAST_LIMIT = 1 << 20
 
 _TAIL = re.compile(r"(node-\d+\.log)\.(\d{15})\.(\d{1,15})")
 _HEAD = re.compile(r"node-\d+\.log")
+_LEVELS = 4
+"""Directories from that of a log up to its run: ``<run>/logs/<job>/<attempt>``."""
 _SEGMENTS = 16
 """Files of this fraction of the limit make up the tail; half of that many are kept."""
 _IDENTITY = 64
@@ -63,12 +65,16 @@ class Chunk(NamedTuple):
 
 
 def log_segments(directory: Path) -> dict[str, list[Segment]]:
-    """The regular files of every log in ``directory`` by the name of its head, in order; empty where there is no such directory."""
+    """The regular files of every log in ``directory`` by the name of its head, in order.
+
+    Empty where there is no such directory, or where a link leads to it.
+    """
     found: dict[str, list[Segment]] = {}
     try:
+        refuse_links(directory, _LEVELS)
         with os.scandir(directory) as entries:
             names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError, DamagedFile):
         return found
     for name in names:
         if match := _TAIL.fullmatch(name):
@@ -151,7 +157,7 @@ class LogWriter:
     """Appends whole lines to a node's log and keeps it within its limit. One writer a log."""
 
     def __init__(self, path: Path, limit: int = LIMIT) -> None:
-        """Go on with the log whose head is ``path``, or begin it. Raises OSError.
+        """Go on with the log whose head is ``path``, or begin it. Raises OSError, DamagedFile where a directory on the way is a link.
 
         ``limit``: bytes to keep: half of them from the log's beginning, half from its end. Less where the volume is nearly full: no
         log takes more than a quarter of what it finds free, so that it has a tail, and its end is kept, whatever comes.
@@ -159,6 +165,7 @@ class LogWriter:
         self.path = path
         self.error: OSError | None = None
         """Why the last :meth:`append` did not write everything."""
+        refuse_links(path.parent, _LEVELS)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._segments = segments_of(path) or [Segment(0, 0, path)]
         self._unchecked, self._interval = 0, 0

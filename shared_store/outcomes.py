@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from shared_store.files import read_json, write_json
+from shared_store.files import read_json, refuse_links, write_json
 from shared_store.layout import Run
 
 LONGEST_TEXT = 16 << 10
@@ -18,6 +18,8 @@ a job can write the file itself."""
 _LATEST = 2.0**40
 """Unix times [s] in an outcome are smaller."""
 _NUMBER = int | float
+_LEVELS = 4
+"""Directories from that of an outcome up to its run: ``<run>/outcomes/<job>/<attempt>``."""
 EX_TEMPFAIL = 75
 """Exit code for "checkpointed and left on request: start me again, and don't count it as a failure" (sysexits.h)."""
 
@@ -64,14 +66,21 @@ def first_cause(ends: Sequence[tuple[bool, float]]) -> int:
 
 
 def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
-    """Commit ``outcome``, its texts bounded. Raises OSError where the store can't be written."""
-    write_json(run.outcome(job, attempt, outcome.node), asdict(bounded(outcome)))
+    """Commit ``outcome``, its texts bounded.
+
+    Raises OSError where the store can't be written, DamagedFile where a directory on the way is a link.
+    """
+    path = run.outcome(job, attempt, outcome.node)
+    refuse_links(path.parent, _LEVELS)
+    write_json(path, asdict(bounded(outcome)))
 
 
 def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
     """The committed outcome of a node; None while there is none, or where it is damaged. Raises OSError."""
     try:
-        value: dict[str, Any] | None = read_json(run.outcome(job, attempt, node))
+        path = run.outcome(job, attempt, node)
+        refuse_links(path.parent, _LEVELS)
+        value: dict[str, Any] | None = read_json(path)
         return None if value is None else parse_outcome(value)
     except (ValueError, TypeError):
         return None

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from shared_store.contract import BUS_VARIABLES, ContractError, NodeContract
 from shared_store.epoch import StaleEpoch, check_epoch, find_epoch
+from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.log_files import LogWriter, left_out
 from shared_store.logs import END_LINE, format_line, format_lines
@@ -340,8 +341,8 @@ class Supervisor:
             return outcome.exit_code  # somebody deleted the run: it must not come back in part
         try:
             write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
-        except OSError as error:
-            _tell(f"outcome of node {outcome.node} can't be written: {error.strerror}")
+        except (OSError, DamagedFile) as error:
+            _tell(f"outcome of node {outcome.node} can't be written: {error}")
         return outcome.exit_code
 
 

@@ -8,6 +8,7 @@ checkpoints stay on the volume.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import threading
@@ -26,6 +27,7 @@ from orchestrator.engines.aws_config import is_mounted_from, load_config
 from orchestrator.engines.aws_logs import GangLogs, NodeLog
 from orchestrator.engines.aws_requests import DIGEST, Requests, job_name, requests_for
 from orchestrator.engines.base import EngineError, Gang, GangStatus, Host, NodeStatus, NotYet, Plan, node_plans
+from shared_store.files import DamagedFile
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
@@ -312,7 +314,8 @@ class AwsBatchEngine:
         if not (log.whole if log is not None else since > _FIXED):
             return False
         if run.path.exists():
-            write_outcome(run, facts["job"], facts["attempt"], (log.outcome if log else None) or seen)
+            with contextlib.suppress(DamagedFile):  # a link in its place: what AWS says of the node counts then
+                write_outcome(run, facts["job"], facts["attempt"], (log.outcome if log else None) or seen)
         return True
 
     def _follow(

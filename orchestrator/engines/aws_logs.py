@@ -15,7 +15,7 @@ from typing import Any
 from botocore.exceptions import BotoCoreError, ClientError
 from botocore.parsers import ResponseParserError
 
-from shared_store.files import json_object
+from shared_store.files import DamagedFile, json_object
 from shared_store.log_files import LIMIT, LogWriter
 from shared_store.logs import OUTCOME_LINE, format_line, parse_line
 from shared_store.outcomes import Outcome, parse_outcome
@@ -187,6 +187,6 @@ class GangLogs:
                 if before == node.token:  # AWS's sign for: that is all for now
                     break
                 time.sleep(_PACE)
-        except (ClientError, BotoCoreError, ResponseParserError, OSError):
-            pass  # not there yet, throttled, away, or the disk is full: the next round
+        except (ClientError, BotoCoreError, ResponseParserError, OSError, DamagedFile):
+            pass  # not there yet, throttled, away, the disk is full, or a link is in the log's place: the next round
         node.settle(self.quiet)

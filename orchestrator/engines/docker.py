@@ -7,6 +7,7 @@ Containers and networks carry the gang's name as a label: a restarted controller
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -48,6 +49,7 @@ from orchestrator.engines.gpus import visible_gpus
 from orchestrator.engines.mounts import mounts_of
 from shared_store import __version__
 from shared_store.contract import BUS_VARIABLES, sealed_in_image
+from shared_store.files import DamagedFile
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT
 from shared_store.outcomes import Outcome, read_outcome, write_outcome
@@ -310,7 +312,7 @@ class DockerEngine:
         copy = self._copies.get(f"{facts['gang']}/{index}")
         if copy is not None:
             copy.wait(10.0)
-            if copy.trouble is not None and not isinstance(copy.trouble, APIError):  # that one will stay
+            if copy.trouble is not None and not isinstance(copy.trouble, APIError | DamagedFile):  # these will stay
                 raise copy.trouble
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None or not run.path.exists():
@@ -318,9 +320,9 @@ class DockerEngine:
         code = int(state["ExitCode"])
         reason = detail or ("done" if code == 0 else f"container exited with code {code}")
         ended = time.time()
-        write_outcome(
-            run, facts["job"], facts["attempt"], Outcome(index, facts["epoch"], code, None, reason, None, ended, ended)
-        )
+        outcome = Outcome(index, facts["epoch"], code, None, reason, None, ended, ended)
+        with contextlib.suppress(DamagedFile):  # a link in its place: what Docker says of the container counts then
+            write_outcome(run, facts["job"], facts["attempt"], outcome)
 
     def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""

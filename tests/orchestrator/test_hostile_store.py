@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,17 @@ import httpx
 import pytest
 from sqlalchemy import select
 
+from orchestrator.api.log_events import log_file
 from orchestrator.client import Client
 from orchestrator.database import Database, DatabaseError
 from orchestrator.server import Server
 from orchestrator.tables import Job, JobQueue
-from shared_store.epoch import read_epoch
+from shared_store.epoch import close_claim, raise_epoch, read_epoch
 from shared_store.files import DamagedFile, write_json
 from shared_store.layout import Run
 from shared_store.log_files import LogWriter
+from shared_store.logs import LogFollower, format_line
+from shared_store.outcomes import Outcome, read_outcome, write_outcome
 from tests.conftest import run_muster, submit_gang, wait_for
 
 SPEC = {"name": "a", "train": {"task": "Cartpole", "worlds": 4, "iterations": 2}}
@@ -231,3 +235,54 @@ def test_a_node_s_log_is_not_written_through_a_link(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         LogWriter(tmp_path / "node-0.log")
     assert target.read_text() == "kept"
+
+
+def test_an_attempt_is_closed_without_touching_what_a_job_put_in_place_of_its_claim(tmp_path: Path) -> None:
+    run, victim = Run(tmp_path / "run"), tmp_path / "victim"
+    run.path.mkdir()
+    victim.write_text("kept")
+    (run.path / "EPOCH.1").symlink_to(victim)
+    os.mkfifo(run.path / "EPOCH.2")
+    (run.path / "EPOCH.3").mkdir()
+    for epoch in (1, 2, 3):
+        with pytest.raises(DamagedFile, match=f"EPOCH.{epoch}: not a regular file"):
+            close_claim(run, epoch)
+    assert victim.read_text() == "kept"
+
+
+def test_a_run_that_is_a_link_is_damaged_and_nothing_is_read_or_written_through_it(
+    inside: Server, http: httpx.Client, runs: Path, tmp_path: Path
+) -> None:
+    write_json(tmp_path / "elsewhere" / "run.json", {"run": "e-linked", "spec": SPEC})
+    (runs / "e-linked").symlink_to(tmp_path / "elsewhere")
+    for path in ("", "/checkpoints", "/metrics"):
+        assert "e-linked: a link" in refused(http.get(f"/api/runs/e-linked{path}"))
+    assert {each["run"]: each.get("problem", "") for each in http.get("/api/runs").json()}["e-linked"].count("a link")
+    run = inside.store.run("e-linked")
+    for work in (lambda: read_epoch(run), lambda: raise_epoch(run, 1), lambda: close_claim(run, 1)):
+        with pytest.raises(DamagedFile, match="e-linked: a link"):
+            work()
+    assert os.listdir(tmp_path / "elsewhere") == ["run.json"]
+    (runs / "e-linked").unlink()
+
+
+@pytest.mark.parametrize("place", ["logs", "logs/job", "logs/job/1", "outcomes", "outcomes/job", "outcomes/job/1"])
+def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path: Path, place: str) -> None:
+    run, other = Run(tmp_path / "run"), tmp_path / "other"
+    outcome = Outcome(0, 1, 0, None, "done", None, 1.0, 2.0)
+    for each in (other, other / "1", other / "job" / "1"):
+        each.mkdir(parents=True, exist_ok=True)
+        (each / "node-0.log").write_text(format_line(1.0, 0, "o", "not yours"))
+        write_json(each / "node-0.json", asdict(outcome))
+    before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
+    (run.path / place).parent.mkdir(parents=True)
+    (run.path / place).symlink_to(other)
+    assert not list(LogFollower(run, "job").drain()) and not log_file(run.log("job", 1, 0), "s").look().segments
+    assert read_outcome(run, "job", 1, 0) is None
+    kind = place.partition("/")[0]
+    with pytest.raises(DamagedFile, match=f"{place}: a link"):
+        if kind == "logs":
+            LogWriter(run.log("job", 1, 0))
+        else:
+            write_outcome(run, "job", 1, outcome)
+    assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
