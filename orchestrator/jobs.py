@@ -141,4 +141,6 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
 
 def main_container(job_nodes: Sequence[dict[str, Any]], main: int) -> dict[str, Any]:
     """The main node's record of an attempt; empty before it started."""
+    if main < len(job_nodes) and job_nodes[main]["index"] == main:  # nearly always: the records are in this order
+        return job_nodes[main]
     return next((node for node in job_nodes if node["index"] == main), {})

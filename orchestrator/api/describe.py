@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.api.arns import ecs_arn, job_arn, queue_arn
+from orchestrator.api.damaged import DAMAGED
 from orchestrator.api.ecs import to_ecs
 from orchestrator.definition import target_nodes
 from orchestrator.jobs import Status, main_container
@@ -157,6 +158,14 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
         summary["shareIdentifier"] = job.share
     if job.stop_reason is not None:  # AWS shows only the one that is true
         summary["isCancelled" if job.cancelled else "isTerminated"] = True
+    return {key: value for key, value in summary.items() if value is not None}
+
+
+def describe_damaged(job: Job, reason: str | None) -> dict[str, Any]:
+    """JobSummary of a job whose row is damaged: what can be read, and in its reason that the rest can't be."""
+    summary = _common(job, reason)
+    said = summary["statusReason"] or ""
+    summary["statusReason"] = said if DAMAGED in said else f"{said}; {DAMAGED}" if said else DAMAGED
     return {key: value for key, value in summary.items() if value is not None}
 
 

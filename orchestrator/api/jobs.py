@@ -9,9 +9,10 @@ from sqlalchemy import ColumnElement, and_, func, or_, select
 from sqlalchemy.orm import selectinload
 
 from orchestrator.api import permissions
-from orchestrator.api.arns import definition_arn, split_reference
+from orchestrator.api.arns import definition_arn, queue_arn, split_reference
 from orchestrator.api.context import Context
-from orchestrator.api.describe import array_properties, describe_job, summarize
+from orchestrator.api.damaged import DamagedRow, reading
+from orchestrator.api.describe import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.errors import ClientError
 from orchestrator.api.paging import decode, encode, page, page_size
 from orchestrator.api.permissions import JobsOf, Operation
@@ -33,9 +34,14 @@ def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         job = context.session.get(Job, job_id)
         if job is None or not permissions.is_visible(job):
             continue
-        if node is not None and not (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"]):
-            continue
-        detail = describe_job(job, context.definition_of(job), node, context.reason(job))
+        reason = context.reason(job)
+        try:
+            with reading(job):
+                if node is not None and not (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"]):
+                    continue
+                detail = describe_job(job, context.definition_of(job), node, reason)
+        except DamagedRow:
+            detail = {**describe_damaged(job, reason), "jobQueue": queue_arn(job.queue)}
         if (array := array_properties(job, _count_children(context, job))) is not None:
             detail["arrayProperties"] = array
         found.append(detail)
@@ -73,7 +79,15 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         most = 100 if request.get("filters") else 1000
         keys = (Job.created_at, Job.id)
         rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))
-    return {"jobSummaryList": [summarize(job, context.reason(job)) for job in rows], **token}
+    return {"jobSummaryList": [_summary(job, context.reason(job)) for job in rows], **token}
+
+
+def _summary(job: Job, reason: str | None) -> dict[str, Any]:
+    try:
+        with reading(job):
+            return summarize(job, reason)
+    except DamagedRow:
+        return describe_damaged(job, reason)
 
 
 def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -81,16 +95,17 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     if job is None or job.kind != "multinode":
         return {"jobSummaryList": []}
     permissions.check(Operation.LIST_JOBS, job)
-    summaries = [summarize(job, context.reason(job), node) for node in range(int(job.node_properties["numNodes"]))]
-    wanted = request.get("jobStatus", Status.RUNNING)
-    summaries = [summary for summary in summaries if summary["status"] == wanted]
+    wanted, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
+    with reading(job):
+        nodes = [node for node in range(int(job.node_properties["numNodes"])) if node_status(job, node) == wanted]
     token = request.get("nextToken")
     start = decode(token, [int])[0] if token else 0
     if start < 0:
         raise ClientError(f"nextToken {str(token)[:100]!r} is not one that was given out")
     end = start + page_size(dict(request), 1000)
-    more = {"nextToken": encode([end])} if len(summaries) > end else {}
-    return {"jobSummaryList": summaries[start:end], **more}
+    more = {"nextToken": encode([end])} if len(nodes) > end else {}
+    with reading(job):
+        return {"jobSummaryList": [summarize(job, reason, node) for node in nodes[start:end]], **more}
 
 
 def _conditions(request: Mapping[str, Any]) -> Sequence[Any]:

@@ -21,6 +21,7 @@ from orchestrator.admission import fit_in_queue, node_records
 from orchestrator.api import permissions, rules, runs
 from orchestrator.api.batch import validate
 from orchestrator.api.context import permitted_run
+from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.bus import BusError
@@ -198,33 +199,34 @@ def job_detail(request: Request, reference: str) -> Any:
     with controller.database.session() as session:
         job = _job(session, reference, Operation.READ_JOB)
         run = controller.store.run(job.run)
-        attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
         owner = owner_of(session, run)
         is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
         described = runs.results_of(controller, session, run) if is_visible else None
-        needs = gang_needs(job.node_properties)
-        detail = {
-            "id": job.id,
-            "name": job.name,
-            "owner": job.owner,
-            "run": job.run,
-            "kind": next(
-                (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
-            ),
-            "status": job.status,
-            "statusReason": controller.reason(job) or job.status_reason,
-            "queue": job.queue,
-            "share": job.share,
-            "createdAt": job.created_at,
-            "startedAt": job.started_at,
-            "stoppedAt": job.stopped_at,
-            "nodes": len(needs.nodes),
-            "attempts": attempts,
-            "attemptsAllowed": job.attempts_allowed,
-            "spec": needs.spec,
-            "results": described,
-            "progress": runs.last_metrics(run) if is_visible else None,
-        }
+        with reading(job):
+            attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
+            needs = gang_needs(job.node_properties)
+            detail = {
+                "id": job.id,
+                "name": job.name,
+                "owner": job.owner,
+                "run": job.run,
+                "kind": next(
+                    (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
+                ),
+                "status": job.status,
+                "statusReason": controller.reason(job) or job.status_reason,
+                "queue": job.queue,
+                "share": job.share,
+                "createdAt": job.created_at,
+                "startedAt": job.started_at,
+                "stoppedAt": job.stopped_at,
+                "nodes": len(needs.nodes),
+                "attempts": attempts,
+                "attemptsAllowed": job.attempts_allowed,
+                "spec": needs.spec,
+                "results": described,
+                "progress": runs.last_metrics(run) if is_visible else None,
+            }
     return permissions.shown(detail)
 
 
@@ -245,7 +247,8 @@ def job_logs(
     controller = _controller(request)
     with controller.database.session() as session:
         job = _job(session, reference, Operation.READ_JOB_LOGS)
-        count = int(job.node_properties["numNodes"])
+        with reading(job):
+            count = int(job.node_properties["numNodes"])
         if node is not None and not 0 <= node < count:
             raise ClientError(
                 f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
@@ -292,12 +295,10 @@ def _running(controller: Controller, reference: str, operation: Operation) -> tu
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
             raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", runs.CONFLICT)
-        main = int(job.node_properties["mainNode"])
-        return (
-            job.id,
-            attempt.number,
-            sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main),
-        )
+        with reading(job):
+            main = int(job.node_properties["mainNode"])
+            nodes = sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main)
+        return job.id, attempt.number, nodes
 
 
 def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:

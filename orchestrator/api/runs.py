@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from orchestrator.admission import fit_in_queue
 from orchestrator.api import batch, definitions, limits, submission
 from orchestrator.api.context import Context, visible_runs
+from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import visible_queues
 from orchestrator.controller import Controller
@@ -67,7 +68,7 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
         "created": description.get("created"),
         "owner": owner.owner if owner else None,
         "queue": owner.queue if owner else None,
-        "spec": spec_of(session, run) if jobs else description.get("spec"),
+        "spec": _shown_spec(session, run, description.get("spec")) if jobs else description.get("spec"),
         "jobs": [{"id": job.id, "name": job.name, "status": job.status} for job in jobs],
         "checkpoints": len(checkpoints),
         "iteration": checkpoints[-1].iteration if checkpoints else 0,
@@ -99,11 +100,20 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
 
 
 def spec_of(session: Session, run: Run) -> dict[str, Any] | None:
-    """The spec with which a run goes on: that of its newest job, else the one that it was created with."""
+    """The spec with which a run goes on: that of its newest job, else the one that it was created with. Raises DamagedRow."""
     newest = _newest_job(session, run)
     if newest:
-        return gang_needs(newest.node_properties).spec
+        with reading(newest):
+            return gang_needs(newest.node_properties).spec
     return (run.description() or {}).get("spec")
+
+
+def _shown_spec(session: Session, run: Run, created: Any) -> Any:
+    """:func:`spec_of`; that with which the run was ``created`` where the row of its newest job is damaged."""
+    try:
+        return spec_of(session, run)
+    except DamagedRow:
+        return created
 
 
 def resume(

@@ -100,6 +100,52 @@ def test_a_damaged_row_is_named_once_and_stops_no_other_job_also_after_a_restart
     assert sorted(failed) == sorted([f"job {running}", f"job {waiting}"])
 
 
+@pytest.fixture(scope="module")
+def ended(inside: Server) -> tuple[str, str]:
+    """Two jobs of the queue ``default`` that are over."""
+    with Client(inside.url) as client:
+        jobs = submit_gang(client, "print('here')", name="broken"), submit_gang(client, "print('here')", name="whole")
+        for each in jobs:
+            await_status(client, each, "SUCCEEDED")
+    return jobs
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("node_properties", "{broken"), ("node_properties", "null"), ("node_properties", "[]"), ("nodes", "[1]")],
+)
+def test_a_damaged_row_answers_for_itself_alone(
+    inside: Server, http: httpx.Client, ended: tuple[str, str], column: str, value: str
+) -> None:
+    broken, whole = ended
+    home = Path(str(inside.controller.database.volume))
+    table, key = ("jobs", "id") if column == "node_properties" else ("attempts", "job_id")
+    [[kept]] = change(home, f"SELECT {column} FROM {table} WHERE {key} = ?", broken)
+    asked = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
+    run = http.get(f"/api/jobs/{broken}").json()["run"]
+    before = http.post("/v1/describejobs", json={"jobs": [whole]}).json()["jobs"]
+    change(home, f"UPDATE {table} SET {column} = ? WHERE {key} = ?", value, broken)
+    try:
+        answer = http.post("/v1/listjobs", json=asked)
+        assert answer.status_code == 200, answer.text
+        listed = {each["jobId"]: each for each in answer.json()["jobSummaryList"]}
+        described = http.post("/v1/describejobs", json={"jobs": [broken, f"{broken}#0", whole]}).json()["jobs"]
+        assert described[2:] == before and "container" in listed[whole]
+        for each in (listed[broken], *described[:2]):
+            assert (each["jobName"], each["status"]) == ("broken", "SUCCEEDED")
+            assert each["statusReason"].endswith("; the job's row in the database is damaged")
+        pages = [http.get(f"/api/jobs/{broken}")]
+        pages.append(http.post("/v1/listjobs", json={"multiNodeJobId": broken, "jobStatus": "SUCCEEDED"}))
+        if column == "node_properties":
+            pages.append(http.get(f"/api/jobs/{broken}/logs"))
+        for page in pages:
+            said = f"job broken ({broken[:8]}): the job's row in the database is damaged; submit the job again"
+            assert (page.status_code, page.json()["message"]) == (409, said)
+        assert all(http.get(f"/api/{path}").status_code == 200 for path in (f"jobs/{whole}", "runs", f"runs/{run}"))
+    finally:
+        change(home, f"UPDATE {table} SET {column} = ? WHERE {key} = ?", kept, broken)
+
+
 def status_reason(home: Path, job_id: str) -> str:
     [[reason]] = change(home, "SELECT status_reason FROM jobs WHERE id = ?", job_id)
     return str(reason)

@@ -1,0 +1,41 @@
+"""Jobs whose row in the database is damaged: each answers for itself alone, and takes no answer about others with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from orchestrator.api.errors import ClientError
+from orchestrator.definition import gang_needs
+from orchestrator.tables import Job
+
+DAMAGED = "the job's row in the database is damaged"
+
+
+class DamagedRow(ClientError):
+    """A job's row can't be read (409); the message names the job."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"job {job.name} ({job.id[:8]}): {DAMAGED}; submit the job again", 409)
+
+
+@contextmanager
+def reading(job: Job) -> Iterator[None]:
+    """A block that reads the JSON columns of a job and its attempts: whatever fails in it because of them is a DamagedRow."""
+    try:
+        yield
+    except Exception as error:
+        if _is_intact(job):
+            raise  # another cause
+        raise DamagedRow(job) from error
+
+
+def _is_intact(job: Job) -> bool:
+    """Whether the JSON columns have the shapes in which they are written."""
+    try:
+        _ = gang_needs(job.node_properties).spec
+        _ = [(node["index"] + 0, node["host"]) for attempt in job.attempts for node in attempt.nodes]
+        _ = [entry["action"] for entry in job.evaluate_on_exit or []]
+        return all(isinstance(each, dict) for each in (job.request, job.parameters, job.tags))
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError):
+        return False
