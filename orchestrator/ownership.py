@@ -6,20 +6,25 @@ was lost, still has its owner.
 
 from __future__ import annotations
 
-import os
-
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from orchestrator.jobs import Status
 from orchestrator.tables import Job, RunRecord, now
 from shared_store.layout import Run
 
 
 def owner_of(session: Session, run: Run) -> RunRecord | None:
-    """Whose the run is: as recorded, else as ``run.json`` says, else as its first job says; None where there is no such run.
+    """Whose the run is: as recorded, else as ``run.json`` says, else as its first job says.
 
-    The record is in the session only where it was in the database. Its queue is empty for a run that says nothing about it.
+    A run that does not exist belongs to the unfinished job that will create it, whatever is recorded of an earlier run of that
+    name; None without such a job. The record is in the session only where it was in the database. Its queue is empty for a run
+    that says nothing about it.
     """
+    of_run = select(Job).where(Job.run == run.name).order_by(Job.created_at, Job.id).limit(1)
+    if run.is_missing():
+        writer = session.scalars(of_run.where(Job.status.not_in([Status.SUCCEEDED, Status.FAILED]))).first()
+        return _record(run, writer.queue, writer.owner) if writer is not None else None
     record = session.get(RunRecord, run.name)
     if record is not None:
         return record
@@ -30,7 +35,7 @@ def owner_of(session: Session, run: Run) -> RunRecord | None:
     queue, owner = (description or {}).get("queue"), (description or {}).get("owner")
     if isinstance(queue, str) and queue:
         return _record(run, queue, owner if isinstance(owner, str) else None)
-    first = session.scalars(select(Job).where(Job.run == run.name).order_by(Job.created_at, Job.id).limit(1)).first()
+    first = session.scalars(of_run).first()
     if first is not None:
         return _record(run, first.queue, first.owner)
     return None if description is None else _record(run, "", None)
@@ -40,14 +45,17 @@ def record_owner(session: Session, run: Run, job: Job) -> RunRecord:
     """The record of a run that ``job`` is about to create or continue, added to the session where there was none.
 
     A run that exists and says nothing about its queue belongs to that of ``job`` from now on: only a key with all queues gets
-    that far.
+    that far. The record of an earlier run of that name, which is gone from the store, is replaced and committed: ``run.json``
+    is written next, and a controller that is killed in between must not leave the new run to the old owner.
     """
-    record = session.get(RunRecord, run.name)
+    record, is_missing = session.get(RunRecord, run.name), run.is_missing()
     if record is None:
-        exists = os.path.lexists(run.path / "run.json")
-        found = owner_of(session, run) if exists else None  # else an earlier job named the run and never started
+        found = None if is_missing else owner_of(session, run)
         record = found if found and found.queue else _record(run, job.queue, job.owner)
         session.add(record)
+    elif is_missing and (record.queue, record.owner) != (job.queue, job.owner):
+        record.queue, record.owner, record.created_at = job.queue, job.owner, now()
+        session.commit()
     return record
 
 

@@ -83,6 +83,16 @@ class Run:
             raise DamagedFile(f"{path}: created is not a number")
         return found
 
+    def is_missing(self) -> bool:
+        """Whether the store can be read and has no such run; False where that is not certain, as while the volume is away."""
+        try:
+            os.lstat(self.path / "run.json")
+        except FileNotFoundError:
+            return os.path.lexists(self.path.parent.parent / "store.json")
+        except OSError:
+            return False
+        return False
+
     def create(self, description: dict[str, Any]) -> None:
         """Write ``run.json`` once; a run that exists keeps the one it has. Raises as :meth:`check_links`, OSError."""
         self.check_links()

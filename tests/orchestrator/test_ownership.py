@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,6 +53,33 @@ def test_a_run_belongs_to_the_job_that_creates_it_not_to_one_that_never_started(
     assert known(record_owner(session, run, later)) == ("lab", "key lab")
     run.create({"run": "r", "queue": "other"})
     assert known(owner_of(session, run)) == ("lab", "key lab")  # the database's record comes first
+
+
+def test_a_run_made_anew_under_an_old_name_belongs_to_its_new_creator(session: Session, run: Run) -> None:
+    first = submitted(session, "a", "robots", 1)
+    record_owner(session, run, first)
+    run.create({"run": "r", "queue": "robots"})
+    first.status = "SUCCEEDED"
+    session.commit()
+    shutil.rmtree(run.path)
+    assert owner_of(session, run) is None, "nobody is refused a run that does not exist"
+    second = submitted(session, "b", "lab", 2)
+    assert known(owner_of(session, run)) == ("lab", "key lab"), "before it has started, too"
+    record_owner(session, run, second)
+    run.create({"run": "r", "queue": "lab"})
+    session.rollback()  # as where the controller is killed before it records the attempt
+    assert known(owner_of(session, run)) == ("lab", "key lab")
+
+
+def test_a_run_keeps_its_owner_while_the_volume_of_the_store_is_away(session: Session, run: Run) -> None:
+    first = submitted(session, "a", "robots", 1)
+    record_owner(session, run, first)
+    run.create({"run": "r", "queue": "robots"})
+    first.status = "SUCCEEDED"
+    store = run.path.parent.parent
+    store.rename(store.with_name("away"))
+    later = submitted(session, "b", "lab", 2)
+    assert known(owner_of(session, run)) == known(record_owner(session, run, later)) == ("robots", "key robots")
 
 
 def test_a_run_that_exists_belongs_to_whom_it_names_whoever_continues_it(session: Session, run: Run) -> None:
