@@ -123,20 +123,21 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
         ends: By node index; None for a node that runs or has not started.
     """
     failures = [(index, end) for index, end in enumerate(ends) if end and end.exit_code not in (0, EX_TEMPFAIL)]
-    head = ends[main]
+    head, is_unseen = ends[main], None in ends
     if head is not None and head.exit_code == 0:
         return Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
     if head is not None and head.exit_code == EX_TEMPFAIL:
         return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
     if head is not None and (policy == "ignore" or len(failures) == 1):
-        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code)
+        certain = policy == "ignore" or not (head.asked and is_unseen)
+        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code, certain)
     if not failures or policy == "ignore":
         return None
     # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
     index, first = failures[first_cause([(end.asked, end.ended) for _, end in failures])]
     ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
     reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
-    return Verdict(ending, reason, first.exit_code, certain=head is not None or not first.asked)
+    return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen))
 
 
 def main_container(job_nodes: Sequence[dict[str, Any]], main: int) -> dict[str, Any]:

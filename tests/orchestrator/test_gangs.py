@@ -13,10 +13,13 @@ from typing import Any
 
 import pytest
 
+from orchestrator import gangs
 from orchestrator.client import Client
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.local import LocalEngine
+from orchestrator.jobs import Ending, NodeEnd, Verdict
 from orchestrator.server import Server
+from orchestrator.tables import Attempt, Job
 from tests.conftest import MAIN_LAST, MUSTER, Serving, parent, processes_of, submit_gang, wait_for
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
@@ -271,3 +274,23 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
         server.close()
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {said}"]
     assert processes_of(tmp_path) == []
+
+
+def test_a_main_node_that_was_told_to_end_waits_for_the_cause_for_a_limited_time(
+    inside: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    container = {"command": ["x"], "environment": [{"name": key, "value": value} for key, value in NATIVE.items()]}
+    ranges = [{"targetNodes": "0:", "container": container}]
+    properties = {"numNodes": 2, "mainNode": 0, "nodeRangeProperties": ranges}
+    job = Job(id="j", name="j", queue="default", definition="d", request={}, run="j", node_properties=properties)
+    attempt = Attempt(job_id="j", number=1, nodes=[{"host": "localhost"}] * 2)
+    ends = [NodeEnd(143, "rank 0 was killed by SIGTERM", 1.0, asked=True), None]
+    judged = inside.controller.gangs
+    try:
+        assert judged._verdict(job, attempt, ends, 0) is None, "the child may tell the cause"
+        monkeypatch.setattr(gangs, "_CAUSE_PATIENCE", -1.0)
+        assert judged._verdict(job, attempt, ends, 0) == Verdict(
+            Ending.FAILED, "main node: rank 0 was killed by SIGTERM", 143, certain=False
+        )
+    finally:
+        judged._uncertain.clear()

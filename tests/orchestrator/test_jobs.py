@@ -117,17 +117,22 @@ ASKED = [
     ((RUNS, (137, 2.0), (143, 1.0, True)), "node 1: exit 137", True),
     (((143, 1.0, True), (137, 2.0), (143, 0.5, True)), "node 1: exit 137", True),
     (((1, 3.0), (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
-    (((143, 1.0, True), RUNS, RUNS), "main node: exit 143", True),
+    (((143, 1.0, True), RUNS, RUNS), "main node: exit 143", False),
+    (((143, 2.0, True), (143, 1.0, True), RUNS), "node 1: exit 143", False),
     (((143, 2.0, True), (143, 1.0, True)), "node 1: exit 143", True),
+    (((143, 2.0, True), DONE), "main node: exit 143", True),
 ]
 
 
 @pytest.mark.parametrize(("codes", "reason", "certain"), ASKED)
 def test_a_node_that_was_told_to_end_is_not_the_cause(
-    codes: tuple[tuple[int, float, bool] | tuple[int, float] | None, ...], reason: str, certain: bool
+    codes: tuple[tuple[int, float, bool] | tuple[int, float] | int | None, ...], reason: str, certain: bool
 ) -> None:
     found = [
-        None if each is None else NodeEnd(each[0], f"exit {each[0]}", each[1], asked=len(each) > 2) for each in codes
+        NodeEnd(each[0], f"exit {each[0]}", each[1], asked=True) if isinstance(each, tuple) and len(each) > 2 else plain
+        for each, plain in zip(
+            codes, ends(*(each[:2] if isinstance(each, tuple) else each for each in codes)), strict=True
+        )
     ]
     verdict = judge("restart", 0, found)
     assert verdict
