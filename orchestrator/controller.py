@@ -100,6 +100,7 @@ class Controller:
                 bus.expect(job.id, attempt.number, len(attempt.nodes))  # before the router is there for their nodes
 
     def start(self) -> None:
+        self.disk.start()
         self._thread.start()
 
     def wake(self) -> None:
@@ -109,6 +110,7 @@ class Controller:
     def close(self) -> None:
         """Leave the loop; running gangs go on, and the next controller on this database finds them."""
         self._ending.set()
+        self.disk.close()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join()

@@ -8,11 +8,14 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-_AGE = 1.0
-"""Seconds for which an answer of the volumes is kept."""
+_INTERVAL = 0.5
+"""Seconds between two looks at a volume."""
+_PATIENCE = 5.0
+"""Seconds after which a volume that has not answered is said not to."""
 
 
 @dataclass(frozen=True)
@@ -44,35 +47,70 @@ class MinFree:
 DEFAULT = MinFree(size=1 << 30, share=0.05)
 
 
+@dataclass
+class _Volume:
+    """One volume, and what the last look at it said."""
+
+    name: str
+    path: Path
+    short: str | None = None
+    asked: tuple[float, float] | None = None
+    """While it is looked at: since when, by the monotonic clock [s] and in Unix time [s]."""
+
+
 class Disk:
-    """Watches volumes by what lies on them. Any thread may ask."""
+    """Watches volumes by what lies on them. Any thread may ask, and none ever waits for a volume."""
 
     def __init__(self, volumes: Mapping[str, Path], minimum: MinFree = DEFAULT) -> None:
-        """``volumes``: a directory on each volume, by what the volume is for, such as ``store``."""
-        self._volumes, self._minimum = volumes, minimum
-        self._lock = threading.Lock()
-        self._asked = -_AGE
-        self._short: dict[str, str] = {}
+        """Look once at each volume. ``volumes``: a directory on each, by what the volume is for, such as ``store``."""
+        self._volumes, self._minimum = [_Volume(*each) for each in volumes.items()], minimum
+        self._ended = threading.Event()
+        for volume in self._volumes:
+            volume.short = self._look(volume)
+
+    def start(self) -> None:
+        """Look at each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
+        for volume in self._volumes:
+            threading.Thread(target=self._watch, args=(volume,), name=f"volume {volume.name}", daemon=True).start()
+
+    def close(self) -> None:
+        """Look no more; a look that hangs is left behind."""
+        self._ended.set()
 
     def shortage(self, purpose: str | None = None) -> str | None:
-        """Which volume has less than the minimum, and what to do; None where all have enough, or the one for ``purpose`` has."""
-        with self._lock:
-            if time.monotonic() - self._asked >= _AGE:
-                self._short = {name: said for name, path in self._volumes.items() if (said := self._look(name, path))}
-                self._asked = time.monotonic()
-            if purpose is not None:
-                return self._short.get(purpose)
-            return next(iter(self._short.values()), None)
+        """Which volume does not answer or has less than the minimum, and what to do; None where there is no such volume.
 
-    def _look(self, name: str, path: Path) -> str | None:
-        try:
-            volume = os.statvfs(path)
-        except OSError:  # whoever needs it says so
+        ``purpose``: of the volume for this alone.
+        """
+        of = (volume for volume in self._volumes if purpose in (None, volume.name))
+        return next((said for volume in of if (said := self._silence(volume) or volume.short)), None)
+
+    @staticmethod
+    def _silence(volume: _Volume) -> str | None:
+        asked = volume.asked
+        if asked is None or time.monotonic() - asked[0] < _PATIENCE:
             return None
-        free, least = volume.f_bavail * volume.f_frsize, self._minimum.of(volume.f_blocks * volume.f_frsize)
+        since = datetime.fromtimestamp(asked[1], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return (
+            f"the volume of the {volume.name} ({volume.path}) has not answered since {since}: no new gang starts until it does; "
+            "see whether its server can be reached"
+        )
+
+    def _watch(self, volume: _Volume) -> None:
+        while not self._ended.wait(_INTERVAL):
+            volume.asked = (time.monotonic(), time.time())
+            volume.short = self._look(volume)
+            volume.asked = None
+
+    def _look(self, volume: _Volume) -> str | None:
+        try:
+            found = os.statvfs(volume.path)
+        except OSError:  # an operation that needs it says so
+            return None
+        free, least = found.f_bavail * found.f_frsize, self._minimum.of(found.f_blocks * found.f_frsize)
         if free >= least:
             return None
         return (
-            f"the volume of the {name} ({path}) has {free / 1e6:,.0f} MB free, less than {least / 1e6:,.0f} MB (--min-free): "
-            "no new gang starts until there is room"
+            f"the volume of the {volume.name} ({volume.path}) has {free / 1e6:,.0f} MB free, less than {least / 1e6:,.0f} MB "
+            "(--min-free): no new gang starts until there is room"
         )

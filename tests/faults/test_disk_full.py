@@ -105,7 +105,7 @@ def test_the_database_may_lie_on_another_volume_than_the_home(tmp_path: Path, vo
     try:
         assert (volume / "jobs.db").exists() and not (tmp_path / "home" / "muster.db").exists()
         fill(volume)
-        time.sleep(1.1)  # for which an answer of the volume is kept
+        time.sleep(1.5)  # a look at the volume
         with pytest.raises(ApiError, match=r"the volume of the database \(.*volume\) has 0 MB free"):
             server.gang("pass")
     finally:

@@ -19,6 +19,7 @@ from typing import Any
 import httpx
 import pytest
 
+from orchestrator import disk
 from orchestrator.client import ApiError, Client
 from orchestrator.database import Database, DatabaseError
 from orchestrator.engines.local import LocalEngine
@@ -307,3 +308,29 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     finally:
         stop.set()
         thread.join()
+
+
+def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobody(
+    inside: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look, answers = os.statvfs, threading.Event()
+
+    def hanging(path: Any) -> os.statvfs_result:
+        if path == inside.store.path:
+            answers.wait()
+        return look(path)
+
+    monkeypatch.setattr(disk, "_PATIENCE", 0.2)
+    monkeypatch.setattr(os, "statvfs", hanging)
+    try:
+        with Client(inside.url) as client:
+            wait_for(inside.controller.disk.shortage, 30, "that the volume is missed")
+            waiting = submit_gang(client, "print('at last')")
+            [listed] = client.batch("ListJobs", jobQueue="default", jobStatus="RUNNABLE")["jobSummaryList"]
+            assert listed["jobId"] == waiting
+            reason = detail(client, waiting)["statusReason"]
+            assert f"the volume of the store ({inside.store.path}) has not answered since 20" in reason, reason
+            answers.set()
+            await_status(client, waiting, "SUCCEEDED")
+    finally:
+        answers.set()
