@@ -7,6 +7,7 @@ iteration twice, none from a past that was given up.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import threading
@@ -14,6 +15,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice, takewhile
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -24,6 +26,10 @@ from shared_store.layout import Run
 _NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
 _BLOCK = 16 << 10
 """Bytes between two marks."""
+_LONGEST = 64 << 10
+"""Bytes of a line; a longer one is no record, and is passed over."""
+_LOOK = 64 << 20
+"""Bytes of new lines that one look at a history takes up; the next look goes on behind them."""
 _IDENTITY = 256
 """Bytes of a file's beginning that tell it from another one."""
 
@@ -59,7 +65,11 @@ def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:
 
     For an iteration seen twice the later epoch counts. A last line that a crash cut short is passed over.
     """
-    return MetricsHistory(run).after(after)
+    history = MetricsHistory(run)
+    found = history.after(after)
+    while history.behind:
+        found = history.after(after)
+    return found
 
 
 @lru_cache(maxsize=256)
@@ -87,21 +97,26 @@ class _File:
     path: Path
     end: int = 0
     """Bytes of whole lines that are known."""
+    inside: bool = False
+    """Whether ``end`` is inside a line that is too long."""
     identity: bytes = b""
     sections: list[_Section] = field(default_factory=list)
 
-    def refresh(self) -> None:
-        """Take up what was added."""
+    def refresh(self, most: int) -> int:
+        """Take up what was added, up to about ``most`` bytes of it; returns how many."""
         with open_regular(self.path) as file:
             head = file.read(_IDENTITY)
             if os.fstat(file.fileno()).st_size < self.end or not head.startswith(self.identity):
-                self.end, self.sections = 0, []
-            file.seek(self.end)
-            for line in file:
-                if not line.endswith(b"\n"):
+                self.end, self.inside, self.sections = 0, False, []
+            file.seek(before := self.end)
+            while self.end - before < most and (line := file.readline(_LONGEST)):
+                whole = line.endswith(b"\n")
+                if not whole and len(line) < _LONGEST:
                     break
-                self._note(_record(line), len(line))
+                self._note({} if self.inside or not whole else _record(line), len(line))
+                self.inside = not whole
             self.identity = head[: self.end]
+            return self.end - before
 
     def _note(self, record: Mapping[str, Any], size: int) -> None:
         start, self.end = self.end, self.end + size
@@ -109,9 +124,10 @@ class _File:
         if isinstance(before := record.get("resumed_from"), int):
             self.sections.append(_Section(before, self.end))
         elif isinstance(iteration, int):
-            if not self.sections or (self.sections[-1].marks and iteration <= self.sections[-1].last):
-                self.sections.append(_Section(None, self.end))
-            section = self.sections[-1]
+            section = self.sections[-1] if self.sections else None
+            if section is None or start - section.end > _LONGEST or (section.marks and iteration <= section.last):
+                section = _Section(None, self.end)
+                self.sections.append(section)
             if not section.marks or start - section.marks[-1][1] >= _BLOCK:
                 section.marks.append((iteration, start))
             section.last, section.end = iteration, self.end
@@ -120,8 +136,9 @@ class _File:
         """The section's records from the last mark before ``after`` on, by iteration."""
         place = max(0, bisect_right(section.marks, after, key=lambda mark: mark[0]) - 1)
         with open_regular(self.path) as file:
-            file.seek(section.marks[place][1])
-            for line in file.read(section.end - section.marks[place][1]).split(b"\n"):
+            position = file.seek(section.marks[place][1])
+            while position < section.end and (line := file.readline(_LONGEST)):
+                position += len(line)
                 record = _record(line)
                 if isinstance(iteration := record.get("iteration"), int):
                     yield iteration, record
@@ -131,21 +148,27 @@ class MetricsHistory:
     """A run's history, read from where it was read before. Safe to use from many threads."""
 
     def __init__(self, run: Run) -> None:
+        self.behind = False
+        """Whether there is more than the last look took up."""
         self._run = run
         self._lock = threading.Lock()
         self._known: dict[Path, _File] = {}
 
-    def after(self, iteration: int = 0) -> list[dict[str, Any]]:
-        """As :func:`read_metrics`; reads no more than 16 KiB and what is asked for. Raises OSError."""
+    def after(self, iteration: int = 0, most: int | None = None) -> list[dict[str, Any]]:
+        """As :func:`read_metrics`, the first ``most`` of them; reads 16 KiB and what is asked for. Raises OSError.
+
+        What was added since the last look is taken up in parts: :attr:`behind`.
+        """
+        found: dict[int, dict[str, Any]] = {}
         with self._lock:
-            sections = self._refresh()
-            found: dict[int, dict[str, Any]] = {}
-            for place, (file, section) in enumerate(sections):
-                later = [each.resumed_from for _, each in sections[place + 1 :] if each.resumed_from is not None]
-                limit = min(later, default=section.last)
+            limit: float = math.inf
+            for file, section in reversed(self._refresh()):
                 if section.marks and min(section.last, limit) > iteration:
-                    found |= {i: record for i, record in file.read(section, iteration) if iteration < i <= limit}
-        return [found[i] for i in sorted(found)]
+                    wanted = (each for each in file.read(section, iteration) if each[0] > iteration)
+                    counting = takewhile(lambda each, limit=limit: each[0] <= limit, wanted)  # type: ignore[misc]
+                    found = dict(islice(counting, most)) | found  # the later section counts
+                limit = limit if section.resumed_from is None else min(limit, section.resumed_from)
+        return [found[i] for i in sorted(found)[:most]]
 
     def last(self) -> dict[str, Any] | None:
         """The newest record; None where there is none. Raises OSError."""
@@ -160,8 +183,10 @@ class MetricsHistory:
     def _refresh(self) -> list[tuple[_File, _Section]]:
         paths = [path for _, path in sorted(_files(self._run))]
         self._known = {path: self._known.get(path) or _File(path) for path in paths}
+        room = _LOOK
         for file in self._known.values():
-            file.refresh()
+            room -= file.refresh(room)
+        self.behind = room <= 0
         return [(file, section) for file in self._known.values() for section in file.sections]
 
 

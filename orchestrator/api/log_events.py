@@ -28,6 +28,8 @@ _BLOCK = 32 << 10
 """Bytes between two marks."""
 _READ = 1 << 20
 """Bytes that are read at once: more than the longest line; supervisors cut at 128 KiB."""
+_BARREN = 64 << 20
+"""Bytes without an event that one look reads: a program can make its log a hole of any size."""
 _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
 
@@ -71,16 +73,20 @@ class LogFile:
         self.path, self.stream = path, stream
         self.source = int.from_bytes(hashlib.sha256(stream.encode()).digest()) % 10**24
         self._lock = threading.Lock()
-        self._begun = 0
+        self._begun, self._barren = 0, 0
         self._forget()
 
     def look(self) -> View:
-        """What is in the log now: whole lines only. A log that is not there yet is empty. Raises OSError."""
+        """What is in the log now: whole lines only. A log that is not there yet is empty. Raises OSError.
+
+        Of what holds no events 64 MiB are passed over; the next look goes on there.
+        """
         with self._lock:
+            self._barren = 0
             segments = segments_of(self.path)
             if not segments and self._end:
                 self._forget()
-            while segments:
+            while segments and self._barren < _BARREN:
                 try:
                     if not self._extend(segments):
                         break
@@ -118,7 +124,9 @@ class LogFile:
             stop = (chunk.data.find(b"\n", start + _BLOCK - 1, whole) + 1) or whole
             if self._end - self._marks[-1][0] >= _BLOCK:  # looks at a growing file must not leave a mark each
                 self._mark(self._end)
-            self._top = max(self._top, _milliseconds(max(_STAMPS.findall(chunk.data, start, stop), default=b"")))
+            newest = max(_STAMPS.findall(chunk.data, start, stop), default=b"")
+            self._barren += 0 if newest else stop - start
+            self._top = max(self._top, _milliseconds(newest))
             self._end, start = chunk.start + stop, stop
         return bool(whole)
 

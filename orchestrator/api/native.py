@@ -343,12 +343,18 @@ def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[d
 @router.get("/runs/{name}/metrics")
 def run_metrics(
     request: Request,
+    response: Response,
     name: str,
     after: int = 0,
     most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
 ) -> list[dict[str, Any]]:
-    """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``."""
-    return history_of(permitted_run(_controller(request), name, Operation.READ_METRICS)).after(after)[:most]
+    """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``; the header ``Link`` (``rel="next"``) has the address of the next page."""
+    history = history_of(permitted_run(_controller(request), name, Operation.READ_METRICS))
+    found = history.after(after, most)
+    if len(found) == most or history.behind:
+        last = found[-1]["iteration"] if found else after
+        response.headers["Link"] = f'</api/runs/{name}/metrics?max={most}&after={last}>; rel="next"'
+    return found
 
 
 @router.post("/runs/{name}/resume")

@@ -262,3 +262,18 @@ def test_files_of_other_names_are_no_part_of_a_log(tmp_path: Path) -> None:
         (tmp_path / name).write_text("x\n")
     assert {name: [s.start for s in found] for name, found in log_segments(tmp_path).items()} == {"node-0.log": [0, 5]}
     assert read_log(segments_of(tmp_path / "node-0.log"), 2, 100).left_out == (2, 3)
+
+
+def test_one_look_passes_over_a_bounded_part_of_a_hole_and_the_next_one_goes_on(run: Run) -> None:
+    path = run.log("job", 1, 0)
+    path.parent.mkdir(parents=True)
+    first, last = lines_of(0, 1), lines_of(1, 1)
+    path.write_bytes(first)
+    with open(path, "ab") as file:
+        file.truncate(len(first) + (100 << 20))
+        file.write(b"\n" + last)
+    log = LogFile(path, "stream")
+    assert log.look().end < 70 << 20
+    view = log.look()
+    assert view.end == path.stat().st_size
+    assert numbers([event.text for event in view.backward()]) == [1, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from shared_store import metrics
 from shared_store.layout import Run
-from shared_store.metrics import MetricsHistory, MetricsWriter, read_metrics
+from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics
 
 
 def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
@@ -156,3 +157,45 @@ def test_a_history_whose_file_was_replaced_is_read_anew(tmp_path: Path) -> None:
     (run.metrics / "metrics-e1.jsonl").unlink()
     attempt(run, 1, 2, 9)
     assert [record["iteration"] for record in history.after()] == list(range(3, 10))
+
+
+def test_a_line_of_any_length_is_passed_over_in_little_memory_and_never_read_again(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 2)
+    path = run.metrics / "metrics-e1.jsonl"
+    with open(path, "ab") as file:
+        file.truncate(path.stat().st_size + (200 << 20))  # a line of zeros without an end
+    history = MetricsHistory(run)
+    tracemalloc.start()
+    try:
+        looks = 0
+        while history.after() and history.behind:
+            looks += 1
+        assert looks == 3, "64 MiB each"
+        with open(path, "ab") as file:
+            file.write(b'\n{"iteration": 3, "epoch": 1}\n')
+        assert [record["iteration"] for record in history.after()] == [1, 2, 3]
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
+    assert history_of(run).after(0, 2) == read_metrics(run)[:2]
+    assert [record["iteration"] for record in read_metrics(run)] == [1, 2, 3]
+
+
+def test_a_page_of_a_long_history_is_read_without_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, parsed = Run(tmp_path), []
+    genuine = metrics._record
+    attempt(run, 1, 0, 5000)
+    attempt(run, 2, 2500, 6000)
+    history = MetricsHistory(run)
+    everything = history.after()
+
+    def counting(line: bytes) -> dict[str, Any]:
+        parsed.append(line)
+        return genuine(line)
+
+    monkeypatch.setattr(metrics, "_record", counting)
+    for after in (0, 2400, 2499, 2500, 5990):
+        page = [record for record in everything if record["iteration"] > after][:200]
+        assert history.after(after, 200) == page
+    assert len(parsed) < 10_000, "of 42,500 that five looks at everything would parse"
