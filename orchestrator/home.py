@@ -16,6 +16,11 @@ _OURS = re.compile(
 )
 """Names in the home directory: database, keys, bus, the engines' directories, and what a volume has of itself."""
 
+_DIRECTORIES = ("store", "supervisors", "kernels", "ray")
+"""Of these, the directories: of runs, and of what engines and jobs keep."""
+_MADE_LATER = ("supervisors", "kernels")
+"""Of these, those that are made by jobs or for them, who would make them open."""
+
 log = logging.getLogger("muster.home")
 
 
@@ -41,18 +46,37 @@ def local_url() -> str | None:
 def make_private(home: Path) -> None:
     """Create the home directory for its user alone (0700); one that others can enter is closed to them, which is logged.
 
-    One that holds anything but what Muster puts there is left as it is, which is logged too: others may need it. Raises OSError.
+    One that holds anything but what Muster puts there stays open, since others may need that: then Muster's own directories in
+    it are closed, and it is logged what is open. Raises OSError.
     """
     home.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = home.stat()
     if not found.st_mode & 0o077:
         return
-    if found.st_uid == os.geteuid() and all(_OURS.fullmatch(entry.name) for entry in home.iterdir()):
-        with suppress(OSError):  # of a volume without permissions
-            home.chmod(found.st_mode & 0o700)
-            log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
-            return
-    log.warning("%s is open to other users; run chmod 700 on it, or set MUSTER_HOME to another directory", home)
+    others = sorted(entry.name for entry in home.iterdir() if not _OURS.fullmatch(entry.name))
+    if not others and _closed(home):
+        log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
+        return
+    for name in _MADE_LATER:
+        with suppress(OSError):  # said by what needs it
+            (home / name).mkdir(mode=0o700, exist_ok=True)
+    ours = [home / name for name in _DIRECTORIES if (home / name).is_dir() and not (home / name).is_symlink()]
+    is_open = [path.name for path in ours if not _closed(path)]
+    log.warning(
+        "%s is open to other users%s; Muster's directories in it are closed to them%s; run chmod 700 on it, or set MUSTER_HOME to "
+        "another directory",
+        *(home, f", since it also holds {others[0][:100]!r}" if others else ""),
+        f", but for {', '.join(is_open)} (chmod failed)" if is_open else "",
+    )
+
+
+def _closed(directory: Path) -> bool:
+    """Close it to other users; False where that is not possible."""
+    try:
+        directory.chmod(directory.stat().st_mode & 0o700)
+    except OSError:  # another user's
+        return False
+    return not directory.stat().st_mode & 0o077  # a volume without permissions changes nothing
 
 
 class ControllerRuns(ServerError):

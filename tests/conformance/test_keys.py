@@ -186,12 +186,26 @@ def test_a_home_directory_is_its_users_alone_and_an_open_one_is_closed(
             [record] = caplog.records
             assert words in record.message and str(tmp_path / name) in record.message
             caplog.clear()
+        (tmp_path / "elsewhere").mkdir(mode=0o755)
+        for name in ("store", "ray"):
+            (tmp_path / "shared" / name).mkdir(mode=0o755)
+        (tmp_path / "shared" / "kernels").rmdir()
+        (tmp_path / "shared" / "kernels").symlink_to(tmp_path / "elsewhere")
+        HomeLock(tmp_path / "shared").release()
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "shared").iterdir()}
+        assert {name: modes[name] for name in ("store", "ray", "supervisors", "kernels", "of somebody")} == {
+            **dict.fromkeys(("store", "ray", "supervisors"), 0o700),
+            "kernels": 0o755,  # it lies elsewhere, and may be shared
+            "of somebody": 0o644,
+        }
+        said = caplog.records[0].message
+        assert "since it also holds 'of somebody'" in said and "Muster's directories in it are closed" in said
         database = Database.at(tmp_path / "older")
         with database.session() as session:
             session.add(JobQueue(name="x", environments=[]))
-        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "older").glob("muster.db*")}
+        found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "older").glob("muster.db*")}
         database.close()
-        assert modes == {"muster.db": 0o600, "muster.db-wal": 0o600, "muster.db-shm": 0o600}
+        assert found == {"muster.db": 0o600, "muster.db-wal": 0o600, "muster.db-shm": 0o600}
     finally:
         os.umask(before)
 
