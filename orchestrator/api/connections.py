@@ -23,7 +23,7 @@ HEADER_TIMEOUT = 10.0
 BODY_TIMEOUT = 60.0
 """Seconds from there to the end of its body."""
 _FLUSH_TIMEOUT = 60.0
-"""Seconds that a client gets to take what was still sent when its connection is closed."""
+"""Seconds without any progress after which a closing connection that still has something to send is cut off."""
 BACKLOG = 128
 """Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
 _MOST_DESCRIPTORS = 65_536
@@ -182,15 +182,29 @@ class Connection(H11Protocol):
         self._deadline = None if seconds is None else self.loop.call_later(seconds, self._expire)
 
     def _expire(self) -> None:
-        self._deadline = self.loop.call_later(_FLUSH_TIMEOUT, self.transport.abort)
+        if self._phase == "header" and self.transport.get_write_buffer_size():
+            self._set_deadline(HEADER_TIMEOUT)  # the last answer is not all sent: its reader may be slow
+            return
+        self._close()
+
+    def _close(self) -> None:
+        """Close when all is sent, or when nothing has been sent for a while."""
         self.transport.close()
+        self._flush(self.transport.get_write_buffer_size() + 1)
+
+    def _flush(self, before: int) -> None:
+        left = self.transport.get_write_buffer_size()
+        if left < before:
+            self._deadline = self.loop.call_later(_FLUSH_TIMEOUT, self._flush, left)
+        else:
+            self.transport.abort()
 
     def _refuse(self) -> None:
         message = "too many connections are open; close some, or try again later"
         body = json.dumps({"__type": "ServiceUnavailableException", "message": message}).encode()
         head = "HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-type: application/json\r\n"
         self.transport.write(f"{head}content-length: {len(body)}\r\n\r\n".encode() + body)
-        self._expire()
+        self._close()
 
     def _should_upgrade(self) -> bool:
         return False  # there is no websocket here, and uvicorn would log each attempt

@@ -7,13 +7,18 @@ import resource
 import socket
 import subprocess
 import threading
+import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
+import uvicorn
 
 from orchestrator.api import connections
-from orchestrator.api.connections import raise_descriptor_limit
+from orchestrator.api.connections import Connection, Connections, raise_descriptor_limit
 from orchestrator.client import Client
 from orchestrator.server import Server
 from tests.conftest import MUSTER, Serving, wait_for
@@ -111,6 +116,52 @@ def test_trickling_gains_a_connection_no_time(inside: Server, monkeypatch: pytes
             except OSError:
                 return
     raise AssertionError("still open")
+
+
+ANSWER = b"x" * (24 << 20)
+
+
+async def large(scope: Any, receive: Any, send: Any) -> None:
+    """An application whose answer is larger than what the kernel takes at once."""
+    if scope["type"] == "http":
+        await receive()
+        headers = [(b"content-length", str(len(ANSWER)).encode())]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": ANSWER})
+
+
+@pytest.fixture
+def address_of_large(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, int]]:
+    """Where it is served, with very short deadlines."""
+    monkeypatch.setattr(connections, "HEADER_TIMEOUT", 0.2)
+    monkeypatch.setattr(connections, "_FLUSH_TIMEOUT", 0.5)
+    http: Any = partial(Connection, Connections(1024))
+    config = uvicorn.Config(large, http=http, lifespan="off", log_level="error", timeout_keep_alive=1)
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        thread.start()
+        yield listening.getsockname()
+        server.should_exit = True
+        thread.join(30)
+
+
+@pytest.mark.parametrize("another", [False, True], ids=["one", "and begins another request"])
+def test_a_client_that_reads_a_large_answer_slowly_gets_all_of_it(
+    address_of_large: tuple[str, int], another: bool
+) -> None:
+    with socket.socket() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
+        connection.settimeout(60)
+        connection.connect(address_of_large)
+        begun = b"GET / HTTP/1.1\r\nHost: x\r\nContent-Le" if another else b""
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" + begun)
+        received = 0
+        while received < len(ANSWER):
+            piece = connection.recv(256 << 10)
+            assert piece, f"cut off after {received} of {len(ANSWER)} bytes"
+            received += len(piece)
+            time.sleep(0.01)
 
 
 def test_the_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
