@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from alembic import command
 from alembic.config import Config
@@ -61,12 +62,13 @@ class Database:
         """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
 
         Raises:
-            DatabaseError: It can't be reached, is of a newer Muster, or another controller has it (PostgreSQL).
+            DatabaseError: It can't be reached, is of a newer Muster, or another controller has it.
         """
         self.committed: Callable[[Sequence[Job]], None] | None = None
         self.changed: Callable[[Collection[str]], None] | None = None
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
         self._lock: Connection | None = None
+        self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
         """What was said when a damaged page was first met."""
         self._file: Path | None = None
@@ -79,31 +81,37 @@ class Database:
                 connect_args=_connect_args(make_url(url)),
                 json_deserializer=_read_document,
             )
-            if self.engine.dialect.name == "sqlite":
-                event.listen(self.engine, "do_connect", self._check_before_connect)
-                event.listen(self.engine, "connect", _tune_sqlite)
-                if (path := self.engine.url.database) not in (None, "", ":memory:"):
-                    self._file = Path(str(path))
-            else:
-                self._lock = self._take_lock()
-            self._migrate()
-            if self._file is not None:
-                found = self._file.stat()
-                self._identity = found.st_dev, found.st_ino
-                self._reserve()
         except (SQLAlchemyError, ModuleNotFoundError) as error:
             raise DatabaseError(_explain(_shown(url), error)) from None
+        try:
+            self._open()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, SQLAlchemyError):
+                raise DatabaseError(_explain(_shown(url), error)) from None
+            raise
+
+    def _open(self) -> None:
+        """Take the lock, then migrate: nothing of a database that another controller has is touched."""
+        if self.engine.dialect.name == "sqlite":
+            event.listen(self.engine, "do_connect", self._check_before_connect)
+            event.listen(self.engine, "connect", _tune_sqlite)
+            if (path := self.engine.url.database) not in (None, "", ":memory:"):
+                self._file = Path(str(path))
+                self._file_lock = self._take_file_lock(self._file)
+                _make_private(self._file)
+        else:
+            self._lock = self._take_lock()
+        self._migrate()
+        if self._file is not None:
+            found = self._file.stat()
+            self._identity = found.st_dev, found.st_ino
+            self._reserve()
 
     @classmethod
     def at(cls, home: Path) -> Database:
-        """The SQLite database of a Muster home directory, for its user alone: jobs' environments hold secrets."""
-        path = home / "muster.db"
-        with suppress(OSError):  # said by SQLite, in its own words
-            os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
-        for name in ("muster.db", "muster.db-wal", "muster.db-shm"):  # SQLite gives new ones the mode of the first
-            with suppress(OSError):
-                (home / name).chmod(0o600)
-        return cls(f"sqlite:///{path}")
+        """The SQLite database of a Muster home directory."""
+        return cls(f"sqlite:///{home / 'muster.db'}")
 
     @contextmanager
     def session(self) -> Iterator[Session]:
@@ -200,16 +208,34 @@ class Database:
         if self._lock is not None:
             self._lock.close()
         self.engine.dispose()
+        if self._file_lock is not None:
+            self._file_lock.close()
 
     def _take_lock(self) -> Connection:
         """PostgreSQL drops it when the connection ends, however its process ends."""
         connection = self.engine.connect().execution_options(isolation_level="AUTOCOMMIT")
         if not connection.scalar(text(f"SELECT pg_try_advisory_lock({_CONTROLLER_LOCK})")):
             connection.close()
-            raise DatabaseError(
-                f"database {_shown(str(self.engine.url))}: another controller has it; use that one, or stop it first"
-            )
+            raise self._taken()
         return connection
+
+    def _take_file_lock(self, path: Path) -> IO[bytes] | None:
+        """The same for an SQLite file, beside it: its own locks are SQLite's. None where SQLite itself says what is wrong."""
+        try:
+            file = open(f"{path.resolve()}.lock", "ab", opener=_private)  # noqa: SIM115 - held until close()
+        except OSError:
+            return None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            if isinstance(error, BlockingIOError):
+                raise self._taken() from None
+            raise DatabaseError(f"database {self._shown}: {file.name} can't be locked ({error.strerror})") from None
+        return file
+
+    def _taken(self) -> DatabaseError:
+        return DatabaseError(f"database {self._shown}: another controller has it; use that one, or stop it first")
 
     def _migrate(self) -> None:
         config = Config()
@@ -240,6 +266,19 @@ class Database:
             if is_sqlite:
                 connection.exec_driver_sql("PRAGMA foreign_keys=ON")
                 connection.commit()
+
+
+def _make_private(path: Path) -> None:
+    """Create an SQLite file for its user alone, or close one to others: the environments of jobs hold secrets."""
+    with suppress(OSError):  # said by SQLite, in its own words
+        os.close(_private(str(path), os.O_RDWR | os.O_CREAT))
+    for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):  # SQLite gives new ones the mode of the first
+        with suppress(OSError):
+            path.with_name(name).chmod(0o600)
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def _shown(url: str) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 _OURS = re.compile(
-    r"controller\.(json|lock)|muster\.db(-.*)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
+    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
 )
 """Names in the home directory: database, keys, bus, the engines' directories, and what a volume has of itself."""
 

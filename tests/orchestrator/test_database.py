@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,7 +21,9 @@ from sqlalchemy.exc import IntegrityError
 from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
 from orchestrator.client import ApiError
 from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
+from orchestrator.home import ServerError
 from orchestrator.roster import Roster
+from orchestrator.server import Server
 from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
@@ -210,6 +213,28 @@ def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dea
     first.kill()
     first.wait()
     Database(url).close()
+
+
+@pytest.mark.parametrize("how", ["{}", "sqlite:///{}"])
+def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path: Path, how: str) -> None:
+    path = tmp_path / "m.db"
+    (tmp_path / "link.db").symlink_to(path)
+    before = os.umask(0o022)
+    try:
+        first = Server(tmp_path / "a", database=how.format(path))
+        for other in (path, tmp_path / "link.db"):
+            with pytest.raises(ServerError) as refused:
+                Server(tmp_path / "b", database=how.format(other))
+            said = f"database sqlite:///{other}: another controller has it; use that one, or stop it first"
+            assert str(refused.value) == said
+        modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in ("m.db", "m.db-wal", "m.db-shm")}
+        assert set(modes.values()) == {0o600}, modes
+        first.close()
+        path.chmod(0o644)
+        Server(tmp_path / "b", database=how.format(path)).close()
+        assert path.stat().st_mode & 0o777 == 0o600
+    finally:
+        os.umask(before)
 
 
 def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:
