@@ -1,4 +1,4 @@
-"""A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP COMMAND ...``.
+"""A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP FILES COMMAND ...``.
 
 It outlives whatever the node does. Everything the node starts is re-parented to it, not to init, when its own parent dies (it is a
 subreaper), and where control groups can be made it puts the node into one. When the supervisor ends, however it ends, the shim kills
@@ -29,15 +29,16 @@ _ORPHANED = signal.SIGUSR1
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 
 
-def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0) -> list[str]:
+def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0, files: int = 0) -> list[str]:
     """The command line that runs ``command``, a node's supervisor, below a shim.
 
     Args:
         command: What to run. It keeps the shim's standard streams and environment.
         group: Directory of a control group to make for it; empty for none.
         tied_to: Pid of the parent with whose death (of its thread that starts the shim) the node has to end; 0 for none.
+        files: Soft limit of open files for the node, at most the hard one; 0 for that of the process that starts the shim.
     """
-    return [sys.executable, "-I", "-S", __file__, str(tied_to), group, *command]
+    return [sys.executable, "-I", "-S", __file__, str(tied_to), group, str(files), *command]
 
 
 def group_of(command: Sequence[bytes]) -> str | None:
@@ -46,7 +47,7 @@ def group_of(command: Sequence[bytes]) -> str | None:
     return os.fsdecode(command[5]) if is_shim else None
 
 
-def main(parent: str, group: str, *command: str) -> None:
+def main(parent: str, group: str, files: str, *command: str) -> None:
     """Run ``command`` to its end; leaves with its exit code, 128 + n for signal n."""
     import ctypes
 
@@ -62,7 +63,7 @@ def main(parent: str, group: str, *command: str) -> None:
     me = os.getpid()
     supervisor = os.fork()  # there is one thread only: Python may run in the child
     if not supervisor:
-        _become(me, group, command)
+        _become(me, group, int(files), command)
     code = _wait(supervisor, watched)
     if _has_children() or not _removed(group):
         _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
@@ -71,10 +72,14 @@ def main(parent: str, group: str, *command: str) -> None:
     os._exit(code)
 
 
-def _become(shim: int, group: str, command: Sequence[str]) -> None:
+def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
+    import resource
+
     from shared_store import tied
 
     os.setsid()
+    if files:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     if group:
         try:
             if not os.path.isdir(group):

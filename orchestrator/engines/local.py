@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import pwd
+import resource
 import signal
 import socket
 import subprocess
@@ -81,6 +82,8 @@ class LocalEngine:
         """Directory in which control groups of nodes are made; empty where they can't be."""
         remove_abandoned_groups(self._groups)
         self._ended: dict[str, GangStatus] = {}
+        self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
 
     def capacity(self) -> Sequence[Host]:
         return [self._host]
@@ -191,7 +194,7 @@ class LocalEngine:
         said.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with open(said, "ab") as stderr:
             process = subprocess.Popen(
-                shimmed(with_mounts(command, mounts_of(container, plan.gang.store)), group),
+                shimmed(with_mounts(command, mounts_of(container, plan.gang.store)), group, files=self._files),
                 env=env,
                 cwd=plan.gang.directory,
                 stdin=subprocess.DEVNULL,

@@ -21,7 +21,7 @@ from orchestrator.api import connections
 from orchestrator.api.connections import Connection, Connections, raise_descriptor_limit
 from orchestrator.client import Client
 from orchestrator.server import Server
-from tests.conftest import MUSTER, Serving, wait_for
+from tests.conftest import MUSTER, Serving, submit_gang, wait_for
 
 DESCRIPTORS = 1024
 HALF_OPEN = 1100
@@ -169,6 +169,23 @@ def test_the_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
         assert raise_descriptor_limit() == resource.getrlimit(resource.RLIMIT_NOFILE)[0] == min(hard, 65_536)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (600, hard))
+        server = Server(tmp_path, cpus=1)
+        try:
+            server.start()
+            assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > 600
+            with Client(server.url) as client:
+                job = submit_gang(client, "import resource; print(*resource.getrlimit(resource.RLIMIT_NOFILE))")
+                assert next(line["text"] for line in client.logs(job, follow=True)) == f"600 {hard}"
+        finally:
+            server.close()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
