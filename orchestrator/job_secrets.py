@@ -28,7 +28,8 @@ class Secrets:
 
     def __init__(self, source: str | None = None, environment: MutableMapping[str, str] = os.environ) -> None:
         """Args:
-        source: Path of a JSON file that maps names to values, ``env`` for the variables ``MUSTER_SECRET_<name>`` of ``environment``,
+        source: Path of a JSON file that maps names to values, or to ``{"value": …, "queues": […]}`` for jobs of these queues
+            alone; ``env`` for the variables ``MUSTER_SECRET_<name>`` of ``environment``,
             from which they are removed; None to give no job any.
 
         Raises SecretsError where the file can't be used.
@@ -41,8 +42,11 @@ class Secrets:
                 self._given[name.removeprefix(_PREFIX)] = environment.pop(name)
         self._read()
 
-    def of(self, container: Mapping[str, Any]) -> dict[str, str]:
-        """The variables that ``secrets`` of these ``containerProperties`` ask for, with their values. Raises SecretsError."""
+    def of(self, container: Mapping[str, Any], queue: str) -> dict[str, str]:
+        """The variables that ``secrets`` of these ``containerProperties`` ask for, with their values, for a job of this queue.
+
+        Raises SecretsError.
+        """
         wanted = container.get("secrets") or []
         if wanted and not self._allowed:
             raise SecretsError(
@@ -50,14 +54,14 @@ class Secrets:
                 "muster serve --secrets FILE (or env)"
             )
         known = self._read() if wanted else {}
-        return {secret["name"]: self._value(secret, known) for secret in wanted}
+        return {secret["name"]: self._value(secret, known, queue) for secret in wanted}
 
-    def check(self, containers: Iterable[Mapping[str, Any]]) -> None:
-        """Raises SecretsError where one of the containers asks for a secret that can't be given."""
+    def check(self, containers: Iterable[Mapping[str, Any]], queue: str) -> None:
+        """Raises SecretsError where one of the containers asks for a secret that can't be given to a job of this queue."""
         for container in containers:
-            self.of(container)
+            self.of(container, queue)
 
-    def _value(self, secret: Mapping[str, str], known: Mapping[str, Any]) -> str:
+    def _value(self, secret: Mapping[str, str], known: Mapping[str, Any], queue: str) -> str:
         reference = secret["valueFrom"]
         name = next((name for name in _names(reference) if self._as_kept(name) in known), None)
         if name is None:
@@ -66,6 +70,12 @@ class Secrets:
                 f"secret {secret['name'][:100]}: {reference[:300]!r} is not in {where}; add it under this name"
             )
         value, match = known[self._as_kept(name)], _MANAGER.fullmatch(reference)
+        if isinstance(value, dict) and value.keys() == {"value", "queues"}:
+            if not isinstance(value["queues"], list) or queue not in value["queues"]:
+                raise SecretsError(
+                    f"secret {secret['name'][:100]}: {reference[:300]!r} is not for job queue {queue}; add the queue in {self._file}"
+                )
+            value = value["value"]
         if name != reference and match and (key := match[2]):
             try:
                 value = json.loads(value)[key] if isinstance(value, str) else value[key]

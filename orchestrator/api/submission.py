@@ -139,7 +139,7 @@ def _check_secrets(context: Context, queue: JobQueue, needs: GangNeeds) -> None:
     if containers:
         engines = queue_engines(context.session, queue.name, context.controller.engine.names[0])
         try:
-            context.controller.engine.check_secrets(engines, containers)
+            context.controller.engine.check_secrets(engines, containers, queue.name)
         except SecretsError as error:
             raise ClientError(str(error)) from None
 

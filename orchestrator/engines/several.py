@@ -116,7 +116,7 @@ class Several:
         if engine_of(plan.gang.placements[0].host) in _PASSED_ON:
             return plan
         try:
-            given = [self.secrets.of(container) for container in containers]
+            given = [self.secrets.of(container, plan.gang.queue) for container in containers]
         except SecretsError as error:
             raise EngineError(str(error)) from None
         nodes = [
@@ -125,10 +125,10 @@ class Several:
         ]
         return replace(plan, nodes=nodes)
 
-    def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]]) -> None:
-        """Raises SecretsError where a job of one of these engines could not be given the secrets that it asks for."""
+    def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
+        """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
         if any(name not in _PASSED_ON for name in names):
-            self.secrets.check(containers)
+            self.secrets.check(containers, queue)
 
     def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan]) -> str:
         """The handle of a gang once it is started; does not wait. Raises NotYet until then, and EngineError.

@@ -40,21 +40,34 @@ def file(tmp_path: Path) -> Path:
     ],
 )
 def test_a_secret_is_found_by_its_reference_or_by_the_name_in_it(file: Path, value_from: str, value: str) -> None:
-    assert Secrets(str(file)).of(asking(value_from)) == {"PASSWORD": value}
+    assert Secrets(str(file)).of(asking(value_from), "default") == {"PASSWORD": value}
+
+
+def test_a_secret_of_some_queues_is_given_to_their_jobs_alone(file: Path) -> None:
+    kept = {"value": {"key": "abc"}, "queues": ["robots"]}
+    file.write_text(json.dumps({"token": kept, "broken": {"value": "abc", "queues": "robots"}}))
+    secrets = Secrets(str(file))
+    assert secrets.of(asking(f"{MANAGER}token:key::"), "robots") == {"PASSWORD": "abc"}
+    for name, queue in (("token", "lab"), ("token", "robot"), ("broken", "robots")):
+        with pytest.raises(SecretsError, match=f"'{name}' is not for job queue {queue}; add the queue in") as caught:
+            secrets.check([asking(name)], queue)
+        assert "abc" not in str(caught.value)
 
 
 def test_a_file_is_read_anew_for_every_launch(file: Path) -> None:
     secrets = Secrets(str(file))
     file.write_text('{"db": "rotated"}')
-    assert secrets.of(asking("db")) == {"PASSWORD": "rotated"}
+    assert secrets.of(asking("db"), "default") == {"PASSWORD": "rotated"}
 
 
 def test_variables_leave_the_controllers_environment() -> None:
     environment = {"MUSTER_SECRET_prod_db": "hunter2", "PATH": "/bin"}
     secrets = Secrets("env", environment)
     assert environment == {"PATH": "/bin"}, "or every node would inherit them"
-    assert secrets.of(asking("arn:aws:ssm:us-east-1:123456789012:parameter/prod/db")) == {"PASSWORD": "hunter2"}
-    assert secrets.of(asking("prod/db")) == {"PASSWORD": "hunter2"}
+    assert secrets.of(asking("arn:aws:ssm:us-east-1:123456789012:parameter/prod/db"), "default") == {
+        "PASSWORD": "hunter2"
+    }
+    assert secrets.of(asking("prod/db"), "default") == {"PASSWORD": "hunter2"}
 
 
 @pytest.mark.parametrize(
@@ -67,14 +80,14 @@ def test_variables_leave_the_controllers_environment() -> None:
 )
 def test_what_is_missing_is_named_without_a_value(file: Path, value_from: str, message: str) -> None:
     with pytest.raises(SecretsError) as caught:
-        Secrets(str(file)).of(asking(value_from))
+        Secrets(str(file)).of(asking(value_from), "default")
     assert message in str(caught.value) and "hunter2" not in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_controller_gives_no_secrets_unless_it_was_told_to(file: Path) -> None:
-    assert Secrets().of({"secrets": []}) == {}
+    assert Secrets().of({"secrets": []}, "default") == {}
     with pytest.raises(SecretsError, match="muster serve --secrets"):
-        Secrets().of(asking("db"))
+        Secrets().of(asking("db"), "default")
     file.chmod(0o640)
     with pytest.raises(SecretsError, match="chmod 600"):
         Secrets(str(file))
