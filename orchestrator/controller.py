@@ -339,9 +339,15 @@ class Controller:
 
     # -- what the API asks --------------------------------------------------------------------------------------------
 
-    def check_room(self) -> None:
-        """Raises DatabaseFull where the database's volume has too little room for what is new."""
-        if shortage := self.disk.shortage("database"):
+    def check_writable(self, *, adds: bool) -> None:
+        """Whether a request may change the database, to which it ``adds`` something or not.
+
+        Raises DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
+        little room for what is new.
+        """
+        if (trouble := self.trouble) is not None:
+            raise DatabaseError(trouble)
+        if adds and (shortage := self.disk.shortage("database")):
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
 
     def reason(self, job: Job) -> str | None:

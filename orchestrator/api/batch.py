@@ -87,7 +87,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 
 
 def call(controller: Controller, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
-    """Carry out one operation. Raises ClientError; DatabaseFull where it adds something and there is no room for that."""
+    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Controller.check_writable`)."""
     handler = OPERATIONS.get(operation)
     if handler is None:
         instead = next((use for part, use in _INSTEAD.items() if part in operation), None)
@@ -107,8 +107,7 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
     def carry_out(session: Session) -> dict[str, Any]:
         return handler(Context(session, controller, idempotency_key), checked)
 
-    if operation.startswith(_ADDING):
-        controller.check_room()
+    controller.check_writable(adds=operation.startswith(_ADDING))
     try:
         if operation == "SubmitJob":
             response = controller.submissions.call(carry_out)

@@ -144,7 +144,7 @@ def resume(
             return earlier
     chosen = _choose(run, checkpoint)  # reads all of a checkpoint: before anybody has to wait for it
     controller.engine.capacity(patience=FRESH)  # before the lock: whoever holds it waits for no engine
-    controller.check_room()
+    controller.check_writable(adds=True)
     with controller.writing, controller.database.session() as session:
         context = Context(session, controller, idempotency_key)
         if earlier := _resumed(context, run):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -235,6 +236,40 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         assert path.stat().st_mode & 0o777 == 0o600
     finally:
         os.umask(before)
+
+
+def test_a_controller_that_lost_its_database_to_another_refuses_writes_and_goes_on_reading(
+    server: postgres.Server, tmp_path: Path
+) -> None:
+    url = server.new_database()
+    losing = Server(tmp_path, database=url)
+    losing.start()
+    other, waiter = create_engine(url).connect(), create_engine(url).connect()
+    lock = f"SELECT pg_advisory_lock({0x6D7573746572})"
+    waiting = threading.Thread(target=waiter.execute, args=(text(lock),), daemon=True)
+    waiting.start()
+    queued = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted")
+    wait_for(lambda: other.scalar(queued), 30, "the other one to wait for the lock")
+    other.execute(text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND granted"))
+    with httpx.Client(base_url=losing.url, timeout=60) as client:
+        try:
+            wait_for(lambda: losing.controller.trouble, 30, "that it notices")
+            for operation, request in (
+                ("canceljob", {"jobId": "x", "reason": "x"}),
+                ("submitjob", {"jobName": "x", "jobQueue": "default", "jobDefinition": "x"}),
+            ):
+                answer = client.post(f"/v1/{operation}", json=request)
+                assert answer.status_code == 503 and "another controller has it" in answer.json()["message"]
+            assert client.post("/v1/listjobs", json={"jobQueue": "default"}).status_code == 200
+            waiter.invalidate()
+            waiter.close()
+            wait_for(lambda: client.get("/healthz").status_code == 200, 30, "that it has the database again")
+            answer = client.post("/v1/canceljob", json={"jobId": "x", "reason": "x"})
+            assert answer.status_code == 400 and "does not exist" in answer.json()["message"]
+        finally:
+            waiter.close()
+            other.close()
+            losing.close()
 
 
 def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:
