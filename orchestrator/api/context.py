@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.arns import plain_name
 from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import Operation, check, is_visible, visible_queues
+from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.controller import Controller
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
@@ -34,9 +34,7 @@ class Context:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
-            there = (
-                ", ".join(self.session.scalars(select(JobQueue.name).order_by(JobQueue.name).limit(5))) or "none yet"
-            )
+            there = ", ".join(queue_names(self.session)[:5]) or "none yet"
             raise ClientError(f"Job queue {reference[:300]} does not exist; there is {there}")
         return queue
 
@@ -68,6 +66,12 @@ class Context:
     def reason(self, job: Job) -> str | None:
         """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
         return self.controller.reason(job)
+
+
+def queue_names(session: Session) -> list[str]:
+    """The queues whose jobs the caller may see, by name."""
+    names = session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
+    return [name for name in names if is_visible(JobsOf(name))]
 
 
 def find_run(controller: Controller, name: str) -> Run:

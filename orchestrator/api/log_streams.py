@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import or_, select
-from sqlalchemy.orm import Session, load_only
+from sqlalchemy.orm import Session, load_only, raiseload
 
 from orchestrator.api import permissions
 from orchestrator.api.describe import stream_name
@@ -62,7 +62,11 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
     query = (
         select(Attempt, Job)
         .join(Job, Attempt.job_id == Job.id)
-        .options(load_only(Job.name, Job.run), load_only(Attempt.created_at, Attempt.stopped_at, Attempt.nodes))
+        .options(
+            raiseload(Job.array),
+            load_only(Job.name, Job.run),
+            load_only(Attempt.created_at, Attempt.stopped_at, Attempt.nodes),
+        )
         .where(or_(Attempt.stopped_at.is_(None), Attempt.stopped_at >= since))
         .order_by(Attempt.stopped_at.is_(None).desc(), Job.created_at.desc(), Job.id, Attempt.number)
         .limit(MOST_STREAMS)

@@ -13,14 +13,13 @@ from typing import Any
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.admission import fit_in_queue, node_records
 from orchestrator.api import permissions, rules, runs
 from orchestrator.api.batch import validate
-from orchestrator.api.context import permitted_run
+from orchestrator.api.context import permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
@@ -95,15 +94,13 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     with controller.database.session() as session:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
-        queues = list(
-            session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
-        )
+        queues = queue_names(session)
     return {
         "engines": own_queues(controller.engine.names),
         "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
         "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
-        "queues": [name for name in queues if permissions.is_visible(JobsOf(name))],
+        "queues": queues,
     }
 
 
@@ -179,8 +176,7 @@ def _queue(session: Session, name: str) -> JobQueue:
     """The queue of this name. Raises ClientError naming those that the caller may see."""
     queue = session.get(JobQueue, name)
     if queue is None or queue.deleting:
-        others = session.scalars(select(JobQueue.name).where(JobQueue.deleting.is_(False)).order_by(JobQueue.name))
-        there = ", ".join([each for each in others if permissions.is_visible(JobsOf(each))][:10])
+        there = ", ".join(queue_names(session)[:10])
         raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
     return queue
 
