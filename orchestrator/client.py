@@ -25,6 +25,10 @@ _SUBMISSIONS = ("/submitjob", "/resume")
 """Paths of requests that must not be carried out twice."""
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
 """Seconds after each refusal for too many requests; the last one is told."""
+_BARREN = 4
+"""Streams in a row that broke off without a line, after which those of a job that is over are given up."""
+_LONGEST_PAUSE = 5.0
+"""Seconds between two streams that brought no line."""
 
 
 class ApiError(Exception):
@@ -101,7 +105,8 @@ class Client:
         """The job's log lines. Raises ApiError, Unreachable.
 
         With ``follow=True`` until the job is over: a controller that goes away is waited for, and its successor's stream is taken
-        up where this one broke off, no line twice and none left out.
+        up where this one broke off, no line twice and none left out. Streams that break off without a line, again and again, end
+        it when the job is over.
         """
         for lines in self.log_batches(job, **query):
             yield from lines
@@ -109,19 +114,29 @@ class Client:
     def log_batches(self, job: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
         """:meth:`logs`, as many lines at a time as have come."""
         positions: dict[str, int] = {}
+        barren = 0
         while True:
+            before, broken = dict(positions), None
             try:
                 for lines in self._stream(job, query, positions):
                     for line in lines:
                         positions[f"{line['attempt']}/{line['node']}"] = line["position"]
                     yield lines
-                if not query.get("follow") or self.get(f"/api/jobs/{job}")["status"] in ("SUCCEEDED", "FAILED"):
-                    return
-                self.await_return()  # a controller that was stopped ends its streams in order
-            except Unreachable:
+                if not query.get("follow") or self._is_over(job):
+                    return  # else the controller was stopped, which ends its streams in order
+            except Unreachable as error:
                 if not query.get("follow"):
                     raise
-                self.await_return()
+                broken = error
+            barren = barren + 1 if positions == before else 0
+            if barren:
+                time.sleep(min(0.1 * 2**barren, _LONGEST_PAUSE))
+            self.await_return()
+            if broken and barren >= _BARREN and self._is_over(job):
+                raise broken
+
+    def _is_over(self, job: str) -> bool:
+        return self.get(f"/api/jobs/{job}")["status"] in ("SUCCEEDED", "FAILED")
 
     def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
         wanted = {key: value for key, value in query.items() if value is not None}

@@ -23,8 +23,8 @@ LIMIT = 1 << 30
 LEAST_LIMIT = 1 << 20
 """Bytes below which a limit is refused."""
 
-_TAIL = re.compile(r"(node-\d+\.log)\.(\d{15})\.(\d{1,15})")
-_HEAD = re.compile(r"node-\d+\.log")
+_TAIL = re.compile(r"(node-[0-9]{1,9}\.log)\.([0-9]{15})\.([0-9]{1,15})")
+_HEAD = re.compile(r"node-[0-9]{1,9}\.log")
 _LEVELS = 4
 """Directories from that of a log up to its run: ``<run>/logs/<job>/<attempt>``."""
 _SEGMENTS = 16

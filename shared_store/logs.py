@@ -17,12 +17,14 @@ from json.encoder import encode_basestring_ascii
 from operator import itemgetter
 from typing import NamedTuple
 
+from shared_store.files import DamagedFile, refuse_links
 from shared_store.layout import Run
 from shared_store.log_files import Chunk, Segment, left_out, log_segments, read_log
 
 _LINE = re.compile(r"(\S+) (-|\d{1,9}) ([oe]) (.*)", re.DOTALL)
 _LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
-_HEAD = re.compile(r"node-(\d+)\.log")
+_HEAD = re.compile(r"node-([0-9]{1,9})\.log")
+_ATTEMPT = re.compile(r"[0-9]{1,9}")
 _CHUNK = 1 << 20
 """Bytes that a poll reads of a log; of the logs of many nodes less."""
 _LEAST_CHUNK = 256 << 10
@@ -225,5 +227,10 @@ class LogFollower:
 
 
 def _attempts(run: Run, job: str) -> list[int]:
+    """Those that have a log. What a job put in place of a directory, or beside them, is none. Raises OSError."""
     directory = run.path / "logs" / job
-    return sorted(int(name) for name in os.listdir(directory) if name.isdigit()) if directory.exists() else []
+    try:
+        refuse_links(directory, 3)
+        return sorted({int(name) for name in os.listdir(directory) if _ATTEMPT.fullmatch(name)})
+    except (FileNotFoundError, NotADirectoryError, DamagedFile):
+        return []

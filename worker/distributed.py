@@ -54,7 +54,7 @@ class Placement:
 
         def integer(name: str, default: int) -> int:
             value = env.get(name) or str(default)
-            if not value.isdigit():
+            if not value.isdecimal():
                 raise ValueError(
                     f"{name} is {value!r}, not a whole number; ranks are started by worker.supervisor or by torchrun"
                 )
@@ -287,7 +287,7 @@ def use_cpu_threads(env: Mapping[str, str]) -> None:
     """Give torch ``OMP_NUM_THREADS`` threads; without it, this rank's share of the host."""
     given = env.get("OMP_NUM_THREADS", "")
     share = len(os.sched_getaffinity(0)) // max(1, int(env.get("LOCAL_WORLD_SIZE", "1")))
-    torch.set_num_threads(int(given) if given.isdigit() and int(given) > 0 else max(1, share))
+    torch.set_num_threads(int(given) if given.isdecimal() and int(given) > 0 else max(1, share))
 
 
 def warm_marker(task: type, device: str) -> Path | None:

@@ -25,17 +25,18 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
-from orchestrator.database import find_job
+from orchestrator.database import DatabaseError, find_job
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.engines.several import FRESH
+from orchestrator.excerpts import LONGEST_REASON, excerpt
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import needs as needed
 from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
-from shared_store.logs import LogFollower, LogLine
+from shared_store.logs import LogFollower, LogLine, timestamp
 from shared_store.metrics import history_of
 
 router = APIRouter(prefix="/api")
@@ -400,7 +401,16 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
 
 def _stored(follower: LogFollower) -> Iterator[str]:
     """All that is there, many lines at a time: each piece costs a hand-over between threads."""
-    return map(_json_lines, follower.batches())
+    try:
+        yield from map(_json_lines, follower.batches())
+    except (OSError, ValueError) as error:
+        yield _trouble(error)
+
+
+def _trouble(error: Exception) -> str:
+    """The last line of a stream that can't go on: of no node and no attempt."""
+    text = f"the log can't be read now: {excerpt(' '.join(str(error).split()), LONGEST_REASON)}"
+    return _json_lines([LogLine(timestamp(time.time()), 0, 0, None, "e", text)])
 
 
 def _json_lines(lines: Sequence[LogLine]) -> str:
@@ -420,7 +430,11 @@ async def _follow(
 
     spoken = time.monotonic()
     while not closing.is_set():
-        lines, over = await run_in_threadpool(look)
+        try:
+            lines, over = await run_in_threadpool(look)
+        except (OSError, ValueError, DatabaseError) as error:
+            yield _trouble(error)
+            return
         if lines:
             yield lines
             spoken = time.monotonic()

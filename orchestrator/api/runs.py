@@ -318,7 +318,7 @@ def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | No
         pass
     if newest := _newest_job(session, run):
         given = gang_needs(newest.node_properties).setting("MUSTER_WORLDS")
-        if given.isdecimal():
+        if given.isdecimal() and len(given) < 10:
             return int(given)
     return before.train.worlds * before.ranks_per_node * before.nodes.max
 

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import pwd
+import re
 import resource
 import signal
 import socket
@@ -47,6 +48,8 @@ from shared_store.shim import STUCK, group_of, shimmed
 
 log = logging.getLogger("muster.engines")
 
+_ID = re.compile(r"[0-9]{1,10}")
+"""A user or a group by its number."""
 _FIRST_PORT = 29500
 _UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
 """What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
@@ -228,14 +231,14 @@ def _user(given: str) -> str:
         )
     name, _, group = given.partition(":")
     try:
-        user = pwd.getpwuid(int(name)) if name.isdigit() else pwd.getpwnam(name)
+        user = pwd.getpwuid(int(name)) if _ID.fullmatch(name) else pwd.getpwnam(name)
         uid, gid = user.pw_uid, user.pw_gid
     except KeyError:
-        if not name.isdigit():
+        if not _ID.fullmatch(name):
             raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
         uid = gid = int(name)
     try:
-        gid = int(group) if group.isdigit() else grp.getgrnam(group).gr_gid if group else gid
+        gid = int(group) if _ID.fullmatch(group) else grp.getgrnam(group).gr_gid if group else gid
     except KeyError:
         raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
     return f"{uid}:{gid}"

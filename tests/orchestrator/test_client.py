@@ -10,16 +10,17 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from orchestrator.client import Client
-from tests.conftest import Serving
+from orchestrator.client import Client, Unreachable
+from tests.conftest import Serving, submit_gang, wait_for
 
 
 class LossyProxy:
-    """Forwards connections to a server; the first answer to a request that holds ``marker`` is thrown away."""
+    """Forwards connections to a server; the first ``losses`` answers to requests that hold ``marker`` are thrown away."""
 
-    def __init__(self, url: str, marker: bytes) -> None:
+    def __init__(self, url: str, marker: bytes, losses: int = 1) -> None:
         parts = urlsplit(url)
         self._target, self._marker, self.lost = (parts.hostname, parts.port), marker, 0
+        self._losses = losses
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._serve, daemon=True).start()
@@ -40,7 +41,7 @@ class LossyProxy:
             while request := _message(client):
                 server.sendall(request)
                 answer = _message(server)
-                if self._marker in request and not self.lost:
+                if self._marker in request and self.lost < self._losses:
                     self.lost += 1
                     return  # the server has done it, and the client will never know
                 client.sendall(answer)
@@ -79,3 +80,16 @@ def test_a_submission_whose_answer_was_lost_is_submitted_once(shared_server: Ser
     there = [{"name": "JOB_NAME", "values": ["lossy-once"]}]
     found = shared_server.client.batch("ListJobs", jobQueue="default", filters=there)["jobSummaryList"]
     assert [job["jobId"] for job in found] == [submitted["jobId"]]
+
+
+def test_a_log_whose_stream_always_breaks_off_is_given_up_when_the_job_is_over(shared_server: Serving) -> None:
+    job = submit_gang(shared_server.client, "print('never seen')", name="broken-log")
+    shared_server.client.batch("TerminateJob", jobId=job, reason="enough")
+    wait_for(lambda: shared_server.client.get(f"/api/jobs/{job}")["status"] in ("FAILED", "SUCCEEDED"), 60, "its end")
+    proxy = LossyProxy(shared_server.url, b"/logs?", losses=50)
+    try:
+        with Client(proxy.url) as client, pytest.raises(Unreachable):
+            list(client.logs(job, follow=True))
+    finally:
+        proxy.close()
+    assert proxy.lost < 10

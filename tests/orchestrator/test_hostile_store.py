@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import asdict
@@ -286,3 +287,23 @@ def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path:
         else:
             write_outcome(run, "job", 1, outcome)
     assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
+
+
+def test_a_log_stream_ends_in_order_whatever_lies_where_logs_are_looked_for(
+    inside: Server, http: httpx.Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    job = submit_gang(Client(inside.url), "print('said')")
+    wait_for(lambda: http.get(f"/api/jobs/{job}").json()["status"] == "SUCCEEDED", 60, "its end")
+    logs = inside.store.run(http.get(f"/api/jobs/{job}").json()["run"]).path / "logs" / job
+    (logs / "²").mkdir()
+    (logs / ("9" * 200)).mkdir()
+    (logs / "1" / "node-².log").write_text("")
+    address = f"/api/jobs/{job}/logs"
+    for follow in (False, True):
+        assert "said" in http.get(address, params={"follow": follow}).text
+        [line] = http.get(address, params={"follow": follow, "attempt": "9" * 300}).text.splitlines()
+        assert json.loads(line)["text"].startswith("the log can't be read now: ")
+    logs.rename(logs.with_name("before"))
+    logs.write_text("")
+    assert [http.get(address, params={"follow": follow}).text for follow in (False, True)] == ["", ""]
+    assert "Exception in ASGI application" not in caplog.text

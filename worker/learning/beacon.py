@@ -17,7 +17,7 @@ class Beacon:
 
     def __init__(self, env: Mapping[str, str] | None = None) -> None:
         given = (os.environ if env is None else env).get("MUSTER_PROGRESS_FD", "")
-        self._descriptor = int(given) if given.isdigit() else None
+        self._descriptor = int(given) if given.isdecimal() else None
 
     def tell(self, **message: Any) -> None:
         """Send one message of JSON values."""

@@ -40,7 +40,7 @@ def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
         if newest is None:
             raise UserError(f"run {run.name} has no checkpoint that can be read in {run.checkpoints}; train it first")
         return newest
-    found = [c for c in checkpoints if wanted == c.name or (str(wanted).isdigit() and int(wanted) == c.iteration)]
+    found = [c for c in checkpoints if wanted == c.name or (str(wanted).isdecimal() and int(wanted) == c.iteration)]
     if not found:
         there = ", ".join(str(c.iteration) for c in checkpoints) or "none"
         raise UserError(f"run {run.name} has no checkpoint {wanted}; there are: {there}")
