@@ -1,10 +1,10 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the whole test suite
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
-# make torture N=300   kill everything at random moments; every run must end with the same bits
+# make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
-# make fuzz N=10000    malformed requests, drawn at random; none may be answered with a 500
+# make fuzz N=10000    malformed requests and hostile clients; no answer may be a 500, and others must be served meanwhile
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
@@ -60,7 +60,7 @@ bench-api: $(READY)
 	$(BIN)/python -m benchmarks.api
 
 torture: $(READY)
-	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300)
+	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300) --rounds $(or $(ROUNDS),10)
 
 bits: $(READY)
 	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/e2e tests/engines
