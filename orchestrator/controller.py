@@ -90,6 +90,8 @@ class Controller:
         self._wake, self._ending = threading.Event(), threading.Event()
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
+        self._is_full = False
+        """Whether that is because its volume is full: what ends jobs is tried all the same."""
         self._backoff = Backoff(log)
         """What goes wrong, by a part of the pass, or by what was tried of a job and the job's id."""
         self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
@@ -166,7 +168,7 @@ class Controller:
         except DatabaseError as error:
             if self.trouble is None:
                 log.error("%s; until it can be used again no job is started or accepted", error)
-            self.trouble = str(error)
+            self.trouble, self._is_full = str(error), isinstance(error, DatabaseFull)
         except Exception as error:
             self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
 
@@ -345,7 +347,7 @@ class Controller:
         Raises DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
         little room for what is new.
         """
-        if (trouble := self.trouble) is not None:
+        if (trouble := self.trouble) is not None and (adds or not self._is_full):
             raise DatabaseError(trouble)
         if adds and (shortage := self.disk.shortage("database")):
             raise DatabaseFull(f"{shortage}, and nothing new is accepted")
