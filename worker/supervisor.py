@@ -342,7 +342,7 @@ class Supervisor:
         try:
             write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
         except (OSError, DamagedFile) as error:
-            _tell(f"outcome of node {outcome.node} can't be written: {error}")
+            _tell(f"outcome of node {outcome.node} can't be written: {error.strerror or error}")
         return outcome.exit_code
 
 

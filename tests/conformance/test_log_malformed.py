@@ -37,7 +37,7 @@ def test_no_malformed_request_is_a_server_error(shared_server: Serving, operatio
         assert "\n" not in answer.json()["message"] and answer.headers["content-type"] == "application/x-amz-json-1.1"
 
 
-@pytest.mark.parametrize("target", [None, "", "Logs_20140328.", "Other_2014.GetLogEvents", "Logs_20140328.__class__"])
+@pytest.mark.parametrize("target", [None, "", "Logs_20140328.", "Logs_20140328.__class__"])
 def test_a_request_without_a_known_target_is_refused(shared_server: Serving, target: str | None) -> None:
     answer = httpx.post(
         shared_server.url, content=b"{}", headers={"X-Amz-Target": target} if target is not None else {}

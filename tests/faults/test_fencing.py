@@ -43,7 +43,7 @@ def gang(store: Store, job: str, epoch: int) -> Gang:
 
 
 def members(store: Store, job: str) -> list[int]:
-    """Pids of a gang's supervisor, ranks and writers."""
+    """Pids of a gang's shim, supervisor, ranks and writers."""
     found = []
     for pid in processes_of(store.path):
         try:
@@ -64,7 +64,7 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
     try:
         wait_for(lambda: len(list_checkpoints(run)) >= 2, 180, "checkpoints of the first gang")
         frozen = members(store, "stale")
-        assert len(frozen) == 3, "supervisor, rank and writer"
+        assert len(frozen) == 4, "shim, supervisor, rank and writer"
         for pid in frozen:
             os.kill(pid, signal.SIGSTOP)
 

@@ -16,14 +16,10 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from sqlalchemy import create_engine, event, select, text
+from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
 from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
-from orchestrator.api.context import Context
-from orchestrator.api.errors import ClientError
-from orchestrator.api.log_streams import newest_streams
-from orchestrator.api.permissions import Identity, current_identity
 from orchestrator.client import ApiError
 from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
 from orchestrator.home import ServerError
@@ -274,33 +270,6 @@ def test_a_controller_that_lost_its_database_to_another_refuses_writes_and_goes_
             waiter.close()
             other.close()
             losing.close()
-
-
-def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of_arrays(tmp_path: Path) -> None:
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        session.add(job("array", kind="array"))
-        for index in range(3):
-            attempt = Attempt(number=1, epoch=1, nodes=[{"index": 0, "host": "h"}])
-            session.add(
-                job(f"array:{index}", run=f"array-{index}", parent="array", node_properties=None, attempts=[attempt])
-            )
-    statements: list[str] = []
-    event.listen(database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
-    with database.session() as session:
-        assert len(newest_streams(session, Store(tmp_path / "store"))) == 3
-    assert len(statements) == 1, statements
-    database.close()
-
-
-def test_an_unknown_queue_is_refused_with_the_names_that_the_caller_may_see(inside: Server) -> None:
-    before = current_identity.set(Identity("robots", frozenset({"robots"})))
-    try:
-        with inside.controller.database.session() as session, pytest.raises(ClientError) as refused:
-            Context(session, inside.controller).queue("nosuch")
-    finally:
-        current_identity.reset(before)
-    assert str(refused.value) == "Job queue nosuch does not exist; there is none yet"
 
 
 def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:

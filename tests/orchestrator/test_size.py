@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import event, func, select
 
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import LARGEST_COMMANDS
+from orchestrator.api.log_streams import newest_streams
+from orchestrator.api.permissions import Identity, current_identity
+from orchestrator.database import Database
 from orchestrator.server import Server
-from orchestrator.tables import Job
+from orchestrator.tables import Attempt, Job
+from shared_store.layout import Store
 from tests.conftest import wait_for
+from tests.orchestrator.test_database import job
 
 OVERSIZED = {
     "takes at most 100 jobs, not 400000": ("describejobs", '{"jobs": [%s1]}' % ("1," * 399_999)),
@@ -94,8 +102,8 @@ def test_the_children_of_an_array_wait_for_each_other_and_for_others_as_asked(
         [(f"{first}:1", "SEQUENTIAL")],
     ]
     assert waits(f"{second}:2") == [(f"{first}:2", "N_TO_N")]
-    for job in (first, second):
-        call(http, "TerminateJob", jobId=job, reason="done with")
+    for array in (first, second):
+        call(http, "TerminateJob", jobId=array, reason="done with")
 
 
 @pytest.mark.parametrize("said", OVERSIZED)
@@ -147,3 +155,30 @@ def test_references_to_a_parameter_can_t_make_a_command_larger_than_the_limit(ht
     refused = http.post("/v1/submitjob", json={**submission, "parameters": {"a": "x" * (most + 1)}})
     assert refused.status_code == 400, refused.text
     call(http, "TerminateJob", jobId=job, reason="enough")
+
+
+def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of_arrays(tmp_path: Path) -> None:
+    database = Database.at(tmp_path)
+    with database.session() as session:
+        session.add(job("array", kind="array"))
+        for index in range(3):
+            attempt = Attempt(number=1, epoch=1, nodes=[{"index": 0, "host": "h"}])
+            session.add(
+                job(f"array:{index}", run=f"array-{index}", parent="array", node_properties=None, attempts=[attempt])
+            )
+    statements: list[str] = []
+    event.listen(database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    with database.session() as session:
+        assert len(newest_streams(session, Store(tmp_path / "store"))) == 3
+    assert len(statements) == 1, statements
+    database.close()
+
+
+def test_an_unknown_queue_is_refused_with_the_names_that_the_caller_may_see(inside: Server) -> None:
+    before = current_identity.set(Identity("robots", frozenset({"robots"})))
+    try:
+        with inside.controller.database.session() as session, pytest.raises(ClientError) as refused:
+            Context(session, inside.controller).queue("nosuch")
+    finally:
+        current_identity.reset(before)
+    assert str(refused.value) == "Job queue nosuch does not exist; there is none yet"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib.util
 import json
 import os
@@ -13,12 +14,14 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shared_store.logs import parse_line
 from tests.conftest import wait_for
+from tests.faults.full_disk import small_volume
 from tests.worker.node import Node, Nodes
 
 # -- output -----------------------------------------------------------------------------------------------------------
@@ -82,24 +85,30 @@ def test_of_a_progress_bar_the_last_state_is_kept(node: Nodes) -> None:
     assert n.output() == ["30%", "windows", "60%"]
 
 
+@contextlib.contextmanager
+def full_volume(directory: Path) -> Iterator[None]:
+    """A volume at ``directory`` without a free byte."""
+    with small_volume(directory, 1 << 16):
+        with contextlib.suppress(OSError), open(directory / "ballast", "wb", buffering=0) as file:
+            while file.write(bytes(4096)):
+                pass
+        yield
+
+
 def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> None:
     n = node()
-    log = n.run.log("job", 1, 0)
-    log.parent.mkdir(parents=True)
-    log.symlink_to("/dev/full")
-    assert n.python("for _ in range(5000): print('x' * 100)\nraise SystemExit(5)") == 5
-    assert n.ended().exit_code == 5
+    with full_volume(n.run.log("job", 1, 0).parent):
+        assert n.python("for _ in range(5000): print('x' * 100)\nraise SystemExit(5)") == 5
+        assert n.ended().exit_code == 5
     assert n.stderr.read_text() == "log of node 0 can't be written: No space left on device\n"
 
 
 def test_where_nothing_at_all_can_be_written_the_exit_code_is_still_the_rank_s(node: Nodes) -> None:
     n = node()
-    log = n.run.log("job", 1, 0)
-    log.parent.mkdir(parents=True)
-    log.symlink_to("/dev/full")
     (n.run.path / "outcomes").write_text("a file where a directory should be")
     n.stderr.symlink_to("/dev/full")
-    assert n.python("print('x')\nraise SystemExit(5)") == 5
+    with full_volume(n.run.log("job", 1, 0).parent):
+        assert n.python("print('x')\nraise SystemExit(5)") == 5
 
 
 def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: Nodes) -> None:
