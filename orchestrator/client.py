@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import httpx
 
@@ -49,6 +50,13 @@ class NotServing(ApiError, Unreachable):
 
 def _unnamable(text: str) -> ApiError:
     return ApiError(f"{text!r} names nothing; jobs and runs are named with letters, digits, '.', '_' and '-'", 400)
+
+
+def named(name: str) -> str:
+    """The name of a job or a run, as a part of a path. Raises ApiError where nothing can be called so."""
+    if not re.fullmatch(r"[A-Za-z0-9_.:#-]{1,256}", name) or name in (".", ".."):
+        raise _unnamable(name)
+    return quote(name, safe=":")
 
 
 def _is_url(text: str) -> bool:
@@ -136,7 +144,7 @@ class Client:
                 raise broken
 
     def _is_over(self, job: str) -> bool:
-        return self.get(f"/api/jobs/{job}")["status"] in ("SUCCEEDED", "FAILED")
+        return self.get(f"/api/jobs/{named(job)}")["status"] in ("SUCCEEDED", "FAILED")
 
     def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
         wanted = {key: value for key, value in query.items() if value is not None}
@@ -144,7 +152,7 @@ class Client:
             wanted["positions"] = json.dumps(positions)
         try:
             with self._http.stream(
-                "GET", f"/api/jobs/{job}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
+                "GET", f"/api/jobs/{named(job)}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
             ) as answer:
                 if answer.is_error:
                     answer.read()

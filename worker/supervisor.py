@@ -342,7 +342,8 @@ class Supervisor:
         try:
             write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
         except (OSError, DamagedFile) as error:
-            _tell(f"outcome of node {outcome.node} can't be written: {error.strerror or error}")
+            why = getattr(error, "strerror", None) or error
+            _tell(f"outcome of node {outcome.node} can't be written: {why}")
         return outcome.exit_code
 
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from orchestrator import specfile
 from orchestrator.cli.progress import evaluated, follow
 from orchestrator.cli.terminal import Console, echo, echo_json, one_line
-from orchestrator.client import Client
+from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
 from orchestrator.engines.base import engine_of
@@ -218,7 +218,7 @@ def _gpus(node: dict[str, Any]) -> str:
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
     """Show a job: its state and why, its attempts and nodes, its run and results."""
     with Client.connect() as client:
-        detail = client.get(f"/api/jobs/{job}")
+        detail = client.get(f"/api/jobs/{named(job)}")
         detail["job"] = client.batch("DescribeJobs", jobs=[detail["id"]])["jobs"][0]
     if as_json:
         echo_json(detail, indent=1)
@@ -271,7 +271,7 @@ def stop(
 ) -> None:
     """Stop a job: it checkpoints and leaves; `muster resume` goes on from there."""
     with Client.connect() as client:
-        detail = client.get(f"/api/jobs/{job}")
+        detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in ("SUCCEEDED", "FAILED"):
             echo(f"{detail['name']} ({detail['id'][:8]}) is {detail['status']} already")
             return
@@ -294,7 +294,7 @@ def stop(
 def checkpoint(job: JobArgument) -> None:
     """Have a training job save now; returns when the checkpoint is durable."""
     with Client.connect() as client:
-        answer = client.post(f"/api/jobs/{job}/checkpoint", {}, seconds=180)["answer"]
+        answer = client.post(f"/api/jobs/{named(job)}/checkpoint", {}, seconds=180)["answer"]
     echo(answer)
     if not answer.startswith("checkpoint "):
         raise typer.Exit(1)
@@ -303,7 +303,7 @@ def checkpoint(job: JobArgument) -> None:
 def stacks(job: JobArgument) -> None:
     """Print where every rank of a running job is: Python and native stacks. They go to the job's log too."""
     with Client.connect() as client:
-        for node in client.get(f"/api/jobs/{job}/stacks", seconds=180):
+        for node in client.get(f"/api/jobs/{named(job)}/stacks", seconds=180):
             echo(f"== node {node['node']}\n{node['stacks']}")
 
 

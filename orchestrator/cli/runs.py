@@ -12,7 +12,7 @@ from rich.table import Table
 from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.client import Client
+from orchestrator.client import Client, named
 
 RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
 
@@ -42,7 +42,7 @@ def resume(
             "set": [*(set_ or []), *elsewhere],
             "directory": os.getcwd(),
         }
-        resumed = client.post(f"/api/runs/{run}/resume", body)
+        resumed = client.post(f"/api/runs/{named(run)}/resume", body)
         if as_json:
             echo_json(resumed)
         else:
@@ -61,7 +61,7 @@ def checkpoints(
 ) -> None:
     """List a run's checkpoints; with --verify exit 1 where one is damaged."""
     with Client.connect() as client:
-        found = client.get(f"/api/runs/{run}/checkpoints", verify=verify)
+        found = client.get(f"/api/runs/{named(run)}/checkpoints", verify=verify)
     damaged = [each for each in found if each.get("problem")]
     if as_json:
         echo_json(found, indent=1)

@@ -51,8 +51,8 @@ def echo(text: str, err: bool = False) -> None:
 
 
 def echo_raw(text: str, err: bool = False) -> None:
-    """:func:`echo` for what is visible already, or is wanted as it is."""
-    print(text, file=sys.stderr if err else sys.stdout, flush=True)
+    """:func:`echo` for what is visible already, or is wanted as it is; one write, so that lines of others stay apart."""
+    print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

@@ -189,7 +189,9 @@ def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
     refused(["stop", "nonsense"], home, 2, "job nonsense does not exist")
     refused(["resume", "nonsense"], home, 2, "run nonsense does not exist")
     refused(["checkpoints", "nonsense"], home, 2, "run nonsense does not exist")
-    refused(["checkpoints", "../../etc"], home, 2, "")
+    for name in ("../../etc", "a/b", "..", "a b"):
+        refused(["checkpoints", name], home, 2, f"{name!r} names nothing; jobs and runs are named with letters")
+        refused(["show", name], home, 2, f"{name!r} names nothing")
 
 
 def test_a_run_that_no_spec_started_is_not_resumed_blindly(shared_server: Serving) -> None:
