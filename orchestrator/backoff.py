@@ -68,3 +68,9 @@ class Backoff:
             return False
         with self._lock:
             return self._troubles.pop(subject, None) is not None
+
+    def tidy(self, idle: float = 600.0) -> None:
+        """Forget what was not tried for ``idle`` seconds after its pause, such as the start of a job that ended otherwise."""
+        before = time.monotonic() - idle
+        with self._lock:
+            self._troubles = {subject: each for subject, each in self._troubles.items() if each.next >= before}

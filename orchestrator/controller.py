@@ -409,6 +409,7 @@ class Controller:
             self.writing.release()
 
     def _clear_away(self) -> None:
+        self._backoff.tidy()
         over = [Status.SUCCEEDED, Status.FAILED]
         with self.database.session() as session:
             for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
