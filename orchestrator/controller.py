@@ -277,10 +277,10 @@ class Controller:
     # -- admission ----------------------------------------------------------------------------------------------------
 
     def _admit(self) -> None:
-        """A scheduling pass, where something changed or time has passed, and the volumes have room."""
+        """A scheduling pass, where something changed or time has passed, and enough space is free."""
         shortage = self.disk.shortage()
         if self._short != (shortage is not None):
-            log.warning("%s", shortage or "the volumes have room again")
+            log.warning("%s", shortage or "the volumes have enough free space again")
             self._short = shortage is not None
         if shortage is not None:
             return

@@ -187,7 +187,7 @@ class Database:
         self.check()
 
     def _reserve(self) -> None:
-        """Have SQLite own room that nobody else on the volume can take: free pages in its file, and a write-ahead log as long as it
+        """Have SQLite own space that no other program on the volume can take: free pages in its file, and a write-ahead log as long as it
         grows between two checkpoints. With that a controller ends jobs, and records their ends, on a volume without a free byte.
         """
         try:

@@ -290,7 +290,7 @@ class Gangs:
             seen: dict[str, Any] = {"exitCode": end.exit_code, "reason": end.reason, "error": end.error} if end else {}
             if end and "stoppedAt" not in record:
                 seen["stoppedAt"] = stopped
-                if attempt.ending is None:  # by itself: nobody has ended the gang
+                if attempt.ending is None:  # by itself: no one ended the gang
                     gone = f"Host EC2 (instance {record['host']}) terminated."
                     seen["statusReason"] = gone if end.lost else AWS_EXITED
             if self.bus.met(job.id, attempt.number, record["index"]):

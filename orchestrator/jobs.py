@@ -74,10 +74,10 @@ class NodeEnd:
     lost: bool = False
     """Nobody saw the end: the node vanished, with its host as far as anyone knows."""
     asked: bool = False
-    """The node was told to end: why is to be found elsewhere."""
+    """The node ended on request: the cause lies elsewhere."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reason", excerpt(self.reason, LONGEST_REASON))  # an engine passes on what it was told
+        object.__setattr__(self, "reason", excerpt(self.reason, LONGEST_REASON))  # an engine passes on foreign text
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class Roster:
             self.version += 1
 
     def take_due(self, most: int | None = None) -> Sequence[str]:
-        """The jobs to be looked at once, oldest note first, at most so many; each is handed out once."""
+        """The jobs to be looked at once, oldest note first, at most so many; each is returned once."""
         with self._lock:
             due = list(islice(self._due, most))
             for job in due:

@@ -50,7 +50,7 @@ class Credential:
         return "Credential(…)"
 
     def prove(self, *parts: str) -> str:
-        """The proof that whoever has the secret says ``parts``."""
+        """The proof that a holder of the secret says ``parts``."""
         return _mac(self.secret, *parts)
 
     def proves(self, proof: object, *parts: str) -> bool:

@@ -74,7 +74,7 @@ def remove_group(group: str) -> None:
 
 
 def remove_abandoned_groups(directory: str) -> None:
-    """Remove groups of nodes below ``directory`` that are empty and not new: of shims that were killed, and nobody stopped the gang."""
+    """Remove groups of nodes below ``directory`` that are empty and not new: left by shims that were killed while no controller stopped the gang."""
     for entry in os.scandir(directory) if directory else ():
         with contextlib.suppress(OSError):  # the kernel refuses where a process is in it
             if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:

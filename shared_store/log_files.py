@@ -1,4 +1,4 @@
-"""The files of one node's log: a head, and behind it a tail of segments, of which the oldest are deleted at the limit.
+"""The files of one node's log: a head, and behind it a tail of segments; at the limit the oldest are deleted.
 
 ``node-0.log`` is the head, the first half of the limit. What follows goes into ``node-0.log.<start>.<lines>``, one file after
 the other: the position at which the file begins, and the number of lines between the head and it. Positions are bytes of the log
@@ -128,7 +128,7 @@ def read_log(
 
 
 def left_out(lines: int | None, size: int, why: str) -> str:
-    """What a reader is told in place of lines that it can't have.
+    """What a reader gets in place of lines that are gone.
 
     >>> left_out(123456, 1_200_000_000, "the log reached its limit")
     '… 123,456 lines (1.2 GB) left out: the log reached its limit'

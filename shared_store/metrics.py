@@ -74,7 +74,7 @@ def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:
 
 @lru_cache(maxsize=256)
 def history_of(run: Run) -> MetricsHistory:
-    """The run's history, with what is known of it from earlier looks: for whoever asks again and again."""
+    """The run's history, with what earlier looks found: for callers that ask again and again."""
     return MetricsHistory(run)
 
 

@@ -54,7 +54,7 @@ class Outcome:
 
 
 def first_cause(ends: Sequence[tuple[bool, float]]) -> int:
-    """Which of several failures made the others happen: the first by time of those that nobody asked for, else the first of all.
+    """Which of several failures made the others happen: the first by time of those that were not asked for, else the first of all.
 
     Args:
         ends: Of each failure whether it was asked to end, and when it ended (Unix time [s]). Not empty.
@@ -87,7 +87,7 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
 
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
-    """The outcome of which ``asdict`` made this, its texts bounded. Raises TypeError where it is damaged."""
+    """The outcome that ``asdict`` made this of, its texts bounded. Raises TypeError where it is damaged."""
     error = FirstError(**value["error"]) if value.get("error") else None
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)

@@ -43,7 +43,7 @@ class Rank:
         self.overdue = False
         """Killed because it did not leave in time."""
         self.asked = False
-        """It was told to end before it was seen to have ended: its end is not the cause of anything."""
+        """It was asked to end before it was seen to have ended: its end is not the cause of anything."""
         self.stuck: str | None = None
         """Names the processes of it that SIGKILL does not end, and where they are."""
         self.exit_code = 0

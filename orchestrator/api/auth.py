@@ -71,7 +71,7 @@ class Access:
             name = "anybody" if self.user is None else f"user {user_name(self.user)} of this machine"
             return f"open to {name}, without a key; `muster keys create NAME` lets others in, and then everybody needs a key"
         with_token = " or MUSTER_TOKEN" if self.token else ""
-        return f"open to those who have a key{with_token}; `muster keys list` shows the keys"
+        return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
 
 
 class Guard:

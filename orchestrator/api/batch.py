@@ -60,7 +60,7 @@ _INSTEAD = {
 
 
 _ADDING = ("Submit", "Register", "Create", "Tag")
-"""How operations begin that need room in the database; the others change or end what is there."""
+"""Prefixes of the operations that need room in the database; the others change or end what exists."""
 
 
 @cache

@@ -56,7 +56,7 @@ class Caller:
             if start >= 0:
                 # state, queues, timer, retransmits, uid, timeout, inode
                 fields = content[start:].split(b"\n", 1)[0].split()[2:]
-                if fields[6] != b"0":  # else nobody's any more
+                if fields[6] != b"0":  # else it has no owner any more
                     return int(fields[4])
         return None
 

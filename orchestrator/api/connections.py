@@ -103,7 +103,7 @@ class Connections:
             self._waiting.setdefault(connection.peer, {})[connection] = None
 
     def has_request(self, connection: Connection) -> None:
-        """It is being answered, and gives way to nobody."""
+        """It is being answered, and gives way to no other."""
         waiting = self._waiting.get(connection.peer, {})
         waiting.pop(connection, None)
         if not waiting:

@@ -85,7 +85,7 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
 
 
 def _check_owner(context: Context, name: str, operation: Operation) -> None:
-    """Refuse a name of which another key has registered a revision: jobs are submitted by the bare name."""
+    """Refuse a name that another key has registered: jobs are submitted by the bare name."""
     caller = permissions.current_identity.get().name
     foreign = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.owner.is_distinct_from(caller))
     permissions.check(operation, *context.session.scalars(foreign.limit(1)))

@@ -42,7 +42,7 @@ def foreign_service(method: str, path: str, query: bytes, headers: Mapping[str, 
         if target:
             return target.partition(".")[0][:40]
         if headers.get("content-type", "").startswith(_FORM):
-            return "sts"  # whose operations for those who have no credentials yet are not signed
+            return "sts"  # its operations for callers without credentials are not signed
     return None
 
 

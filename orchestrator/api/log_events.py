@@ -171,7 +171,7 @@ class View:
     """How often the log began: another number than at the look before says that it was truncated or replaced."""
 
     def replaced(self) -> Event:
-        """What a follower is told of a log that was truncated or replaced."""
+        """The event that a follower gets when a log was truncated or replaced."""
         return Event(self.top, self.file.source, 0, 0, self.file.stream, REPLACED)
 
     def forward(self, since: int = 0, start: int = 0) -> Iterator[Event]:

@@ -143,7 +143,7 @@ def resume(
         if earlier := _resumed(Context(session, controller, idempotency_key), run):
             return earlier
     chosen = _choose(run, checkpoint)  # reads all of a checkpoint: before anybody has to wait for it
-    controller.engine.capacity(patience=FRESH)  # before the lock: whoever holds it waits for no engine
+    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     controller.check_writable(adds=True)
     with controller.writing, controller.database.session() as session:
         context = Context(session, controller, idempotency_key)

@@ -45,7 +45,7 @@ def queues(
 
 
 def _take_snapshot(client: Client, queue: dict[str, Any], is_named: bool) -> bool:
-    """Add the queue's snapshot to it; False for a queue of others in a list of all, of which a key may not see the jobs."""
+    """Add the queue's snapshot to it; False for a queue in a list of all whose jobs the key may not see."""
     try:
         queue["snapshot"] = client.batch("GetJobQueueSnapshot", jobQueue=queue["jobQueueName"])
     except ApiError as error:

@@ -88,7 +88,7 @@ def own(bus: Bus) -> Credential:
 def settled(bus: Bus, session: zenoh.Session | None = None) -> None:
     """Returns when the controller has read what the session sent before: its own progress comes after that.
 
-    Without a session, where it was sent by one in the mode of a router, which does not learn that somebody reads progress.
+    Without a session, where it was sent by one in the mode of a router, which does not learn that the controller reads progress.
     """
     if session is None:
         time.sleep(0.3)

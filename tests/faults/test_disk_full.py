@@ -55,7 +55,7 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
             assert free(volume) > 10 << 20, "a flood does not fill the volume"
             filler = fill(volume)
             wait_for(lambda: "MB free" in server.detail(waiting)["statusReason"], 60, "the reason of what waits")
-            assert "--min-free" in server.detail(sleeper)["statusReason"], "who runs is told, too"
+            assert "--min-free" in server.detail(sleeper)["statusReason"], "a running job says so, too"
 
             batch = client_of(server.url, "batch")
             batch.terminate_job(jobId=sleeper, reason="make room")
@@ -80,7 +80,7 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
             copying.wait(10)
     said = (volume.parent / "stderr").read_text()
     assert "Traceback" not in said and len(said) < 4000, said
-    assert "MB free" in said and "the volumes have room again" in said
+    assert "MB free" in said and "the volumes have enough free space again" in said
     assert not processes_of(server.home)
 
 

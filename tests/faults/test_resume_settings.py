@@ -113,7 +113,7 @@ def test_an_adapted_rate_goes_on_unless_the_setting_changes(tmp_path: Path, caps
     assert adapted != pytest.approx(1e-3), "it was adapted"
     kept = go_on(tmp_path)
     assert float(kept.ppo.learning_rate_tensor) == torch.tensor(adapted) and kept.state.set_rate is None
-    # the task's own rate, now that somebody asks for it
+    # the task's own rate, now that it is asked for
     assert float(go_on(tmp_path, ppo={"learning_rate": 1e-3}).ppo.learning_rate_tensor) == pytest.approx(1e-3)
     changed = train(training(tmp_path, iterations=3, epoch=2, ppo={"learning_rate": 1e-4}))
     assert "learning rate set to 0.0001" in capsys.readouterr().out

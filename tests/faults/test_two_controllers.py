@@ -93,7 +93,7 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
         with pytest.raises(ApiError) as refused:
             second.gang(WAIT, env={"MUSTER_RUN": "shared", **end})
         assert "run shared is being " + named in str(refused.value)
-        assert first.detail(writer)["status"] == "RUNNING", "nobody fenced it"
+        assert first.detail(writer)["status"] == "RUNNING", "it was not fenced"
         (tmp_path / "end").touch()
         assert first.wait(writer)["status"] == "SUCCEEDED"
         next_ = second.gang("print('goes on')", env={"MUSTER_RUN": "shared"})

@@ -1,4 +1,4 @@
-"""Connections that send no request: they give way, and neither jobs nor those who follow a log notice them."""
+"""Connections that send no request: they give way, and neither jobs nor followers of a log notice them."""
 
 from __future__ import annotations
 

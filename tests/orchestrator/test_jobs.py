@@ -111,7 +111,7 @@ def test_the_ends_of_nodes_are_judged(
 
 
 ASKED = [
-    # what was told to end is the cause only where nothing else is; whoever is read first, and whatever the clocks say
+    # what was told to end is the cause only where nothing else is, in any order of reading, and whatever the clocks say
     ((RUNS, (143, 1.0, True)), "node 1: exit 143", False),
     ((RUNS, (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
     ((RUNS, (137, 2.0), (143, 1.0, True)), "node 1: exit 137", True),

@@ -62,7 +62,7 @@ def test_a_run_made_anew_under_an_old_name_belongs_to_its_new_creator(session: S
     first.status = "SUCCEEDED"
     session.commit()
     shutil.rmtree(run.path)
-    assert owner_of(session, run) is None, "nobody is refused a run that does not exist"
+    assert owner_of(session, run) is None, "no caller is refused a run that does not exist"
     second = submitted(session, "b", "lab", 2)
     assert known(owner_of(session, run)) == ("lab", "key lab"), "before it has started, too"
     record_owner(session, run, second)

@@ -44,7 +44,7 @@ def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch:
                 f"rank {rank} did not leave within 1 s of SIGTERM and was killed" for rank in (0, 1)
             ]
 
-            # somebody asks node 1's supervisor to leave, and rank 0 is killed: node 1 was first, and is not the cause
+            # node 1's supervisor is asked to leave, and rank 0 is killed: node 1 was first, and is not the cause
             found = wait_for(
                 lambda: len(f := {x["node"]: x["text"] for x in lines(asleep)}) == 2 and f, 60, "two nodes"
             )

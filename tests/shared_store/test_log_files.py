@@ -1,4 +1,4 @@
-"""A log keeps its head and its tail within its limit; followers get every line once, and are told what they can't have."""
+"""A log keeps its head and its tail within its limit; followers get every line once, and a count of those that are gone."""
 
 from __future__ import annotations
 

@@ -340,7 +340,7 @@ class Runner:
     def held_out_worlds(self) -> Task:
         """The worlds on which the policy is evaluated. All ranks call it.
 
-        They are those of training, of which each episode begins at a new random start, unless the worlds themselves were drawn at random:
+        They are those of training, whose episodes each begin at a new random start, unless the worlds themselves were drawn at random:
         then they are others, drawn from another seed.
         """
         worlds, began = self.task, max(0, self.state.progress.iteration - 1)

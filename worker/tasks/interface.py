@@ -23,7 +23,7 @@ class Observation:
     offset: float = 0.0
     """Value of the quantity that the policy sees as 0 [unit]."""
     kind: Literal["measured", "command", "previous_action"] = "measured"
-    """Whether a sensor gives it, whoever commands the robot, or the policy itself: its last action, clipped."""
+    """Where it comes from: a sensor, the operator, or the policy itself (its last action, clipped)."""
     range: tuple[float, float] | None = None
     """Least and greatest value in training, of a command [unit]."""
 
