@@ -175,6 +175,7 @@ class Node:
             if self._abandoned():
                 self._end()
                 os._exit(1)
+        self._end()  # a shim that was killed has left what it should have ended
         self._ended.set()
         while not self._abandoned():
             time.sleep(0.5)

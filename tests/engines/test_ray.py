@@ -253,13 +253,15 @@ def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
     assert bench.stopped(handle) == [143, 143, 143]
 
 
-def test_an_actor_that_is_killed_takes_what_its_rank_started_with_it(bench: Bench) -> None:
+@pytest.mark.parametrize("killed", ["actor", "shim"])
+def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(bench: Bench, killed: str) -> None:
     script = f"[ $NODE_RANK = 0 ] || {{ setsid sleep 577 & echo $! > $MUSTER_STORE/apart; }}; echo $PPID > $MUSTER_STORE/supervisor-$NODE_RANK; {WAIT}"
     handle = bench.ready(bench.gang(script, ("n1", "n2")))
     apart = int((bench.store.path / "apart").read_text())
     supervisor = int((bench.store.path / "supervisor-1").read_text())
     wait_for(lambda: os.getsid(apart) == apart, 5, "a session of its own")
-    os.kill(parent(supervisor), signal.SIGKILL)
+    shim = parent(supervisor)
+    os.kill(shim if killed == "shim" else parent(shim), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 30, "the node's end is seen")
     wait_for(lambda: not alive(apart), 10, "nothing of the node is left")
     assert bench.engine.observe(handle)[0].running, "the other node goes on"

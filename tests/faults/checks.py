@@ -19,7 +19,7 @@ from shared_store.metrics import read_metrics
 from tests.faults.home import Home
 from tests.faults.processes import processes_below
 
-_TIMING = ("time", "_seconds", "_per_second")
+_TIMING = ("time", "_seconds", "_per_second", "slowest_rank", "slowest_excess")
 """How the names of fields end that no two runs share."""
 _NOT_TRAINING = {"checkpoint", "seconds", "time"}
 """The same of an evaluation; the checkpoint's name has the epoch in it."""
