@@ -47,7 +47,7 @@ def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) ->
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
     assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
     wait_for(lambda: ranks(bench) == [nodes[b"2"]], 5, "its rank went with it")
-    step = parent(parents[nodes[b"2"]])
+    step = parent(parent(parents[nodes[b"2"]]))  # between them is the shim
     assert b"slurmstepd" in Path(f"/proc/{step}/cmdline").read_bytes()
     os.kill(step, signal.SIGKILL)
     wait_for(lambda: not ranks(bench), 5, "supervisor and rank went with it")
@@ -81,7 +81,7 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         assert bench.state(first) == "NODE_FAIL" and child.detail.startswith("Slurm lost a node of n[1-2] (job ")
         bench.engine.stop(first, 5.0)
         alive = bench.processes(b"worker.supervisor")
-        assert len(alive) == 1, "the supervisor on n2 lives on: Slurm can't reach it"
+        assert len(alive) == 2, "the shim and the supervisor on n2 live on: Slurm can't reach them"
         log = bench.run.log(bench.job, 1, 1)
         before = log.stat().st_size
         wait_for(lambda: log.stat().st_size > before, 10, "and it still writes")
