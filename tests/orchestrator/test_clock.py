@@ -135,4 +135,5 @@ def test_a_step_of_the_clock_ends_no_job_also_where_the_controller_starts_again(
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
     steps = [record.getMessage() for record in caplog.records if "the wall clock moved by" in record.getMessage()]
-    assert [step.split()[5] for step in steps][:3] == ["+7200", "-93600", "+97200"], steps
+    # another controller of this process sees the same steps
+    assert list(dict.fromkeys(step.split()[5] for step in steps))[:3] == ["+7200", "-93600", "+97200"], steps
