@@ -25,7 +25,7 @@ from orchestrator.definition import gang_needs
 from orchestrator.disk import DEFAULT, Disk, MinFree
 from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs, StoreUnavailable
-from orchestrator.jobs import Ending, Status
+from orchestrator.jobs import WAITING, Ending, Status
 from orchestrator.peers import Peers
 from orchestrator.roster import Roster
 from orchestrator.scheduling import Board, Cancel, Decisions, Leading, Preempt, Start, decide
@@ -250,7 +250,7 @@ class Controller:
                 others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
                 job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
             else:
-                job.move(Status.RUNNABLE, "waiting for the scheduler")
+                job.move(Status.RUNNABLE, WAITING)
         elif job.status == Status.RUNNABLE:
             gang_needs(job.node_properties)  # raises where the row is damaged, which is why the job is looked at
 

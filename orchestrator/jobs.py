@@ -10,6 +10,9 @@ from typing import Any
 from orchestrator.excerpts import LONGEST_REASON, excerpt
 from shared_store.outcomes import EX_TEMPFAIL, first_cause
 
+WAITING = "waiting for the scheduler"
+"""Why a job is RUNNABLE that no pass has looked at yet."""
+
 
 class Status(StrEnum):
     """State of a job (AWS Batch user guide, "Job states")."""

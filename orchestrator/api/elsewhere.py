@@ -1,7 +1,7 @@
 """Answers to AWS services that are not here (S3, STS, IAM, EC2, ECS …), in each one's own form of an error.
 
-``AWS_ENDPOINT_URL`` sends every service to one address. A client that gets an answer of another protocol says something that helps
-nobody, so each is told in its own: which service it is speaking to, and how to have only Batch and CloudWatch Logs come here.
+``AWS_ENDPOINT_URL`` sends every service to one address. A client that gets an answer of another protocol prints an error that helps
+no one, so each gets one in its own: which service it has reached, and how to send only Batch and CloudWatch Logs here.
 """
 
 from __future__ import annotations

@@ -30,12 +30,12 @@ from orchestrator.api.limits import check_size
 from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
 from orchestrator.api.log_streams import Stream, find_stream, newest_streams
+from orchestrator.api.members import LOG_GROUP
 from orchestrator.api.permissions import Operation, Refusal, check
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, Job, now
 
-GROUP = "/aws/batch/job"
-GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{GROUP}"
+GROUP_ARN = f"arn:aws:logs:{REGION}:{ACCOUNT}:log-group:{LOG_GROUP}"
 SETTLE = 500
 """Milliseconds for which FilterLogEvents keeps back the newest lines of running gangs.
 
@@ -250,14 +250,14 @@ def describe_log_groups(controller: Controller, request: dict[str, Any]) -> dict
         raise invalid("logGroupNamePrefix and logGroupNamePattern are mutually exclusive.")
     if request.get("nextToken"):
         raise invalid("The specified nextToken is invalid.")
-    wanted = GROUP.startswith(prefix or "") and (pattern or "") in GROUP
+    wanted = LOG_GROUP.startswith(prefix or "") and (pattern or "") in LOG_GROUP
     if identifiers := request.get("logGroupIdentifiers"):
         wanted = wanted and any(_is_group(identifier) for identifier in identifiers)
     if not wanted or request.get("logGroupClass", "STANDARD") != "STANDARD":
         return {"logGroups": []}
     with controller.database.session() as session:
         created = session.scalar(select(func.min(Job.created_at))) or 0
-    group: dict[str, Any] = {"logGroupName": GROUP, "creationTime": created, "arn": f"{GROUP_ARN}:*"}
+    group: dict[str, Any] = {"logGroupName": LOG_GROUP, "creationTime": created, "arn": f"{GROUP_ARN}:*"}
     if pattern is None:
         group |= {"metricFilterCount": 0, "storedBytes": 0, "logGroupClass": "STANDARD", "logGroupArn": GROUP_ARN}
     return {"logGroups": [group]}
@@ -288,7 +288,7 @@ def start_live_tail(controller: Controller, closing: threading.Event, request: d
     start = {"logGroupIdentifiers": [GROUP_ARN], "logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
     tail = LiveTail(controller, asked_for, matches)
-    stream = messages(tail, start, f"{ACCOUNT}:{GROUP}", closing)
+    stream = messages(tail, start, f"{ACCOUNT}:{LOG_GROUP}", closing)
     return StreamingResponse(stream, media_type="application/vnd.amazon.eventstream")
 
 
@@ -296,12 +296,12 @@ def start_live_tail(controller: Controller, closing: threading.Event, request: d
 
 
 def _is_group(reference: str) -> bool:
-    return reference in (GROUP, GROUP_ARN, f"{GROUP_ARN}:*")
+    return reference in (LOG_GROUP, GROUP_ARN, f"{GROUP_ARN}:*")
 
 
 def _no_group(reference: str) -> LogsError:
     return LogsError(
-        "ResourceNotFoundException", f"The specified log group does not exist: {reference}; there is {GROUP}"
+        "ResourceNotFoundException", f"The specified log group does not exist: {reference}; there is {LOG_GROUP}"
     )
 
 

@@ -21,7 +21,7 @@ from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.database import note_changed
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.job_secrets import SecretsError
-from orchestrator.jobs import Status
+from orchestrator.jobs import WAITING, Status
 from orchestrator.ownership import owner_of
 from orchestrator.pools import queue_engines
 from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, RunRecord, now
@@ -29,7 +29,6 @@ from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
 _ARRAY_SIZES = range(2, 10_001)
-WAITING = "waiting for the scheduler"
 _KEY = re.compile(r"[\x21-\x7e]{1,128}")
 
 
