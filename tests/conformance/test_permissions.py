@@ -11,7 +11,7 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from orchestrator.api import batch, logs, native
+from orchestrator.api import batch, logs, members, native
 from orchestrator.api.app import create_app
 from orchestrator.api.permissions import HIDDEN, Operation
 from orchestrator.client import ApiError
@@ -104,7 +104,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         """The name of a new definition of the key ``robots``."""
         return world.register("robots", world.fresh()).rpartition("/")[2].partition(":")[0]
 
-    group, order = {"logGroupName": logs.GROUP}, [{"order": 1, "computeEnvironment": "local"}]
+    group, order = {"logGroupName": members.LOG_GROUP}, [{"order": 1, "computeEnvironment": "local"}]
     job = {"jobName": "x", "jobQueue": "robots", "jobDefinition": world.definition}
     disabled = {"type": "UNMANAGED", "state": "DISABLED"}
     of = Operation

@@ -82,7 +82,7 @@ def test_every_job_that_waits_says_what_it_needs_and_for_whom_it_waits(
     )
     said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
     assert "the largest host has 8 CPUs, " in said
-    assert batch.describe(pending)["statusReason"] == f"waits for the success of job {head}"
+    assert batch.reason(pending, "waits for the success") == f"waits for the success of job {head}"
     listed = {
         each["jobId"]: each["statusReason"]
         for each in batch.api.list_jobs(jobQueue="q-low", jobStatus="RUNNABLE")["jobSummaryList"]

@@ -328,8 +328,8 @@ def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobo
             waiting = submit_gang(client, "print('at last')")
             [listed] = client.batch("ListJobs", jobQueue="default", jobStatus="RUNNABLE")["jobSummaryList"]
             assert listed["jobId"] == waiting
-            reason = detail(client, waiting)["statusReason"]
-            assert f"the volume of the store ({inside.store.path}) has not answered since 20" in reason, reason
+            missing = f"the volume of the store ({inside.store.path}) has not answered since 20"
+            wait_for(lambda: missing in detail(client, waiting)["statusReason"], 30, "the reason why it waits")
             answers.set()
             await_status(client, waiting, "SUCCEEDED")
     finally:
