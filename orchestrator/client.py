@@ -44,6 +44,10 @@ class Unreachable(Exception):
     """No controller answers; the message says where one was looked for and how to start one."""
 
 
+class NoUrl(Unreachable):
+    """The address that was given is not that of a controller."""
+
+
 class NotServing(ApiError, Unreachable):
     """The controller answers that it can't serve now (503), and why; followers wait for it as for one that is away."""
 
@@ -71,9 +75,9 @@ class Client:
     """Requests to one controller."""
 
     def __init__(self, url: str, token: str | None = None) -> None:
-        """Raises Unreachable where ``url`` is none."""
+        """Raises NoUrl where ``url`` is none."""
         if not _is_url(url):
-            raise Unreachable(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {DEFAULT_URL}")
+            raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {DEFAULT_URL}")
         self.url = url
         self._found = False
         self.successor: Callable[[], Client] | None = None

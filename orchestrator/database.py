@@ -390,11 +390,17 @@ def _tune_sqlite(connection: Any, _record: object) -> None:
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one).
 
+    ``REFERENCE:3`` is the child with index 3 of the array that is found so.
+
     ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
     """
     job = session.get(Job, reference)
     if job:
         return job
+    array, colon, index = reference.rpartition(":")
+    if colon:
+        parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
+        return session.get(Job, f"{parent.id}:{index}") if parent else None
     among = select(Job).where(Job.parent.is_(None))
     if queues is not None:
         among = among.where(Job.queue.in_(queues))

@@ -28,6 +28,10 @@ class ServerError(Exception):
     """A controller can't start; the message says why and what to do."""
 
 
+class UsageError(ServerError):
+    """An option or argument can't be used; the message says why and what to give instead."""
+
+
 def muster_home() -> Path:
     """``$MUSTER_HOME``, by default ``~/.muster``: database, store and kernel cache."""
     return Path(os.environ.get("MUSTER_HOME") or "~/.muster").expanduser().absolute()

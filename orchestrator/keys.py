@@ -20,7 +20,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_camel
 
-from orchestrator.home import ServerError
+from orchestrator.home import ServerError, UsageError
 from shared_store.files import sync_directory
 from shared_store.layout import NAME
 
@@ -34,6 +34,10 @@ log = logging.getLogger("muster.keys")
 
 class KeysError(ServerError):
     """keys.json can't be used, or a key can't be made or deleted; the message says why and what to do."""
+
+
+class KeyUsageError(KeysError, UsageError):
+    """The name of a key or of its queue can't be used."""
 
 
 class _Document(BaseModel):
@@ -128,10 +132,10 @@ class KeyStore:
     def create(self, name: str, queues: tuple[str, ...] | None = None, read_only: bool = False) -> Key:
         """Add a key with a new pair. Raises KeysError."""
         if not NAME.fullmatch(name):
-            raise KeysError(f"key name {name!r}: 1 to 128 letters, digits, '.', '_' and '-', a letter or digit first")
+            raise KeyUsageError(f"key name {name!r}: 1 to 128 letters, digits, '.', '_' and '-', a letter or digit first")
         for queue in queues or ():
             if not NAME.fullmatch(queue):
-                raise KeysError(f"--queue {queue!r}: give the name of a queue, such as default")
+                raise KeyUsageError(f"--queue {queue!r}: give the name of a queue, such as default")
         key = Key(
             name=name,
             access_key_id="MSTR" + "".join(secrets.choice(_ID_LETTERS) for _ in range(16)),
@@ -143,7 +147,7 @@ class KeyStore:
 
         def add(keys: list[Key]) -> list[Key]:
             if any(each.name == name for each in keys):
-                raise KeysError(
+                raise KeyUsageError(
                     f"there is a key {name} already; choose another name, or first: muster keys delete {name}"
                 )
             return [*keys, key]
@@ -157,7 +161,7 @@ class KeyStore:
         def remove(keys: list[Key]) -> list[Key]:
             if all(each.name != name for each in keys):
                 there = ", ".join(each.name for each in keys) or "no key"
-                raise KeysError(f"there is no key {name!r}; there is {there}")
+                raise KeyUsageError(f"there is no key {name!r}; there is {there}")
             return [each for each in keys if each.name != name]
 
         self._change(remove)

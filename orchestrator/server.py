@@ -27,7 +27,7 @@ from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.local_gangs import running_gangs
 from orchestrator.engines.several import Several
-from orchestrator.home import HomeLock, ServerError
+from orchestrator.home import HomeLock, ServerError, UsageError
 from orchestrator.job_secrets import Secrets, SecretsError
 from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers
@@ -221,12 +221,12 @@ def _check_token(token: str | None) -> None:
 
 
 def _check_proxies(addresses: Sequence[str]) -> None:
-    """Raises ServerError for what is neither an address nor a network."""
+    """Raises UsageError for what is neither an address nor a network."""
     for address in addresses:
         try:
             ipaddress.ip_network(address)
         except ValueError as error:
-            raise ServerError(
+            raise UsageError(
                 f"--trust-proxy: {error}; give the proxy's address or network, such as 10.0.0.7 or 10.0.0.0/24"
             ) from None
 

@@ -10,6 +10,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.arns import plain_name
+from orchestrator.api.damaged import DamagedRow
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.controller import Controller
@@ -52,9 +53,12 @@ class Context:
         return found
 
     def definition_of(self, job: Job) -> JobDefinition:
-        """The definition of a job, active or not."""
+        """The definition of a job, active or not. Raises DamagedRow where the database has lost it."""
         name, _, revision = plain_name(job.definition, "job-definition").partition(":")
-        return self.session.get_one(JobDefinition, (name, int(revision)))
+        definition = self.session.get(JobDefinition, (name, int(revision)))
+        if definition is None:
+            raise DamagedRow(job)
+        return definition
 
     def run(self, name: str) -> Run:
         """The run of that name, whether it exists or not. Raises ClientError where no run can have it."""

@@ -23,6 +23,7 @@ from orchestrator.api.context import permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.submission import sources_of
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, find_job
@@ -34,6 +35,7 @@ from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import needs as needed
+from orchestrator.spec import KINDS
 from orchestrator.tables import Attempt, Job, JobQueue
 from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower, LogLine, timestamp
@@ -113,6 +115,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
+        for source in sources_of(needs):
+            permitted_run(controller, source, Operation.READ_RUN)
         found = fit_in_queue(session, controller.engine, queue, needs.shape, FRESH)
         if found.seat is None:
             raise ClientError(
@@ -207,9 +211,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "name": job.name,
                 "owner": job.owner,
                 "run": job.run,
-                "kind": next(
-                    (k for k in ("train", "evaluate", "export", "command") if (needs.spec or {}).get(k)), "command"
-                ),
+                "kind": next((kind for kind in KINDS if (needs.spec or {}).get(kind)), "command"),
                 "status": job.status,
                 "statusReason": controller.reason(job) or job.status_reason,
                 "queue": job.queue,
@@ -252,9 +254,8 @@ def job_logs(
             )
         follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, _positions(positions))
         job_id = job.id
-    closing: threading.Event = request.app.state.closing
     lines: AsyncIterator[str] | Iterator[str]
-    lines = _follow(controller, job_id, follower, closing) if follow else _stored(follower)
+    lines = _follow(controller, job_id, follower, request.app.state.closing) if follow else _stored(follower)
     return StreamingResponse(lines, media_type="application/x-ndjson")
 
 

@@ -184,15 +184,20 @@ def _check_run(context: Context, run: str, named: bool) -> None:
 def _check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> None:
     """The runs that a job from YAML evaluates or exports are there, unless it waits for a job that makes them.
 
-    The caller may read them. Each node reads the spec of its own environment, so all of them are looked at.
+    The caller may read them.
     """
-    specs = {node.environment.get("MUSTER_SPEC", "") for node in needs.nodes}
-    for source in sorted({run for text in specs for run in _sources(text)}):
+    for source in sources_of(needs):
         if not is_waiting:
             find_run(context.controller, source)
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source)) or nobodys)
+
+
+def sources_of(needs: GangNeeds) -> list[str]:
+    """Names of the runs that a job evaluates or exports; each node reads the spec of its own environment."""
+    specs = {node.environment.get("MUSTER_SPEC", "") for node in needs.nodes}
+    return sorted({run for text in specs for run in _sources(text)})
 
 
 def _sources(spec: str) -> Iterator[str]:

@@ -11,8 +11,8 @@ import typer
 
 from orchestrator.cli import aws, doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
 from orchestrator.cli.terminal import echo, log_visibly, one_line
-from orchestrator.client import ApiError, Unreachable
-from orchestrator.home import ServerError
+from orchestrator.client import ApiError, NoUrl, Unreachable
+from orchestrator.home import ServerError, UsageError
 from orchestrator.spec import SpecError
 from shared_store import __version__
 from shared_store.layout import StoreError
@@ -58,7 +58,7 @@ def main() -> None:
     log_visibly()
     try:
         app()
-    except SpecError as error:
+    except (SpecError, UsageError, NoUrl) as error:
         _fail(error, 2)
     except ApiError as error:
         _fail(error, 2 if error.status in (400, 404) else 1)

@@ -28,7 +28,10 @@ SetOption = Annotated[
 ]
 SpecArgument = Annotated[str, typer.Argument(help="A job YAML, such as job_specs/cartpole.yaml.")]
 JobArgument = Annotated[
-    str, typer.Argument(help="Job id, the first letters of one (4 or more), or a job name (the newest).")
+    str,
+    typer.Argument(
+        help="Job id, the first letters of one (4 or more), or a job name (the newest); of an array's child with :INDEX."
+    ),
 ]
 
 _PATIENCE = 3.0
@@ -104,8 +107,7 @@ def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
 
 def engine_queue(client: Client, engine: str) -> str:
     """The queue of an engine. Raises SpecError where the controller does not have it."""
-    if engine not in ENGINES:
-        raise SpecError(f"--engine {engine}: there is no such engine; there are {', '.join(ENGINES)}")
+    check_engine(engine)
     queues: dict[str, str] = client.get("/api/capacity")["engines"]
     if engine not in queues:
         raise SpecError(
@@ -113,6 +115,12 @@ def engine_queue(client: Client, engine: str) -> str:
             + " ".join(f"--engine {name}" for name in (*queues, engine))
         )
     return queues[engine]
+
+
+def check_engine(name: str) -> None:
+    """Raises SpecError for a name that no engine has."""
+    if name not in ENGINES:
+        raise SpecError(f"--engine {name}: there is no such engine; there are {', '.join(ENGINES)}")
 
 
 def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
@@ -196,6 +204,11 @@ def _nodes(summary: dict[str, Any]) -> str:
     return str(summary.get("nodeProperties", {}).get("numNodes", 1))
 
 
+def _counted(summary: dict[str, int]) -> str:
+    """The children of an array by state."""
+    return ", ".join(f"{count} {status}" for status, count in summary.items() if count)
+
+
 def _used(attempt: dict[str, Any]) -> str:
     """GPU time of an attempt (CPU time where it has no GPUs), and how much of it was lost."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
@@ -235,6 +248,10 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
     }
     results = detail["results"] or {}
+    array = detail["job"].get("arrayProperties", {})
+    if "statusSummary" in array:  # its children have runs and nodes, the array has none
+        facts["run"] = None
+        facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"

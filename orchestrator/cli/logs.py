@@ -44,9 +44,11 @@ def logs(
     except re.error as error:
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour = sys.stdout.isatty()
+    came = False
     with Client.connect() as client:
         client.told = lambda line: echo(line, err=True)
         for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
+            came = True
             shown = [
                 to_json(line) if as_json else _format(line, colour, raw)
                 for line in lines
@@ -54,6 +56,10 @@ def logs(
             ]
             if shown:
                 echo_raw("\n".join(shown))
+    if not came and not as_json:
+        asked = {"node": node, "rank": rank, "attempt": attempt}
+        of = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
+        echo(f"job {job} has no log lines{f' of {of}' if of else ''}; muster show {job} has its attempts and nodes", err=True)
 
 
 def _format(line: dict[str, Any], colour: bool, raw: bool) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from orchestrator import specfile
-from orchestrator.cli.jobs import SetOption, SpecArgument, on_engine, submit_spec
+from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, NotServing, Unreachable
@@ -52,6 +52,8 @@ def run(
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
     loaded = specfile.load(spec, set_)
+    for name in engine or ():
+        check_engine(name)
     with controller(store, cpus, engine or ()) as connect:
         client = connect()
         if engine:
@@ -125,6 +127,8 @@ def serve(
     """Run the controller as a server. Running jobs outlive it; the next one finds them."""
     from orchestrator.server import Server  # imports what only a controller needs
 
+    for name in engine or ():
+        check_engine(name)
     server = Server(
         muster_home(),
         host=host,

@@ -56,7 +56,7 @@ def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -
 def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
     KeyStore(tmp_path).create("a")
     done = run_muster("keys", *arguments, home=tmp_path)
-    assert done.returncode == 1 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
+    assert done.returncode == 2 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
     assert [each.name for each in KeyStore(tmp_path).load().values()] == ["a"]
 
 

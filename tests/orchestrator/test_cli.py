@@ -19,6 +19,8 @@ import pytest
 from orchestrator.cli.jobs import _gpus
 from tests.conftest import MUSTER, REPOSITORY, Serving, call_muster, run_muster, wait_for
 
+REQUIREMENTS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
+
 
 def refused(arguments: list[str], home: Path, code: int, *parts: str, **env: str) -> None:
     """The command exits with ``code`` and one line on stderr that holds all ``parts``."""
@@ -138,9 +140,17 @@ def test_commands_without_a_controller_say_how_to_start_one(tmp_path: Path) -> N
         refused(["list"], tmp_path, 1, f"no controller answers at {url}", "muster serve", MUSTER_URL=url)
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://"])
-def test_what_is_no_url_is_said(tmp_path: Path, url: str) -> None:
-    refused(["list"], tmp_path, 1, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
+@pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://", "ftp://x"])
+def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> None:
+    refused(["list"], tmp_path, 2, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
+
+
+@pytest.mark.parametrize(
+    ("option", "part"),
+    [(["--engine", "rya"], "there is no such engine; there are local"), (["--trust-proxy", "x"], "give the proxy's")],
+)
+def test_an_option_that_serve_cannot_use_is_wrong_use(tmp_path: Path, option: list[str], part: str) -> None:
+    refused(["serve", "--port", "0", *option], tmp_path, 2, option[0], part)
 
 
 def test_an_engine_that_does_not_exist_is_not_recommended(shared_server: Serving) -> None:
@@ -228,6 +238,37 @@ def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server
     assert stopped.returncode == 0 and "ended: stopped by the user" in stopped.stdout
     assert json.loads(shared_server.muster("show", "greeter", "--json").stdout)["status"] == "FAILED"
     assert "FAILED already" in shared_server.muster("stop", "greeter").stdout
+
+
+def test_a_log_that_holds_nothing_of_what_was_asked_for_says_so(shared_server: Serving) -> None:
+    job = shared_server.gang("print('here')", name="brief")
+    shared_server.wait(job)
+    for option, part in ((["--attempt", "9"], "attempt 9"), (["--rank", "77"], "rank 77")):
+        done = shared_server.muster("logs", "brief", *option)
+        assert done.stdout == "" and f"job brief has no log lines of {part}; muster show brief" in done.stderr
+
+
+def test_a_plan_of_a_run_that_is_not_there_is_refused_as_its_submission_is(shared_server: Serving, tmp_path: Path) -> None:
+    spec = tmp_path / "job.yaml"
+    spec.write_text("name: judge\nevaluate: {run: nosuch}\n")
+    for option in ([], ["--dry-run"]):
+        refused(["submit", str(spec), *option], shared_server.home, 2, "run nosuch does not exist")
+
+
+def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_server: Serving) -> None:
+    container = {"image": "any", "command": ["true"], "resourceRequirements": REQUIREMENTS}
+    client = shared_server.client
+    client.batch("RegisterJobDefinition", jobDefinitionName="many", type="container", containerProperties=container)
+    array = client.batch(
+        "SubmitJob", jobName="many", jobQueue="default", jobDefinition="many", arrayProperties={"size": 3}
+    )["jobId"]
+    shared_server.wait(array)
+    shown = shared_server.muster("show", "many").stdout
+    assert f"children:   3: 3 SUCCEEDED; muster show {array[:8]}:0" in shown and "run:" not in shown
+    for reference in ("many:2", f"{array[:8]}:2", f"{array}:2"):
+        assert f"{array}:2" in shared_server.muster("show", reference).stdout
+    for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):
+        refused(["show", missing], shared_server.home, 2, f"job {missing} does not exist")
 
 
 def test_the_all_reduce_example_needs_no_muster_import(shared_server: Serving) -> None:

@@ -132,6 +132,9 @@ def test_a_damaged_row_answers_for_itself_alone(
         listed = {each["jobId"]: each for each in answer.json()["jobSummaryList"]}
         described = http.post("/v1/describejobs", json={"jobs": [broken, f"{broken}#0", whole]}).json()["jobs"]
         assert described[2:] == before and "container" in listed[whole]
+        streams = {"X-Amz-Target": "Logs_20140328.DescribeLogStreams"}
+        named = http.post("/", json={"logGroupName": "/aws/batch/job"}, headers=streams)
+        assert named.status_code == 200 and f"whole/{whole}/1/node-0" in named.text, named.text
         for each in (listed[broken], *described[:2]):
             assert (each["jobName"], each["status"]) == ("broken", "SUCCEEDED")
             assert each["statusReason"].endswith("; the job's row in the database is damaged")
@@ -145,6 +148,23 @@ def test_a_damaged_row_answers_for_itself_alone(
         assert all(http.get(f"/api/{path}").status_code == 200 for path in (f"jobs/{whole}", "runs", f"runs/{run}"))
     finally:
         change(home, f"UPDATE {table} SET {column} = ? WHERE {key} = ?", kept, broken)
+
+
+def test_a_job_whose_definition_is_gone_from_the_database_answers_for_itself_alone(
+    inside: Server, http: httpx.Client, ended: tuple[str, str]
+) -> None:
+    broken, whole = ended
+    home = Path(str(inside.controller.database.volume))
+    [[kept]] = change(home, "SELECT definition FROM jobs WHERE id = ?", broken)
+    change(home, "UPDATE jobs SET definition = 'gone:9' WHERE id = ?", broken)
+    try:
+        answer = http.post("/v1/describejobs", json={"jobs": [broken, whole]})
+        assert answer.status_code == 200, answer.text
+        first, second = answer.json()["jobs"]
+        assert first["statusReason"].endswith("; the job's row in the database is damaged")
+        assert second["jobId"] == whole and "damaged" not in second.get("statusReason", "")
+    finally:
+        change(home, "UPDATE jobs SET definition = ? WHERE id = ?", kept, broken)
 
 
 def status_reason(home: Path, job_id: str) -> str:
