@@ -258,7 +258,9 @@ def write_config(home: Path, stack: Stack, endpoint_url: str | None) -> Path:
     kept: dict[str, Any] = {}
     try:
         before = json.loads(config_path(home).read_text())
-        kept = {key: before[key] for key in ("poll", "instance_type", "share", "store_is_shared") if key in before}
+        kept = {
+            key: before[key] for key in ("poll", "quiet", "instance_type", "share", "store_is_shared") if key in before
+        }
     except (OSError, ValueError, TypeError):
         pass
     config = AwsConfig(

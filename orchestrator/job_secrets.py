@@ -29,17 +29,17 @@ class Secrets:
     def __init__(self, source: str | None = None, environment: MutableMapping[str, str] = os.environ) -> None:
         """Args:
         source: Path of a JSON file that maps names to values, or to ``{"value": …, "queues": […]}`` for jobs of these queues
-            alone; ``env`` for the variables ``MUSTER_SECRET_<name>`` of ``environment``,
-            from which they are removed; None to give no job any.
+            alone; ``env`` for the variables ``MUSTER_SECRET_<name>`` of ``environment``; None to give no job any.
+        environment: Loses these variables in any case: processes of jobs would inherit them.
 
         Raises SecretsError where the file can't be used.
         """
         self._file = Path(source).expanduser() if source not in (None, "env") else None
         self._allowed = source is not None
         self._given: dict[str, str] = {}
+        named = {name: environment.pop(name) for name in list(environment) if name.startswith(_PREFIX)}
         if source == "env":
-            for name in [name for name in environment if name.startswith(_PREFIX)]:
-                self._given[name.removeprefix(_PREFIX)] = environment.pop(name)
+            self._given = {name.removeprefix(_PREFIX): value for name, value in named.items()}
         self._read()
 
     def of(self, container: Mapping[str, Any], queue: str) -> dict[str, str]:

@@ -132,7 +132,9 @@ class KeyStore:
     def create(self, name: str, queues: tuple[str, ...] | None = None, read_only: bool = False) -> Key:
         """Add a key with a new pair. Raises KeysError."""
         if not NAME.fullmatch(name):
-            raise KeyUsageError(f"key name {name!r}: 1 to 128 letters, digits, '.', '_' and '-', a letter or digit first")
+            raise KeyUsageError(
+                f"key name {name!r}: 1 to 128 letters, digits, '.', '_' and '-', a letter or digit first"
+            )
         for queue in queues or ():
             if not NAME.fullmatch(queue):
                 raise KeyUsageError(f"--queue {queue!r}: give the name of a queue, such as default")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
+import re
 import socket
 import threading
 from collections.abc import Sequence
@@ -40,6 +41,7 @@ log = logging.getLogger("muster.controller")
 SHORTEST_TOKEN = 16
 """Characters of a token that lets its bearer do everything."""
 _FEWEST_CHARACTERS = 6
+_CLIENT = re.compile(r"(MSTR[A-Z2-7]{16}):")
 _INVALID = Seldom("Invalid HTTP request received")
 _NO_DESCRIPTOR = Seldom("socket.accept() out of system resource")
 """What any client can have uvicorn and asyncio log at any rate."""
@@ -212,7 +214,12 @@ def _check_exposure(option: str, access: Access) -> None:
 
 
 def _check_token(token: str | None) -> None:
-    """Raises ServerError for a token that can be guessed."""
+    """Raises ServerError for a token that can be guessed, and for a client's key: it would be let in to do everything."""
+    if token and (client := _CLIENT.match(token)):
+        raise ServerError(
+            f"MUSTER_TOKEN is the key {client[1]} of a client, which could do everything here; unset it for `muster serve`, or "
+            "give the controller a token of its own"
+        )
     if token and (len(token) < SHORTEST_TOKEN or len(set(token)) < _FEWEST_CHARACTERS):
         raise ServerError(
             f"MUSTER_TOKEN is too easy to guess: use at least {SHORTEST_TOKEN} characters, {_FEWEST_CHARACTERS} of them different, "

@@ -20,11 +20,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from shared_store.contract import NodeContract, sealed
+from shared_store.ports import free_port
 from shared_store.shim import shimmed
 from worker.network import address_towards
-
-_PORTS, _SLOTS, _EACH = 20000, 600, 20
-"""Below the ports that the kernel hands out: 600 jobs in a row each have 20 of their own, so that two on one host do not meet."""
 
 
 def meet() -> str:
@@ -37,7 +35,7 @@ def meet() -> str:
     far = next((a for a in addresses if not ipaddress.ip_address(a).is_loopback), None)
     if far is not None and ipaddress.ip_address(addresses[0]).is_loopback:
         addresses[0] = address_towards(far)
-    return json.dumps({"nodes": names, "addresses": addresses, "port": _free_port(int(os.environ["SLURM_JOB_ID"]))})
+    return json.dumps({"nodes": names, "addresses": addresses, "port": free_port(os.environ["SLURM_JOB_ID"])})
 
 
 def _lines(*command: str) -> list[str]:
@@ -45,19 +43,6 @@ def _lines(*command: str) -> list[str]:
     if done.returncode:
         raise OSError(f"{' '.join(command)}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout.splitlines()
-
-
-def _free_port(job: int) -> int:
-    first = _PORTS + job % _SLOTS * _EACH
-    for port in range(first, first + _EACH):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("", port))
-                return port
-            except OSError:
-                continue
-    raise OSError(f"no free port from {first} to {first + _EACH - 1}")
 
 
 def node_index(task: int, main: int) -> int:
@@ -85,7 +70,8 @@ def contract_of(told: Mapping[str, Any], meeting: Mapping[str, Any], task: int) 
 
 
 def environment_of(told: Mapping[str, Any], contract: NodeContract, given: Mapping[str, str]) -> dict[str, str]:
-    """What Slurm gave, under what the job says, under the contract."""
+    """What Slurm gave, under what the job says, under the contract; without the token with which the controller called ``sbatch``."""
+    given = {name: value for name, value in given.items() if name != "SLURM_JWT"}
     return {
         "CUDA_VISIBLE_DEVICES": "",  # Slurm sets it where it gave GPUs, and does not hide them where it gave none
         **given,

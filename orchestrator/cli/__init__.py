@@ -64,9 +64,6 @@ def main() -> None:
         _fail(error, 2 if error.status in (400, 404) else 1)
     except (Unreachable, ServerError, StoreError) as error:
         _fail(error, 1)
-    except BrokenPipeError:  # `muster logs … | head`
-        sys.stderr.close()
-        sys.exit(0)
     except KeyboardInterrupt:
         sys.exit(130)
 

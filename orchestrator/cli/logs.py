@@ -59,7 +59,10 @@ def logs(
     if not came and not as_json:
         asked = {"node": node, "rank": rank, "attempt": attempt}
         of = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
-        echo(f"job {job} has no log lines{f' of {of}' if of else ''}; muster show {job} has its attempts and nodes", err=True)
+        echo(
+            f"job {job} has no log lines{f' of {of}' if of else ''}; muster show {job} has its attempts and nodes",
+            err=True,
+        )
 
 
 def _format(line: dict[str, Any], colour: bool, raw: bool) -> str:

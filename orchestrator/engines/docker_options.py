@@ -14,7 +14,10 @@ _PERMISSIONS = {"READ": "r", "WRITE": "w", "MKNOD": "m"}
 
 
 def limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[str, Any]:
-    """Cores, memory and GPUs of a node, as Docker's options."""
+    """Cores, memory and GPUs of a node, as Docker's options.
+
+    ``/dev/shm`` has half of the memory, as on the engine aws-batch: Docker's 64 MiB are too few for NCCL between the ranks of a node.
+    """
     placement = node.placement
     options: dict[str, Any] = {
         "nano_cpus": int(min(placement.cpus, cores) * 1e9),
@@ -23,6 +26,7 @@ def limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[s
     if placement.gpus:
         options["device_requests"] = [DeviceRequest(device_ids=list(placement.gpus), capabilities=[["gpu"]])]
     parameters = container.get("linuxParameters") or {}
+    options["shm_size"] = f"{parameters.get('sharedMemorySize') or max(64, placement.memory // 2)}m"
     if (swap := parameters.get("maxSwap")) is not None:  # as on AWS, swappiness counts only beside it
         options["memswap_limit"] = f"{placement.memory + swap}m"
         options["mem_swappiness"] = parameters.get("swappiness", 60)
@@ -35,8 +39,6 @@ def linux(container: Mapping[str, Any]) -> dict[str, Any]:
     """What else ``containerProperties`` say, as Docker's options."""
     parameters = container.get("linuxParameters") or {}
     options: dict[str, Any] = {"init": bool(parameters.get("initProcessEnabled"))}
-    if size := parameters.get("sharedMemorySize"):
-        options["shm_size"] = f"{size}m"
     if tmpfs := parameters.get("tmpfs"):
         options["tmpfs"] = {
             entry["containerPath"]: ",".join([f"size={entry['size']}m", *(entry.get("mountOptions") or [])])

@@ -16,7 +16,6 @@ import pwd
 import re
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -43,6 +42,7 @@ from shared_store.contract import sealed
 from shared_store.layout import Store
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.outcomes import read_outcome
+from shared_store.ports import first_port, free_port
 from shared_store.processes import find_process, marked, unkillable
 from shared_store.shim import STUCK, group_of, shimmed
 
@@ -50,7 +50,6 @@ log = logging.getLogger("muster.engines")
 
 _ID = re.compile(r"[0-9]{1,10}")
 """A user or a group by its number."""
-_FIRST_PORT = 29500
 _UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
 """What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
 _REMEMBERED = 256
@@ -93,7 +92,7 @@ class LocalEngine:
 
     def plan(self, gang: Gang) -> Plan:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
-        nodes = node_plans(gang, addresses, _FIRST_PORT)
+        nodes = node_plans(gang, addresses, first_port(gang.name))
         for index, container in enumerate(gang.containers):
             if user := container.get("user"):
                 nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=_user(user)))
@@ -103,10 +102,9 @@ class LocalEngine:
         gang = plan.gang
         if gang.directory and not Path(gang.directory).is_dir():
             raise EngineError(f"working directory {gang.directory} is not on this machine")
-        master = plan.nodes[gang.main].contract.master_address
         found = _shims(gang.name)
         # a node that is started late must meet the others where they are
-        port = next((shim.port for shim in found.values()), 0) or _free_port(master)
+        port = next((shim.port for shim in found.values()), 0) or _port(gang.name)
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
         before = set(self._children)
@@ -250,17 +248,12 @@ def _address(gang: Gang, index: int) -> str:
     return f"127.{64 + digest[0] % 63}.{(digest[1] + index // 254) % 256}.{index % 254 + 1}"
 
 
-def _free_port(address: str) -> int:
-    """The first port from 29500 that nobody listens on at ``address``. Raises EngineError where there is none."""
-    for port in range(_FIRST_PORT, _FIRST_PORT + 200):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((address, port))
-                return port
-            except OSError:
-                continue
-    raise EngineError(f"no free port from {_FIRST_PORT} on {address}")
+def _port(gang: str) -> int:
+    """Where the nodes of a gang meet. Raises EngineError where no port is free."""
+    try:
+        return free_port(gang)
+    except OSError as error:
+        raise EngineError(str(error)) from None
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,13 @@ from orchestrator.engines.ray_bundles import in_words
 from orchestrator.engines.ray_cluster import Watch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray_folder import LEASE, NEW, Folder
 from shared_store.files import read_json, write_json
+from shared_store.ports import first_port
 
 DEFAULT_ADDRESS = "127.0.0.1:6379"
 _SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
 """Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
 _KEPT = 7 * 86400.0
 """Seconds for which a job's folder is kept when it is over."""
-_PORT = 29500
 
 
 class RayEngine:
@@ -132,7 +132,7 @@ class RayEngine:
         """With the placement group. Addresses of machines that are not there yet are empty; the port is chosen on the main node's."""
         machines = self._machines()
         addresses = [machines[p.host]["address"] if p.host in machines else "" for p in gang.placements]
-        plan = Plan(gang, node_plans(gang, addresses, _PORT))
+        plan = Plan(gang, node_plans(gang, addresses, first_port(gang.name)))
         return dataclasses.replace(plan, document=in_words(self._document(plan)))
 
     def launch(self, plan: Plan) -> str:

@@ -18,6 +18,7 @@ from orchestrator.engines.ray_folder import LEASE, Folder
 from shared_store import __version__
 from shared_store.contract import NodeContract
 from shared_store.files import write_json
+from shared_store.ports import first_port
 
 _BEAT = 2.0
 """Seconds between two signs of life to an actor."""
@@ -110,9 +111,9 @@ class Gang:
     def start(self, addresses: list[str]) -> None:
         """Start the supervisors, the main node's first. Waits for it."""
         main = self.plan["main"]
-        port = ray.get(self.actors[main].free_port.remote(addresses[main]), timeout=LEASE)
+        port = ray.get(self.actors[main].free_port.remote(self.name), timeout=LEASE)
         if not port:
-            self.fail(f"no free port from 29500 on {addresses[main]}")
+            self.fail(f"no free port from {first_port(self.name)} on {addresses[main]}")
             return
         for index in sorted(range(len(self.nodes)), key=lambda index: index != main):
             node = self.plan["nodes"][index]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-_FIRST_PORT, _PORTS = 29500, 500
 _OF_RAY = ("RAY_", "OMP_NUM_THREADS", "PYTHONBREAKPOINT", "SPT_NOENV", "GRPC_DEFAULT_SSL_ROOTS_FILE_PATH")
 """Variables of a Ray worker that its node's command does not get."""
 
@@ -66,14 +64,12 @@ class Node:
         problem = _foreign(store, run, epoch) if muster == version else ""
         return {"version": muster, "gpus": os.environ.get("CUDA_VISIBLE_DEVICES", ""), "problem": problem}
 
-    def free_port(self, address: str) -> int:
-        """The first port from 29500 that nobody listens on at ``address``; 0 where there is none."""
-        for port in range(_FIRST_PORT, _FIRST_PORT + _PORTS):
-            with socket.socket() as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                with contextlib.suppress(OSError):
-                    probe.bind((address, port))
-                    return port
+    def free_port(self, gang: str) -> int:
+        """Where the nodes of a gang meet, on this node's machine; 0 where no port is free."""
+        from shared_store.ports import free_port
+
+        with contextlib.suppress(OSError):
+            return free_port(gang)
         return 0
 
     def start(

@@ -159,6 +159,12 @@ def test_a_token_that_can_be_guessed_is_refused_at_the_start(tmp_path: Path, tok
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_client_s_key_is_not_taken_for_the_controller_s_own_token(tmp_path: Path) -> None:
+    key = KeyStore(tmp_path).create("wall", read_only=True)
+    with pytest.raises(ServerError, match=f"MUSTER_TOKEN is the key {key.access_key_id} of a client"):
+        Server(tmp_path, token=f"{key.access_key_id}:{key.secret}")
+
+
 def test_a_proxy_is_trusted_by_its_address_and_only_where_keys_are_demanded(tmp_path: Path) -> None:
     with pytest.raises(ServerError, match="--trust-proxy: 'proxy' does not appear"):
         Server(tmp_path, trusted_proxies=["proxy"])

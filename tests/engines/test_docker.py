@@ -192,6 +192,8 @@ def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: B
     gang = bench.gang("for i in 1 2 3 4 5 6; do echo line $i; sleep 0.3; done", 2)
     handle = bench.launch(gang)
     wait_for(lambda: bench.log(), 10, "the first line")
+    shared = {container.attrs["HostConfig"]["ShmSize"] for container in bench.engine._containers(gang.name).values()}
+    assert shared == {128 * 2**20}, "half of the memory"
     successor = bench.another()
     assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
     assert bench.left() == (2, 1)

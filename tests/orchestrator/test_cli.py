@@ -248,7 +248,18 @@ def test_a_log_that_holds_nothing_of_what_was_asked_for_says_so(shared_server: S
         assert done.stdout == "" and f"job brief has no log lines of {part}; muster show brief" in done.stderr
 
 
-def test_a_plan_of_a_run_that_is_not_there_is_refused_as_its_submission_is(shared_server: Serving, tmp_path: Path) -> None:
+def test_a_log_whose_reader_has_had_enough_ends_in_order(shared_server: Serving) -> None:
+    job = shared_server.gang("print('line\\n' * 50_000)", name="long")
+    shared_server.wait(job)
+    piped = ["bash", "-c", f"{MUSTER} logs long | head -1; exit ${{PIPESTATUS[0]}}"]
+    env = {**os.environ, "MUSTER_HOME": str(shared_server.home)}
+    done = subprocess.run(piped, env=env, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.endswith("line\n"), done
+
+
+def test_a_plan_of_a_run_that_is_not_there_is_refused_as_its_submission_is(
+    shared_server: Serving, tmp_path: Path
+) -> None:
     spec = tmp_path / "job.yaml"
     spec.write_text("name: judge\nevaluate: {run: nosuch}\n")
     for option in ([], ["--dry-run"]):
@@ -264,7 +275,7 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
     )["jobId"]
     shared_server.wait(array)
     shown = shared_server.muster("show", "many").stdout
-    assert f"children:   3: 3 SUCCEEDED; muster show {array[:8]}:0" in shown and "run:" not in shown
+    assert f"children:    3: 3 SUCCEEDED; muster show {array[:8]}:0" in shown and "run:" not in shown
     for reference in ("many:2", f"{array[:8]}:2", f"{array}:2"):
         assert f"{array}:2" in shared_server.muster("show", reference).stdout
     for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):

@@ -88,6 +88,9 @@ def test_a_controller_gives_no_secrets_unless_it_was_told_to(file: Path) -> None
     assert Secrets().of({"secrets": []}, "default") == {}
     with pytest.raises(SecretsError, match="muster serve --secrets"):
         Secrets().of(asking("db"), "default")
+    environment = {"MUSTER_SECRET_db": "hunter2", "HOME": "/"}
+    Secrets(str(file), environment)
+    assert environment == {"HOME": "/"}, "a process of a job would inherit it"
     file.chmod(0o640)
     with pytest.raises(SecretsError, match="chmod 600"):
         Secrets(str(file))

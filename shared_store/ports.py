@@ -1,0 +1,32 @@
+"""The port at which a gang meets (``MASTER_PORT``): free on all addresses of the host, and not the one that another gang is about to take."""
+
+from __future__ import annotations
+
+import hashlib
+import socket
+
+_FIRST, _SLOTS, _EACH = 20000, 600, 20
+"""600 ranges of 20 ports, all below those that Linux hands out by itself (from 32768)."""
+
+
+def first_port(gang: str) -> int:
+    """The first port of a gang's own range: 20000 to 31980."""
+    return _FIRST + int.from_bytes(hashlib.sha256(gang.encode()).digest()[:4], "big") % _SLOTS * _EACH
+
+
+def free_port(gang: str) -> int:
+    """The first port of a gang's range that no process of this host listens on, at whatever address.
+
+    A program that calls ``torch.distributed.init_process_group`` listens on all addresses at once, so a port at which another gang
+    listens on its own address alone is not free for it. Raises OSError where none is free.
+    """
+    first = first_port(gang)
+    for port in range(first, first + _EACH):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", port))
+                return port
+            except OSError:
+                continue
+    raise OSError(f"no free port from {first} to {first + _EACH - 1}")
