@@ -10,7 +10,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test engines lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test engines lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -46,6 +46,9 @@ bench-logs: $(READY)
 
 bench-engines: $(READY)
 	$(BIN)/python -m pytest -q -s -p tests.engines.conftest benchmarks/engines.py
+
+bench-startup: $(READY)
+	$(BIN)/python -m benchmarks.startup
 
 bench-resume: $(READY)
 	$(BIN)/python -m benchmarks.resume

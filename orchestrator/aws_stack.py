@@ -18,7 +18,7 @@ from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, 
 from botocore.parsers import ResponseParserError
 
 from orchestrator.engines.aws_config import AwsConfig, config_path, save_config
-from orchestrator.home import ServerError
+from orchestrator.errors import ServerError
 
 _PLACES = (
     Path(__file__).parent.parent / "containers" / "aws" / "muster.yaml",

@@ -18,6 +18,9 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 
+from orchestrator.errors import ApiError as ApiError
+from orchestrator.errors import NotServing, NoUrl
+from orchestrator.errors import Unreachable as Unreachable
 from orchestrator.home import local_url
 
 DEFAULT_URL = "http://127.0.0.1:8080"
@@ -30,26 +33,6 @@ _BARREN = 4
 """Streams in a row that broke off without a line, after which those of a job that is over are given up."""
 _LONGEST_PAUSE = 5.0
 """Seconds between two streams that brought no line."""
-
-
-class ApiError(Exception):
-    """The controller refused a request; ``status`` is the HTTP status."""
-
-    def __init__(self, message: str, status: int) -> None:
-        super().__init__(message)
-        self.status = status
-
-
-class Unreachable(Exception):
-    """No controller answers; the message says where one was looked for and how to start one."""
-
-
-class NoUrl(Unreachable):
-    """The address that was given is not that of a controller."""
-
-
-class NotServing(ApiError, Unreachable):
-    """The controller answers that it can't serve now (503), and why; followers wait for it as for one that is away."""
 
 
 def _unnamable(text: str) -> ApiError:

@@ -11,10 +11,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import (
     URL,
     ColumnElement,
@@ -22,7 +18,6 @@ from sqlalchemy import (
     and_,
     create_engine,
     event,
-    inspect,
     make_url,
     select,
     text,
@@ -32,11 +27,11 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlch
 from sqlalchemy.orm import Session
 
 from orchestrator.jobs import Status
+from orchestrator.schema import NewerSchema, bring_up_to_date
 from orchestrator.tables import Attempt, Base, Job, now
 
 __all__ = ["Attempt", "Base", "Database", "DatabaseError", "DatabaseFull", "Job", "find_job", "now"]
 
-MIGRATIONS = Path(__file__).parent / "migrations"
 _RESERVE = 5 << 20
 """Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
 _FULL = ("SQLITE_FULL", "SQLITE_IOERR_SHMSIZE")
@@ -238,20 +233,14 @@ class Database:
         return DatabaseError(f"database {self._shown}: another controller has it; use that one, or stop it first")
 
     def _migrate(self) -> None:
-        config = Config()
-        config.set_main_option("script_location", str(MIGRATIONS))
         with self._unchecked() as connection:
-            config.attributes["connection"] = connection
-            present = MigrationContext.configure(connection).get_current_revision()
-            known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-            if present is not None and present not in known:
+            try:
+                bring_up_to_date(connection)
+            except NewerSchema as newer:
                 raise DatabaseError(
-                    f"database {_shown(str(self.engine.url))} was written by a newer Muster (schema {present}); "
+                    f"database {_shown(str(self.engine.url))} was written by a newer Muster (schema {newer}); "
                     "install that version, or use another database"
-                )
-            if present is None and inspect(connection).has_table("jobs"):
-                command.stamp(config, "0001")  # of the versions before there were migrations
-            command.upgrade(config, "head")
+                ) from None
 
     @contextmanager
     def _unchecked(self) -> Iterator[Connection]:

@@ -11,6 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
+from orchestrator.errors import ServerError
+
 _OURS = re.compile(
     r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
 )
@@ -22,14 +24,6 @@ _MADE_LATER = ("supervisors", "kernels")
 """Of these, those that are made by jobs or for them, who would make them open."""
 
 log = logging.getLogger("muster.home")
-
-
-class ServerError(Exception):
-    """A controller can't start; the message says why and what to do."""
-
-
-class UsageError(ServerError):
-    """An option or argument can't be used; the message says why and what to give instead."""
 
 
 def muster_home() -> Path:

@@ -28,7 +28,8 @@ from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.local_gangs import running_gangs
 from orchestrator.engines.several import Several
-from orchestrator.home import HomeLock, ServerError, UsageError
+from orchestrator.errors import ServerError, UsageError
+from orchestrator.home import HomeLock
 from orchestrator.job_secrets import Secrets, SecretsError
 from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
 from shared_store.layout import NAME
 from shared_store.log_files import LEAST_LIMIT, LIMIT
@@ -28,10 +29,6 @@ _BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "
 
 LONGEST_CHANGES = 24 << 10
 """Characters of all ``--set`` assignments together: as many as a job definition has."""
-
-
-class SpecError(Exception):
-    """A spec can't be used; the message is one line: file, line, key, what was expected."""
 
 
 def _duration(value: object) -> object:

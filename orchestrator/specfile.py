@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator import strict_yaml
-from orchestrator.spec import Spec, SpecError, override, validate
+from orchestrator.errors import SpecError
+from orchestrator.spec import Spec, override, validate
 
 
 def load(path: str, assignments: list[str] | None = None) -> Spec:

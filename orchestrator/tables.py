@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import Any, Generic, TypeVar
 
-from sqlalchemy import JSON, BigInteger, ForeignKey, Index, String
+from sqlalchemy import JSON, BigInteger, ForeignKey, Index, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
 
 from orchestrator.excerpts import LONGEST_REASON, excerpt
@@ -116,6 +116,7 @@ class Job(Base):
 
     __tablename__ = "jobs"
     __table_args__ = (
+        UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
         Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
         Index("ix_jobs_queue_created", "queue", "created_at", "id"),
     )
@@ -167,7 +168,7 @@ class Job(Base):
     array_index: Mapped[int | None] = mapped_column(default=None)
     array_size: Mapped[int | None] = mapped_column(default=None)
     """Of the array that it is, or belongs to."""
-    idempotency_key: Mapped[str | None] = mapped_column(default=None, unique=True)
+    idempotency_key: Mapped[str | None] = mapped_column(default=None)
     attempts: Mapped[list[Attempt]] = relationship(
         back_populates="job", order_by="Attempt.number", cascade="all, delete-orphan"
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.cli.catalogue import ENTRIES, load
 from tests.conftest import REPOSITORY, wait_for
 
 HEAVY = {"torch", "warp", "newton", "rsl_rl", "gymnasium", "tensordict", "mujoco"}
@@ -56,6 +57,16 @@ def test_the_supervisor_imports_no_torch() -> None:
     code = "import sys, worker.supervisor, worker.slurm_node, orchestrator.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not set(loaded) & HEAVY
+
+
+def test_help_imports_no_command_and_each_says_what_its_own_help_says() -> None:
+    code = "import sys; sys.argv = ['muster', '--help']; import orchestrator.cli as c, atexit\natexit.register(lambda: print(*sys.modules)); c.main()"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "orchestrator.cli.catalogue" in loaded
+    assert not {"httpx", "pydantic", "sqlalchemy", "yaml", "orchestrator.cli.jobs"} & set(loaded)
+    for entry in ENTRIES:
+        own = " ".join((load(entry.name).help or "").partition("\n\n")[0].split())
+        assert own == entry.summary, entry.name
 
 
 def test_a_bare_installation_gives_a_working_controller_without_torch(tmp_path: Path) -> None:

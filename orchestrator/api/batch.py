@@ -10,7 +10,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import botocore.session
 from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -18,6 +17,7 @@ from sqlalchemy.orm import Session
 from orchestrator.api import definitions, environments, jobs, limits, permissions, queues, submission, tags
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
+from orchestrator.api.models import service_model
 from orchestrator.api.permissions import Operation
 from orchestrator.controller import Controller
 
@@ -64,14 +64,9 @@ _ADDING = ("Submit", "Register", "Create", "Tag")
 
 
 @cache
-def _model() -> Any:
-    return botocore.session.Session().get_service_model("batch")
-
-
-@cache
 def operation_names() -> dict[str, str]:
     """Path name (lower case) → operation, of every operation that AWS Batch has."""
-    return {name.lower(): name for name in _model().operation_names}
+    return {name.lower(): name for name in service_model("batch").operation_names}
 
 
 def validate(operation: str, request: object) -> dict[str, Any]:
@@ -79,7 +74,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise ClientError(f"{operation}: expected a JSON object")
     limits.check_size(operation, request)
-    report = ParamValidator().validate(request, _model().operation_model(operation).input_shape)
+    report = ParamValidator().validate(request, service_model("batch").operation_model(operation).input_shape)
     if report.has_errors():
         message = " ".join(report.generate_report().split())
         raise ClientError(f"Error executing request, Exception : {message[:2000]}")

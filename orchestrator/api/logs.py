@@ -12,11 +12,9 @@ import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
-from functools import cache
 from itertools import chain, islice
 from typing import Any
 
-import botocore.session
 from botocore.validate import ParamValidator
 from sqlalchemy import func, select
 from starlette.concurrency import run_in_threadpool
@@ -31,6 +29,7 @@ from orchestrator.api.live_tail import LiveTail, messages
 from orchestrator.api.log_events import Event, event_id, first_and_last
 from orchestrator.api.log_streams import Stream, find_stream, newest_streams
 from orchestrator.api.members import LOG_GROUP
+from orchestrator.api.models import service_model
 from orchestrator.api.permissions import Operation, Refusal, check
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, Job, now
@@ -107,11 +106,6 @@ async def answer(
         return LogsError("ServiceUnavailableException", f"the store can't be read: {error}", 503).response()
 
 
-@cache
-def _model() -> Any:
-    return botocore.session.Session().get_service_model("logs")
-
-
 def validate(operation: str, request: object) -> dict[str, Any]:
     """The request, checked against AWS's model. Raises LogsError with what is wrong, in one line."""
     if not isinstance(request, dict):
@@ -122,7 +116,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
             raise invalid(f"{operation}: zero bytes are not allowed")
     except (UnicodeEncodeError, RecursionError):
         raise invalid(f"{operation}: not text (half a surrogate pair), or nested too deep") from None
-    shape = _model().operation_model(operation).input_shape
+    shape = service_model("logs").operation_model(operation).input_shape
     report = ParamValidator().validate(request, shape)
     if report.has_errors():
         raise invalid(" ".join(report.generate_report().split()))

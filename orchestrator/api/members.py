@@ -1,6 +1,6 @@
 """What AWS's model lets a definition say and what can't be done here: refused by name, in one line.
 
-What is passed over instead is listed in the README ("What differs"); a test holds every member of the model against both.
+What is passed over instead is listed in docs/aws-differences.md; a test holds every member of the model against both.
 """
 
 from __future__ import annotations

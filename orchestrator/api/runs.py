@@ -17,10 +17,11 @@ from orchestrator.api.permissions import visible_queues
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.several import FRESH
+from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
-from orchestrator.spec import Spec, SpecError, override, validate
+from orchestrator.spec import Spec, override, validate
 from orchestrator.tables import Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import DamagedFile, read_json

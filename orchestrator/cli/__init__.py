@@ -9,16 +9,15 @@ import sys
 
 import typer
 
-from orchestrator.cli import aws, doctor, jobs, keys, logs, queues, runs, serving, tasks, verify
+from orchestrator.cli.catalogue import Catalogue, add_placeholders
 from orchestrator.cli.terminal import echo, log_visibly, one_line
-from orchestrator.client import ApiError, NoUrl, Unreachable
-from orchestrator.home import ServerError, UsageError
-from orchestrator.spec import SpecError
+from orchestrator.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
 from shared_store.layout import StoreError
 
 app = typer.Typer(
     name="muster",
+    cls=Catalogue,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -26,16 +25,7 @@ app = typer.Typer(
     help="Runs one robot-learning job on many machines as if they were one.",
     epilog="Start with:  muster run job_specs/cartpole.yaml",
 )
-serving.register(app)
-jobs.register(app)
-logs.register(app)
-runs.register(app)
-verify.register(app)
-queues.register(app)
-keys.register(app)
-tasks.register(app)
-doctor.register(app)
-aws.register(app)
+add_placeholders(app)
 
 
 def _version(wanted: bool) -> None:

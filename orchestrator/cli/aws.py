@@ -15,7 +15,8 @@ from rich.table import Table
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.engines.aws_config import config_path
-from orchestrator.home import ServerError, muster_home
+from orchestrator.errors import ServerError
+from orchestrator.home import muster_home
 
 if TYPE_CHECKING:
     from orchestrator.aws_stack import Event, Stack

@@ -21,10 +21,11 @@ from rich.markup import escape
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json
-from orchestrator.client import ApiError, Client, Unreachable
+from orchestrator.client import Client
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.gpus import visible_gpus
+from orchestrator.errors import ApiError, Unreachable
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
 from shared_store.files import write_json

@@ -20,7 +20,8 @@ from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
 from orchestrator.engines.base import engine_of
-from orchestrator.spec import Spec, SpecError, schema
+from orchestrator.errors import SpecError
+from orchestrator.spec import Spec, schema
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 SetOption = Annotated[
@@ -318,7 +319,10 @@ def checkpoint(job: JobArgument) -> None:
 
 
 def stacks(job: JobArgument) -> None:
-    """Print where every rank of a running job is: Python and native stacks. They go to the job's log too."""
+    """Print the Python and native stacks of every rank of a running job.
+
+    They go to the job's log too.
+    """
     with Client.connect() as client:
         for node in client.get(f"/api/jobs/{named(job)}/stacks", seconds=180):
             echo(f"== node {node['node']}\n{node['stacks']}")

@@ -20,7 +20,7 @@ NameArgument = Annotated[str, typer.Argument(help="The key's name: who or what u
 def register(app: typer.Typer) -> None:
     group = typer.Typer(
         no_args_is_help=True,
-        help="Access keys of this home directory's server, for AWS clients (as a key pair) and for muster (as MUSTER_TOKEN).",
+        help="Access keys of this home directory's server: who may call it.\n\nAWS clients use one as a key pair, muster as MUSTER_TOKEN.",
     )
     group.command(epilog="Example:  muster keys create alice --queue robots")(create)
     group.command("list", epilog="Example:  muster keys list --json | jq '.[].name'")(list_keys)

@@ -9,7 +9,8 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
-from orchestrator.client import Client, Unreachable
+from orchestrator.client import Client
+from orchestrator.errors import Unreachable
 
 _TERMINAL = ("SUCCEEDED", "FAILED")
 _POLL = 0.3

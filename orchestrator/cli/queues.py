@@ -10,7 +10,8 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json, one_line
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
 
 
 def register(app: typer.Typer) -> None:

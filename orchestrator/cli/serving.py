@@ -17,10 +17,11 @@ from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
-from orchestrator.client import Client, NotServing, Unreachable
+from orchestrator.client import Client
 from orchestrator.disk import DEFAULT, MinFree
-from orchestrator.home import ServerError, local_url, muster_home
-from orchestrator.spec import SpecError, seconds_of
+from orchestrator.errors import NotServing, ServerError, SpecError, Unreachable
+from orchestrator.home import local_url, muster_home
+from orchestrator.spec import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 EngineOption = Annotated[

@@ -13,8 +13,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.home import ServerError
-from orchestrator.spec import SpecError
+from orchestrator.errors import ServerError, SpecError
 
 
 def register(app: typer.Typer) -> None:

@@ -13,7 +13,8 @@ from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
-from orchestrator.spec import Resources, Retry, Spec, SpecError
+from orchestrator.errors import SpecError
+from orchestrator.spec import Resources, Retry, Spec
 
 Connect = Callable[[], Client]
 

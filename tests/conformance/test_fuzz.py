@@ -28,7 +28,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
 from orchestrator.keys import KeyStore
 from tests.conformance import fuzz_requests as good
 from tests.conformance import fuzzing

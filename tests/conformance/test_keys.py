@@ -20,7 +20,8 @@ from orchestrator.api.auth import Access, Guard
 from orchestrator.api.limits import RateLimit
 from orchestrator.api.permissions import current_identity
 from orchestrator.database import Database
-from orchestrator.home import HomeLock, ServerError
+from orchestrator.errors import ServerError
+from orchestrator.home import HomeLock
 from orchestrator.keys import KeyStore
 from orchestrator.server import Server
 from orchestrator.tables import JobQueue

@@ -14,7 +14,7 @@ from fastapi.routing import APIRoute
 from orchestrator.api import batch, logs, members, native
 from orchestrator.api.app import create_app
 from orchestrator.api.permissions import HIDDEN, Operation
-from orchestrator.client import ApiError
+from orchestrator.errors import ApiError
 from tests.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
 
 OWN_WRITE = "+ + + - - - -"

@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 import yaml
 
-from orchestrator.client import ApiError, Client, Unreachable
+from orchestrator.client import Client
+from orchestrator.errors import ApiError, Unreachable
 from tests.conftest import MUSTER, REPOSITORY, wait_for
 from tests.engines.images import PATH, SUPERVISED, host_files
 from tests.worker.ranks import free_port

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
 from tests.conftest import submit_gang, wait_for
 from tests.faults.home import Home
 from tests.faults.processes import end_all

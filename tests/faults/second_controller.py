@@ -9,7 +9,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
 from tests.conftest import wait_for
 from tests.faults.home import Home
 from tests.faults.processes import end_all

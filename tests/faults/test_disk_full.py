@@ -12,9 +12,9 @@ import pytest
 from botocore.exceptions import ClientError
 from sqlalchemy import func, select, update
 
-from orchestrator.client import ApiError
 from orchestrator.database import Database, DatabaseFull
 from orchestrator.disk import DEFAULT, Disk, MinFree
+from orchestrator.errors import ApiError
 from orchestrator.tables import JobQueue
 from tests.conformance.streams import client_of
 from tests.conftest import Serving, processes_of, run_muster, wait_for

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator import peers
-from orchestrator.client import ApiError
+from orchestrator.errors import ApiError
 from orchestrator.peers import Peers
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store

@@ -10,7 +10,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from orchestrator.client import Client, Unreachable
+from orchestrator.client import Client
+from orchestrator.errors import Unreachable
 from tests.conftest import Serving, submit_gang, wait_for
 
 

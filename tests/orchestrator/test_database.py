@@ -20,10 +20,10 @@ from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
 from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
-from orchestrator.client import ApiError
-from orchestrator.database import MIGRATIONS, Database, DatabaseError, find_job
-from orchestrator.home import ServerError
+from orchestrator.database import Database, DatabaseError, find_job
+from orchestrator.errors import ApiError, ServerError
 from orchestrator.roster import Roster
+from orchestrator.schema import MIGRATIONS, NEWEST
 from orchestrator.server import Server
 from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
 from shared_store.layout import Store
@@ -72,10 +72,16 @@ def job(job_id: str, **facts: Any) -> Job:
     return Job(**{**values, "node_properties": NODES, **facts})
 
 
-def test_the_migrations_make_what_the_tables_say(opened: Callable[[], Database]) -> None:
+@pytest.mark.parametrize("history", ["new", "migrated"])
+def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
+    url: str, opened: Callable[[], Database], history: str
+) -> None:
+    if history == "migrated":
+        _migrate(url, "upgrade", "head")
     database = opened()
     with database.engine.connect() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+        context = MigrationContext.configure(connection)
+        assert compare_metadata(context, Base.metadata) == [] and context.get_current_revision() == NEWEST
     with database.session() as session:
         assert [queue.name for queue in session.scalars(select(JobQueue))] == ["default"]
         assert [each.name for each in session.scalars(select(ComputeEnvironment))] == ["local"]

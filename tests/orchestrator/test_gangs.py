@@ -17,6 +17,7 @@ from orchestrator import gangs
 from orchestrator.client import Client
 from orchestrator.engines.base import EngineError
 from orchestrator.engines.local import LocalEngine
+from orchestrator.errors import ApiError
 from orchestrator.jobs import Ending, NodeEnd, Verdict
 from orchestrator.server import Server
 from orchestrator.tables import Attempt, Job
@@ -227,7 +228,6 @@ def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_s
 
 
 def test_two_jobs_can_not_write_one_run(server: Serving) -> None:
-    from orchestrator.client import ApiError
 
     server.gang("import time; time.sleep(300)", env={"MUSTER_RUN": "shared-run"})
     with pytest.raises(ApiError, match="run shared-run is being written by job test"):

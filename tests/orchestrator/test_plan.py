@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 
 from orchestrator.cli.jobs import submit_spec
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines.base import Gang, Plan
 from orchestrator.engines.local import LocalEngine
+from orchestrator.errors import ApiError, SpecError
 from orchestrator.server import Server
-from orchestrator.spec import SpecError, validate
+from orchestrator.spec import validate
 from shared_store.files import write_json
 from tests.conftest import Serving, run_muster, wait_for
 

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
-from orchestrator.spec import Spec, SpecError, known_tasks, override, validate
+from orchestrator.errors import SpecError
+from orchestrator.spec import Spec, known_tasks, override, validate
 from orchestrator.specfile import load, read
 from worker.tasks.config import PPOConfig
 

@@ -20,11 +20,12 @@ import httpx
 import pytest
 
 from orchestrator import disk
-from orchestrator.client import ApiError, Client
+from orchestrator.client import Client
 from orchestrator.database import Database, DatabaseError
 from orchestrator.engines.local import LocalEngine
 from orchestrator.engines.ray import RayEngine
-from orchestrator.home import HomeLock, ServerError
+from orchestrator.errors import ApiError, ServerError
+from orchestrator.home import HomeLock
 from orchestrator.server import Server
 from orchestrator.tables import Job
 from tests.conftest import processes_of, submit_gang, wait_for

@@ -1,0 +1,15 @@
+"""AWS's own models of its services: data that botocore ships. Its sessions and clients, which take long to import, are not needed."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from botocore.loaders import Loader
+from botocore.model import ServiceModel
+
+
+@cache
+def service_model(name: str) -> Any:
+    """The newest model of a service, such as ``batch`` or ``logs``."""
+    return ServiceModel(Loader().load_service_model(name, "service-2"), name)

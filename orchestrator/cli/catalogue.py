@@ -1,0 +1,88 @@
+"""All commands with a line each. The module of a command is imported when the command is used: `muster --help` needs none of them."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import typer
+from typer.core import TyperGroup
+
+
+class Entry(NamedTuple):
+    """A command, or a group of commands, as `muster --help` shows it."""
+
+    name: str
+    module: str
+    """In ``orchestrator.cli``; its function ``register`` adds the command to an application."""
+    panel: str
+    summary: str
+    """The first line of the command's own help."""
+
+
+_JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
+ENTRIES = (
+    Entry(
+        *("run", "serving", _JOBS),
+        "Run a job to its end, with a controller of its own where none is running; exit with its result.",
+    ),
+    Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
+    Entry("list", "jobs", _JOBS, "List jobs, the newest first."),
+    Entry("show", "jobs", _JOBS, "Show a job: its state and why, its attempts and nodes, its run and results."),
+    Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
+    Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and leaves; `muster resume` goes on from there."),
+    Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
+    Entry("resume", "runs", _RUNS, "Go on with a run from its newest checkpoint, at the next iteration."),
+    Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
+    Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
+    Entry(
+        *("verify-resume", "verify", _RUNS),
+        "Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.",
+    ),
+    Entry(
+        "serve", "serving", _SHARED, "Run the controller as a server. Running jobs outlive it; the next one finds them."
+    ),
+    Entry(
+        *("queues", "queues", _SHARED),
+        "List job queues; of one, the waiting jobs in the order in which they will start.",
+    ),
+    Entry("keys", "keys", _SHARED, "Access keys of this home directory's server: who may call it."),
+    Entry(
+        "aws", "aws", _SHARED, "The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch)."
+    ),
+    Entry(
+        *("tasks", "tasks", _HERE),
+        "List the tasks that are installed here; of one, the names of its observations and actions.",
+    ),
+    Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors."),
+    Entry(
+        *("doctor", "doctor", _HERE),
+        "Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing.",
+    ),
+)
+_MODULES = {entry.name: entry.module for entry in ENTRIES}
+
+
+def load(name: str) -> Any:
+    """The command itself. Imports its module."""
+    own = typer.Typer(rich_markup_mode="rich")
+    import_module(f"orchestrator.cli.{_MODULES[name]}").register(own)
+    return typer.main.get_group(own).commands[name]
+
+
+class Catalogue(TyperGroup):
+    """The group that lists placeholders and runs the commands themselves."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, _, rest = super().resolve_command(ctx, args)  # an unknown name ends here, with the nearest known ones
+        return name, load(str(name)), rest
+
+
+def add_placeholders(app: typer.Typer) -> None:
+    """Add the catalogue's commands to ``app``, by name and summary."""
+
+    def placeholder() -> None:
+        """Is never called: see :meth:`Catalogue.resolve_command`."""
+
+    for entry in ENTRIES:
+        app.command(entry.name, help=entry.summary, rich_help_panel=entry.panel)(placeholder)
