@@ -157,6 +157,22 @@ class Gang:
             dist.destroy_process_group()
 
 
+def require_gpus(visible: str) -> None:
+    """Check that PyTorch can use the GPUs of this rank, which would train on the CPU otherwise.
+
+    Args:
+        visible: ``CUDA_VISIBLE_DEVICES``, in which engines name the GPUs of a rank; empty for none.
+
+    Raises:
+        ValueError: It can't.
+    """
+    if visible.strip() not in ("", "-1") and not torch.cuda.is_available():
+        raise ValueError(
+            f"this rank has GPU {visible}, and PyTorch {torch.__version__} can't use it; install a PyTorch with CUDA and a driver "
+            "that fits it, or set resources.gpus to 0"
+        )
+
+
 def connect(placement: Placement, *, device: str | None = None, report_seconds: float = REPORT_SECONDS) -> Gang:
     """Form the gang: report, process group, one all-reduce. Every rank calls it.
 

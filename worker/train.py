@@ -12,11 +12,12 @@ def main() -> int:
     """Train; returns the exit code."""
     stop = StopRequest().listen()  # before the imports, which take seconds
     job = Job.from_env(os.environ, "train")
-    from worker.distributed import REPORT_SECONDS, Placement, connect, use_cpu_threads
+    from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():
         placement = Placement.from_env(os.environ)
+        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     if not isinstance(job.section.get("task"), str):
         raise UserError("train.task: the name of a task is missing")

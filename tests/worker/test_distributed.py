@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 
 from tests.worker.ranks import ROOT, free_port, run_ranks, start_rank
-from worker.distributed import Gang, Placement, _listen, connect, warm_marker
+from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
 from worker.errors import GangError
 
 WORLDS = 7  # two ranks get 3 and 4
@@ -214,3 +214,13 @@ def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
 def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Placement.from_env(env)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this PyTorch can use a GPU")
+def test_a_rank_whose_gpu_pytorch_cannot_use_does_not_train_on_the_cpu_in_silence() -> None:
+    require_gpus("")
+    require_gpus("-1")
+    with pytest.raises(
+        ValueError, match=r"this rank has GPU 0,1, and PyTorch .* can't use it; install a PyTorch with CUDA"
+    ):
+        require_gpus("0,1")
