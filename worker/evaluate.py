@@ -13,11 +13,12 @@ def main() -> int:
     job = Job.from_env(os.environ, "evaluate")
     run = job.named_run()
     episodes = job.setting("episodes", 1)
-    from worker.distributed import REPORT_SECONDS, Placement, connect, use_cpu_threads
+    from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():
         placement = Placement.from_env(os.environ)
+        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from worker.learning.evaluation import evaluate
     from worker.learning.ppo import PPO, Share

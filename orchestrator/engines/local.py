@@ -249,11 +249,11 @@ def _address(gang: Gang, index: int) -> str:
 
 
 def _port(gang: str) -> int:
-    """Where the nodes of a gang meet. Raises EngineError where no port is free."""
+    """Where the nodes of a gang meet. Raises Transient where no port is free."""
     try:
         return free_port(gang)
     except OSError as error:
-        raise EngineError(str(error)) from None
+        raise Transient(str(error)) from None
 
 
 @dataclass(frozen=True)
