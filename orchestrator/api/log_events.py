@@ -20,7 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from shared_store.files import open_regular
+from shared_store.files import DamagedFile, open_regular
 from shared_store.log_files import Segment, left_out, read_log, segments_of
 from shared_store.logs import END_LINE, LIMIT_REACHED, REPLACED
 
@@ -233,14 +233,15 @@ def log_file(path: Path, stream: str) -> LogFile:
 def first_and_last(path: Path) -> tuple[int, int, int] | None:
     """First and last time [ms] and size [bytes] of a log, from its two ends alone; None without an event. Raises OSError."""
     try:
-        segments = segments_of(path)
+        if not (segments := segments_of(path)):
+            return None
         sizes = [os.stat(segment.path).st_size for segment in segments]
         with open_regular(path) as file:
             head = _STAMPS.search(file.read(_ENDS))
         with open_regular(segments[-1].path) as file:
             file.seek(max(0, sizes[-1] - _ENDS))
             tail = _STAMPS.findall(file.read(_ENDS))
-    except (FileNotFoundError, IndexError):
+    except (FileNotFoundError, DamagedFile):  # changed since it was listed
         return None
     if not head:
         return None

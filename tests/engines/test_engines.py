@@ -17,8 +17,8 @@ from tests.engines.slurm_cluster import need_slurm
 def test_an_unknown_engine_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
     refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
     assert (
-        refused.returncode == 1
-        and refused.stderr == f"muster: there is no engine 'dokcer'; there are {', '.join(ENGINES)}\n"
+        refused.returncode == 2
+        and refused.stderr == f"muster: --engine dokcer: there is no such engine; there are {', '.join(ENGINES)}\n"
     )
     assert not (tmp_path / "muster.db").exists(), "nothing was made"
 

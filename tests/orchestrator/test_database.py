@@ -8,7 +8,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -29,12 +28,7 @@ from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, J
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
 from tests.orchestrator import postgres
-
-NODES = {
-    "numNodes": 2,
-    "mainNode": 0,
-    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
-}
+from tests.orchestrator.rows import job
 
 
 @pytest.fixture(scope="session")
@@ -65,11 +59,6 @@ def opened(url: str) -> Iterator[Callable[[], Database]]:
     yield make
     for database in databases:
         database.close()
-
-
-def job(job_id: str, **facts: Any) -> Job:
-    values = {"id": job_id, "name": job_id, "queue": "default", "definition": "arn:d:1", "request": {}, "run": job_id}
-    return Job(**{**values, "node_properties": NODES, **facts})
 
 
 @pytest.mark.parametrize("history", ["new", "migrated"])

@@ -306,4 +306,8 @@ def test_a_log_stream_ends_in_order_whatever_lies_where_logs_are_looked_for(
     logs.rename(logs.with_name("before"))
     logs.write_text("")
     assert [http.get(address, params={"follow": follow}).text for follow in (False, True)] == ["", ""]
+    streams = {"X-Amz-Target": "Logs_20140328.DescribeLogStreams"}
+    for asked in ({}, {"orderBy": "LastEventTime"}):
+        listed = http.post("/", json={"logGroupName": "/aws/batch/job", **asked}, headers=streams)
+        assert listed.status_code == 200, "one job's files are in the way of nothing but its own logs"
     assert "Exception in ASGI application" not in caplog.text

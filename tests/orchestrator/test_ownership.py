@@ -13,7 +13,7 @@ from orchestrator.database import Database
 from orchestrator.ownership import owner_of, record_owner
 from orchestrator.tables import Job, RunRecord
 from shared_store.layout import Run, Store
-from tests.orchestrator.test_database import job
+from tests.orchestrator.rows import job
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from orchestrator.server import Server
 from orchestrator.tables import Attempt, Job
 from shared_store.layout import Store
 from tests.conftest import wait_for
-from tests.orchestrator.test_database import job
+from tests.orchestrator.rows import job
 
 OVERSIZED = {
     "takes at most 100 jobs, not 400000": ("describejobs", '{"jobs": [%s1]}' % ("1," * 399_999)),

@@ -29,7 +29,7 @@ from orchestrator.home import HomeLock
 from orchestrator.server import Server
 from orchestrator.tables import Job
 from tests.conftest import processes_of, submit_gang, wait_for
-from tests.orchestrator.test_database import job
+from tests.orchestrator.rows import job
 
 FOREVER = "import time; time.sleep(600)"
 

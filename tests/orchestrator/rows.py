@@ -1,0 +1,18 @@
+"""Rows of the database, with what a test does not care about filled in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orchestrator.tables import Job
+
+NODES = {
+    "numNodes": 2,
+    "mainNode": 0,
+    "nodeRangeProperties": [{"targetNodes": "0:", "container": {"command": ["true"]}}],
+}
+
+
+def job(job_id: str, **facts: Any) -> Job:
+    values = {"id": job_id, "name": job_id, "queue": "default", "definition": "arn:d:1", "request": {}, "run": job_id}
+    return Job(**{**values, "node_properties": NODES, **facts})
