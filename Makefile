@@ -1,5 +1,5 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
-# make test   lint and the whole test suite
+# make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
@@ -10,19 +10,32 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: run test engines lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test unit integration training engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
 
-test: lint
-	$(BIN)/python -m tests.kernels
-	$(BIN)/pytest -q -n 2 --dist loadfile --durations=10 -m "not cluster"
+# two files at a time, in the order of the tiers in tests/conftest.py
+PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
+
+test: lint kernels
+	$(PYTEST) -m "not cluster"
+
+unit: $(READY)
+	$(PYTEST) tests/unit
+
+integration: $(READY)
+	$(PYTEST) tests/integration
+
+training: $(READY) kernels
+	$(PYTEST) tests/training
 
 # one after the other: a cluster has this machine for itself
-engines: $(READY)
-	$(BIN)/python -m tests.kernels
-	$(BIN)/pytest -q --durations=10 -m cluster
+engines: $(READY) kernels
+	$(BIN)/pytest -q --durations=10 tests/cluster
+
+kernels: $(READY)
+	$(BIN)/python -m tests.support.kernels
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -45,7 +58,7 @@ bench-logs: $(READY)
 	$(BIN)/python -m benchmarks.log_follow | tee benchmarks/log_follow.md
 
 bench-engines: $(READY)
-	$(BIN)/python -m pytest -q -s -p tests.engines.conftest benchmarks/engines.py
+	$(BIN)/python -m pytest -q -s -p tests.support.engines.fixtures benchmarks/engines.py
 
 bench-startup: $(READY)
 	$(BIN)/python -m benchmarks.startup
@@ -63,13 +76,13 @@ bench-api: $(READY)
 	$(BIN)/python -m benchmarks.api
 
 torture: $(READY)
-	$(BIN)/python -m tests.faults.torture --kills $(or $(N),300) --rounds $(or $(ROUNDS),10)
+	$(BIN)/python -m tests.support.faults.torture --kills $(or $(N),300) --rounds $(or $(ROUNDS),10)
 
 bits: $(READY)
-	MUSTER_LONG=1 $(BIN)/pytest -q tests/faults/test_bits.py tests/e2e tests/engines
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/training/faults/test_bits.py tests/training/e2e tests/integration/engines/test_docker_faults.py tests/training/engines
 
 fuzz: $(READY)
-	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/conformance/test_fuzz.py tests/conformance/test_hostile_clients.py
+	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/integration/conformance/test_fuzz.py tests/integration/conformance/test_hostile_clients.py
 
 env: $(READY)
 

@@ -1,6 +1,6 @@
 """What engines cost: how soon a gang starts, how soon a death is noticed and mended, how soon a stop is done, speed and memory.
 
-``make bench-engines`` writes ``benchmarks/engines.md``. The clusters are those of the tests (``tests/engines/``), all on this machine, so
+``make bench-engines`` writes ``benchmarks/engines.md``. The clusters are those of the tests (``tests/support/engines/``), all on this machine, so
 this is a module for pytest. Gangs have two nodes. A rank's death is noticed when the controller has recorded it, a node's likewise; a
 gang runs again when all its ranks have printed; nothing is left when no process of it is and the job is FAILED.
 """
@@ -16,10 +16,12 @@ from typing import Any
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import wait_for
-from tests.engines.sites import Site, kill_rank, kill_supervisor, processes
-from tests.engines.training import submit
+from tests.support.engines.fixtures import sites
+from tests.support.engines.sites import SITES, Site, kill_rank, kill_supervisor, processes
+from tests.support.engines.training import submit
 
 TRIES = 3
+site = sites(*SITES)
 TABLE = Path(__file__).with_suffix(".md")
 STAYS = 'trap "exit 75" TERM; echo ready; while :; do sleep 0.02; done'
 DAEMONS = {

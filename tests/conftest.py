@@ -19,6 +19,10 @@ from orchestrator.cli import main
 from orchestrator.client import Client
 
 REPOSITORY = Path(__file__).parent.parent
+TIERS = ("training", "integration", "unit", "cluster")
+"""The folders of the tests, and the marker of each one's tests; in the order in which they run: what takes long first, so that no
+process is left with a long one at the end."""
+pytest_plugins = [f"tests.support.{area}.fixtures" for area in ("conformance", "engines", "orchestrator", "worker")]
 MUSTER = str(Path(sys.executable).parent / "muster")
 
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
@@ -115,6 +119,23 @@ def frozen(pid: int) -> Iterator[None]:
         (directory / "freezer.state").write_text("THAWED")
         wait_for(lambda: not (directory / "cgroup.procs").read_text(), 20, "an empty freezer")
         directory.rmdir()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark each test with its tier."""
+
+    def tier(item: pytest.Item) -> int:
+        folder = (
+            item.path.relative_to(REPOSITORY / "tests").parts[0]
+            if item.path.is_relative_to(REPOSITORY / "tests")
+            else ""
+        )
+        return TIERS.index(folder) if folder in TIERS else len(TIERS)
+
+    for item in items:
+        if (number := tier(item)) < len(TIERS):
+            item.add_marker(TIERS[number])
+    items.sort(key=tier)
 
 
 class Serving:

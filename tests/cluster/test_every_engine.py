@@ -1,0 +1,29 @@
+"""The tests that every engine passes, on Ray; and on all engines, those that take half a minute each."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.integration.engines import test_every_engine as on_others
+from tests.integration.engines.test_every_engine import WAIT_FOR_ALL, gone
+from tests.support.engines.fixtures import sites
+from tests.support.engines.sites import SITES, Site, freeze
+
+site = sites("ray")
+any_site = sites(*SITES)
+globals().update({name: test for name, test in vars(on_others).items() if name.startswith("test_")})
+
+
+def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(any_site: Site) -> None:
+    site = any_site
+    if site.engine == "aws-batch":
+        pytest.skip("nodes on AWS have no bus to the controller: there a frozen one is found by stall_timeout alone")
+    job = site.submit(
+        "echo ready; [ $AWS_BATCH_JOB_ATTEMPT = 2 ] || exec sleep 600" + WAIT_FOR_ALL, nodes=2, attempts=2
+    )
+    site.ready(job, 1, 2)
+    freeze(job, 1)
+    detail = site.serving.wait(job, timeout=60)
+    assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
+    assert "node 1 gives no sign of life for" in detail["attempts"][0]["statusReason"], detail["attempts"]
+    gone(job)

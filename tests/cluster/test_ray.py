@@ -1,0 +1,383 @@
+"""The Ray engine on a real cluster: gangs placed, told where they are, stopped, lost and found again; nothing is left of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.engines.base import EngineError, Gang, NodeStatus, Placement
+from orchestrator.engines.ray import RayEngine
+from shared_store import __version__
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower
+from shared_store.outcomes import read_outcome
+from tests.conftest import alive, parent, processes_of, wait_for
+from tests.support.engines.ray_cluster import RAY, RayCluster
+from tests.support.engines.sites import POLITE, STUBBORN, WAIT
+
+
+class Bench:
+    """An engine with a home and a store of its own, and the gangs that it started."""
+
+    def __init__(self, cluster: RayCluster, home: Path) -> None:
+        self.cluster, self.home = cluster, home
+        self.store = Store(home / "store").open()
+        self.run = self.store.run("run")
+        self.run.create({"run": "run"})
+        raise_epoch(self.run, 1)
+        self.engine = RayEngine(home / "home")
+        self.handles: list[str] = []
+
+    def gang(self, script: str = WAIT, hosts: tuple[str, ...] = ("n1", "n2", "n3"), **changes: Any) -> Gang:
+        count, gpus = len(hosts), changes.pop("gpus", ())
+        job, cpus = changes.pop("job", "job"), changes.pop("cpus", 1.0)
+        facts: dict[str, Any] = {
+            "job": job,
+            "attempt": 1,
+            "main": 0,
+            "directory": None,
+            "placements": [Placement(f"ray/{host}", gpus, cpus, 256) for host in hosts],
+            **changes,
+        }
+        return Gang(
+            epoch=1,
+            job_epoch=1,
+            run="run",
+            store=str(self.store.path),
+            queue="default",
+            pool="ray",
+            commands=[["sh", "-c", script]] * count,
+            environments=[{"GREETING": "hello"}] * count,
+            grace=5.0,
+            **facts,
+        )
+
+    def launch(self, gang: Gang) -> str:
+        handle = self.engine.launch(self.engine.plan(gang))
+        self.handles.append(handle)
+        return handle
+
+    def ready(self, gang: Gang) -> str:
+        """Launched, and every node has said so."""
+        handle = self.launch(gang)
+        wait_for(
+            lambda: self.log(gang.job, gang.attempt).count("ready") == len(gang.placements),
+            60,
+            f"all are ready: {self.engine.observe(handle)}",
+        )
+        return handle
+
+    def ended(self, handle: str) -> list[NodeStatus]:
+        def over() -> list[NodeStatus] | None:
+            status = list(self.engine.observe(handle))
+            return status if not any(node.running for node in status) else None
+
+        found: list[NodeStatus] = wait_for(over, 60, "the gang's end")
+        return found
+
+    def stopped(self, handle: str, grace: float = 5.0) -> list[int | None]:
+        self.engine.stop(handle, grace)
+        self.nothing_is_left()
+        return [node.exit_code for node in self.engine.observe(handle)]
+
+    def stopped_there(self, handle: str) -> list[int | None]:
+        """Of a gang that lost its third node, where that may go on until it ends itself."""
+        self.engine.stop(handle, 5.0)
+        return [node.exit_code for node in self.engine.observe(handle)][:2]
+
+    def nothing_is_left(self) -> None:
+        assert processes_of(self.store.path) == [], "a process of the gang lives"
+
+    def log(self, job: str = "job", attempt: int = 1) -> list[str]:
+        return [line.text for line in LogFollower(self.run, job).drain() if line.attempt == attempt]
+
+    def driver(self) -> int:
+        [pid] = processes_of(self.home / "home")
+        return pid
+
+
+@pytest.fixture
+def bench(ray_cluster: RayCluster, tmp_path: Path) -> Iterator[Bench]:
+    found = Bench(ray_cluster, tmp_path)
+    yield found
+    for handle in found.handles:
+        found.engine.stop(handle, 0.0)
+    found.nothing_is_left()
+    found.engine._let_go("")
+    found.engine.close()
+    wait_for(lambda: not processes_of(tmp_path), 30, "the drivers leave")
+
+
+def addresses(bench: Bench) -> dict[str, str]:
+    return {node["name"]: node["address"] for node in bench.engine._watch.seen["nodes"]}
+
+
+def test_hosts_are_the_nodes_that_have_cpus(bench: Bench) -> None:
+    hosts = {host.name: host for host in bench.engine.capacity()}
+    assert sorted(hosts) == ["ray/n1", "ray/n2", "ray/n3"]
+    assert (hosts["ray/n1"].cpus, hosts["ray/n1"].gpus, hosts["ray/n1"].memory) == (2.0, ("0", "1"), 1907)
+    assert hosts["ray/n1"].single and bench.engine.address is None
+
+
+def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_are_told(bench: Bench) -> None:
+    script = (
+        "env > $MUSTER_STORE/env-$AWS_BATCH_JOB_NODE_INDEX; pwd; "
+        "sed 's/.*) //' /proc/$PPID/stat | cut -d' ' -f20 > $MUSTER_STORE/start-$NODE_RANK; exit $NODE_RANK"
+    )
+    gang = bench.gang(script, main=1, gpus=("1",), directory=str(bench.home))
+    plan = bench.engine.plan(gang)
+    assert "# node 1, the main node, on ray/n2\n" in plan.document and plan.document.count("ray.io/node-id") == 3
+    handle = bench.launch(gang)
+    status = bench.ended(handle)
+    assert [node.exit_code for node in status] == [1, 0, 2]
+    at = addresses(bench)
+    assert [node.address for node in status] == [at["n1"], at["n2"], at["n3"]]
+    assert bench.log().count(str(bench.home)) == 3
+    for index in range(3):
+        lines = (bench.store.path / f"env-{index}").read_text().splitlines()
+        found = dict(line.split("=", 1) for line in lines if "=" in line)
+        told = plan.nodes[index].contract.to_env()
+        told["MASTER_PORT"] = found["MASTER_PORT"]
+        assert {name: found.get(name) for name in told} == told
+        assert found["MASTER_ADDR"] == at["n2"] and found["GREETING"] == "hello"
+        assert not [name for name in found if name.startswith("RAY_")], "the cluster's token is not for jobs"
+        assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1") and status[index].gpus == (found["CUDA_VISIBLE_DEVICES"],)
+    outcomes = [read_outcome(bench.run, "job", 1, index) for index in range(3)]
+    assert [outcome.exit_code for outcome in outcomes if outcome] == [1, 0, 2]
+    started = [int((bench.store.path / f"start-{rank}").read_text()) for rank in range(3)]
+    assert started[0] == min(started), "the main node's supervisor is the first"
+    assert bench.stopped(handle) == [1, 0, 2]
+
+
+def test_a_gang_of_one_without_gpus_sees_none(bench: Bench) -> None:
+    script = 'echo "[$CUDA_VISIBLE_DEVICES] $AWS_BATCH_JOB_ID $AWS_BATCH_JOB_NUM_NODES"'
+    handle = bench.launch(bench.gang(script, ("n2",), is_gang=False))
+    assert [node.exit_code for node in bench.ended(handle)] == [0]
+    assert "[] job " in bench.log()
+
+
+def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(bench: Bench) -> None:
+    first = bench.ready(bench.gang(POLITE))
+    driver = bench.driver()
+    assert bench.stopped(first) == [75, 75, 75]
+    assert bench.log().count("saved") == 3
+    # meanwhile the place is kept: the driver and its placement group are those of the next attempt
+    second = bench.ready(bench.gang(STUBBORN, ("n1", "n2"), attempt=2))
+    assert bench.driver() == driver
+    assert bench.stopped(second, 0.5) == [137, 137]
+
+
+def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(bench: Bench) -> None:
+    other = bench.ready(bench.gang(hosts=("n2",), job="other", cpus=2.0))
+    handle = bench.launch(bench.gang(hosts=("n1", "n2")))
+    reason = "waits for room on ray/n2: other work of the Ray cluster holds it"
+    wait_for(lambda: [node.waiting for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
+    bench.engine.stop(other, 1.0)
+    wait_for(lambda: bench.engine.observe(handle) and bench.log().count("ready") == 2, 60, "it starts")
+    assert not any(node.waiting for node in bench.engine.observe(handle))
+    waiting = bench.launch(bench.gang(hosts=("n1", "n2"), job="third", cpus=2.0))
+    wait_for(lambda: "holds it" in bench.engine.observe(waiting)[0].waiting, 30, "a third one waits")
+    bench.engine.stop(waiting, 1.0)
+    assert not any(node.running for node in bench.engine.observe(waiting)), "one that waits can be stopped"
+
+
+def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(hosts=("n1",), directory="/nowhere/at/all"))
+    [node] = bench.ended(handle)
+    assert node.detail == (
+        "node 0 on ray/n1: working directory /nowhere/at/all is not there: it has to be on a volume that all nodes share"
+    )
+    bench.engine.stop(handle, 1.0)
+    fake = bench.cluster.modules / "shared_store"
+    fake.mkdir(parents=True)
+    (fake / "__init__.py").write_text('__version__ = "0.0.1"\n')
+    try:
+        status = bench.ended(bench.launch(bench.gang(hosts=("n1", "n3"), attempt=2)))
+        assert status[0].detail == (
+            f"node 1 on ray/n3 has Muster 0.0.1, the controller {__version__}: install the same on both"
+        )
+        (fake / "__init__.py").write_text("raise ImportError('nothing of it')\n")
+        [node] = bench.ended(bench.launch(bench.gang(hosts=("n3",), attempt=3, job="third")))
+        assert "Muster is not installed there for " in node.detail
+        assert bench.log(attempt=2) == []
+    finally:
+        shutil.rmtree(fake)
+
+
+def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_runs(bench: Bench) -> None:
+    # what such a node finds: not the epoch that the controller has written
+    handle = bench.launch(dataclasses.replace(bench.gang(hosts=("n2",)), epoch=2))
+    [node] = bench.ended(handle)
+    assert node.detail.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
+    assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.detail
+    assert bench.log() == [] and read_outcome(bench.run, "job", 1, 0) is None
+
+
+def test_a_rank_and_a_supervisor_that_are_killed(bench: Bench) -> None:
+    handle = bench.ready(bench.gang(f"echo $$ > $MUSTER_STORE/rank-$NODE_RANK; {WAIT}"))
+    os.kill(int((bench.store.path / "rank-1").read_text()), signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "the rank's end")
+    assert bench.engine.observe(handle)[1].exit_code == 137
+    outcome = read_outcome(bench.run, "job", 1, 1)
+    assert outcome is not None and outcome.reason == "rank 1 was killed by SIGKILL"
+    rank = int((bench.store.path / "rank-2").read_text())
+    os.kill(parent(rank), signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[2].running, 20, "the supervisor's end")
+    wait_for(lambda: not alive(rank), 5, "its rank dies with it")
+    status = bench.engine.observe(handle)
+    assert (status[2].exit_code, status[0].running) == (137, True)
+    assert read_outcome(bench.run, "job", 1, 2) is None
+
+
+def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
+    gang = bench.gang()
+    handle = bench.ready(gang)
+    driver, seen = bench.driver(), bench.engine.observe(handle)
+    bench.engine.close()
+    bench.engine = RayEngine(bench.home / "home")
+    assert bench.engine.observe(handle) == seen
+    assert bench.engine.launch(bench.engine.plan(gang)) == handle and bench.driver() == driver
+    assert bench.log().count("ready") == 3, "found, not started twice"
+    assert bench.stopped(handle) == [143, 143, 143]
+
+
+@pytest.mark.parametrize("killed", ["actor", "shim"])
+def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(bench: Bench, killed: str) -> None:
+    script = f"[ $NODE_RANK = 0 ] || {{ setsid sleep 577 & echo $! > $MUSTER_STORE/apart; }}; echo $PPID > $MUSTER_STORE/supervisor-$NODE_RANK; {WAIT}"
+    handle = bench.ready(bench.gang(script, ("n1", "n2")))
+    apart = int((bench.store.path / "apart").read_text())
+    supervisor = int((bench.store.path / "supervisor-1").read_text())
+    wait_for(lambda: os.getsid(apart) == apart, 5, "a session of its own")
+    shim = parent(supervisor)
+    os.kill(shim if killed == "shim" else parent(shim), signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 30, "the node's end is seen")
+    wait_for(lambda: not alive(apart), 10, "nothing of the node is left")
+    assert bench.engine.observe(handle)[0].running, "the other node goes on"
+    bench.engine.stop(handle, 5.0)
+
+
+def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:
+    handle = bench.ready(bench.gang())
+    os.kill(bench.driver(), signal.SIGKILL)
+    assert [node.exit_code for node in bench.ended(handle)] == [None] * 3
+    wait_for(lambda: not processes_of(bench.store.path), 30, "Ray ends its actors")
+    bench.engine.stop(handle, 1.0)
+    again = bench.ready(bench.gang(attempt=2))
+    assert bench.stopped(again) == [143, 143, 143]
+
+
+def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: Bench) -> None:
+    handle = bench.ready(bench.gang())
+    bench.cluster.kill("n3")
+    wait_for(lambda: not bench.engine.observe(handle)[2].running, 60, "its end is seen")
+    assert [node.running for node in bench.engine.observe(handle)] == [True, True, False]
+    assert bench.stopped(handle)[:2] == [143, 143]
+    wait_for(lambda: len(bench.engine.capacity()) == 2, 60, "the host is gone")
+    bench.cluster.add("n3", PYTHONPATH=str(bench.cluster.modules))
+    wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "it is back")
+
+
+def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: Bench) -> None:
+    [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
+    handle = bench.ready(bench.gang(POLITE, ("n1", "n2")))
+    notice = ["--reason=DRAIN_NODE_REASON_PREEMPTION", "--reason-message=spot", "--deadline-remaining-seconds=60"]
+    command = [RAY, "drain-node", f"--address={bench.cluster.address}", f"--node-id={node}", *notice]
+    subprocess.run(command, check=True, capture_output=True)
+    assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
+    assert bench.log().count("saved") == 2
+    wait_for(lambda: len(bench.engine.capacity()) == 2, 20, "no more a host")
+    bench.cluster.kill("n2")
+    bench.cluster.add("n2")
+    wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "its successor is one")
+
+
+def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: Bench) -> None:
+    bench.cluster.add("controller", cpus=0, gpus=0)  # a driver on the head's own node would go with it
+    wait_for(lambda: bench.engine._watch.seen["join"] == addresses(bench).get("controller"), 20, "it is seen")
+    handle = bench.ready(bench.gang(POLITE))
+    driver = bench.driver()
+    bench.cluster.kill("head")
+    wait_for(bench.engine._watch.problem, 30, "it is missed")
+    late = bench.gang(job="late")
+    with pytest.raises(EngineError, match=r"^the Ray head at .* does not answer; waiting for it$"):
+        bench.engine.launch(bench.engine.plan(late))
+    assert all(node.running for node in bench.engine.observe(handle))
+    bench.cluster.start_head()
+    wait_for(lambda: not bench.engine._watch.problem(), 60, "it is back")
+    assert all(node.running for node in bench.engine.observe(handle)) and bench.driver() == driver
+    assert len(bench.engine.capacity()) == 3
+    assert bench.stopped(handle) == [75, 75, 75]
+    after = bench.ready(bench.gang(attempt=2))
+    assert bench.stopped(after) == [143, 143, 143]
+    bench.cluster.kill("controller")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"RAY_ADDRESS": "127.0.0.1:1"},
+            r"no Ray head answers at 127.0.0.1:1 \(Connection refused\); set RAY_ADDRESS to its host:port",
+        ),
+        (
+            {"RAY_ADDRESS": "ray://head:10001"},
+            r"RAY_ADDRESS is 'ray://head:10001'; the host:port of the cluster's head is needed",
+        ),
+        (
+            {"RAY_AUTH_TOKEN": "another-token-of-somebody"},
+            "wants its token, and another one is set here: RAY_AUTH_MODE=token with",
+        ),
+        ({"RAY_AUTH_MODE": "disabled"}, "wants its token, and none is set here"),
+        (
+            {"MUSTER_RAY_GROWS_TO": "4 machines"},
+            r"MUSTER_RAY_GROWS_TO: '4' is not like 4\*\{cpus:4,memory:8GiB,gpus:1\}",
+        ),
+    ],
+)
+def test_a_cluster_that_can_t_be_used_is_one_line_before_anything_starts(
+    ray_cluster: RayCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, str], message: str
+) -> None:
+    for name, value in change.items():
+        monkeypatch.setenv(name, value)
+    if "RAY_AUTH_TOKEN" in change:
+        monkeypatch.delenv("RAY_AUTH_TOKEN_PATH")
+    with pytest.raises(EngineError, match=message) as refused:
+        RayEngine(tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+def test_other_versions_and_no_ray_at_all_are_one_line_each(
+    ray_cluster: RayCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import ray\nray.__version__ = '2.59.0'\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(EngineError, match=r"runs Ray 2\.60\.0 on Python 3\.\d+, this is Ray 2\.59\.0 on Python"):
+        RayEngine(tmp_path)
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = None\n")
+    (tmp_path / "ray.py").write_text("raise ModuleNotFoundError(\"No module named 'ray'\")\n")
+    (tmp_path / "sitecustomize.py").unlink()
+    with pytest.raises(EngineError, match=r"^the ray engine is not installed: pip install 'muster\[ray\]'$"):
+        RayEngine(tmp_path)
+
+
+def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: Bench) -> None:
+    handle = bench.ready(bench.gang())
+    raylet = bench.cluster.raylet("n3")
+    os.kill(raylet, signal.SIGSTOP)
+    try:
+        wait_for(lambda: not bench.engine.observe(handle)[2].running, 100, "Ray gives it up")
+        assert bench.stopped_there(handle) == [143, 143]
+        wait_for(lambda: not processes_of(bench.store.path), 40, "the node that nobody reaches ends itself")
+    finally:
+        os.kill(raylet, signal.SIGCONT)
+        bench.cluster.kill("n3")
+        bench.cluster.add("n3", PYTHONPATH=str(bench.cluster.modules))

@@ -1,0 +1,188 @@
+"""The Slurm engine when something dies: a rank, a supervisor, Slurm's own processes, a node; limits and preemption."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from orchestrator.engines import slurm
+from orchestrator.engines.base import EngineError, NotYet
+from orchestrator.engines.slurm import SlurmEngine
+from orchestrator.engines.slurm_commands import call
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
+from shared_store.outcomes import read_outcome
+from tests.conftest import MUSTER, Serving, parent, wait_for
+from tests.support.engines.sites import POLITE
+from tests.support.engines.slurm_bench import Bench, slurm_bench
+
+bench = slurm_bench
+
+
+def ranks(bench: Bench) -> list[int]:
+    return bench.processes(b"sleep\x00600")
+
+
+def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=3))
+    bench.ready(handle, 3)
+    parents = {pid: parent(pid) for pid in ranks(bench)}
+    nodes = {
+        Path(f"/proc/{pid}/environ").read_bytes().partition(b"\0AWS_BATCH_JOB_NODE_INDEX=")[2][:1]: pid
+        for pid in parents
+    }
+    os.kill(nodes[b"0"], signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[0].running, 20, "its end is seen")
+    outcome = read_outcome(bench.run, bench.job, 1, 0)
+    assert outcome and (outcome.exit_code, outcome.reason) == (137, "rank 0 was killed by SIGKILL")
+    assert [node.running for node in bench.engine.observe(handle)] == [False, True, True], "the others go on"
+    os.kill(parents[nodes[b"1"]], signal.SIGKILL)
+    wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
+    assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
+    wait_for(lambda: ranks(bench) == [nodes[b"2"]], 5, "its rank went with it")
+    step = parent(parent(parents[nodes[b"2"]]))  # between them is the shim
+    assert b"slurmstepd" in Path(f"/proc/{step}/cmdline").read_bytes()
+    os.kill(step, signal.SIGKILL)
+    wait_for(lambda: not ranks(bench), 5, "supervisor and rank went with it")
+
+
+LIVES_ON = """
+import os, pathlib, signal, time
+from shared_store.checkpoints import CheckpointWriter
+from shared_store.layout import Store
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+run = Store(os.environ["MUSTER_STORE"]).run("run")
+print("ready", flush=True)
+for number in range(1, 100000):
+    time.sleep(0.02)
+    print(f"line {number}", flush=True)
+    if os.environ["RANK"] == "1":
+        try:
+            CheckpointWriter(run, number, int(os.environ["MUSTER_EPOCH"])).commit({})
+        except Exception as error:
+            (run.path / "refused").write_text(str(error))
+"""
+
+
+def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_attempt_has_begun(bench: Bench) -> None:
+    commands = [["python", "-c", LIVES_ON]] * 2
+    first = bench.launch(bench.gang(nodes=2, commands=commands))
+    bench.ready(first, 2)
+    bench.cluster.kill("n2")
+    try:
+        child = bench.ended(first)[1]
+        assert bench.state(first) == "NODE_FAIL" and child.detail.startswith("Slurm lost a node of n[1-2] (job ")
+        bench.engine.stop(first, 5.0)
+        alive = bench.processes(b"worker.supervisor")
+        assert len(alive) == 2, "the shim and the supervisor on n2 live on: Slurm can't reach them"
+        log = bench.run.log(bench.job, 1, 1)
+        before = log.stat().st_size
+        wait_for(lambda: log.stat().st_size > before, 10, "and it still writes")
+        # its machine hangs while the next attempt begins
+        there = [*alive, *bench.processes(b"for number in range")]
+        for pid in there:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(1.1)
+        raise_epoch(bench.run, 2)
+        second = bench.launch(bench.gang(nodes=2, epoch=2, attempt=2, options={"exclude": "n2"}))
+        wait_for(lambda: sum(line.attempt == 2 and line.text == "ready" for line in bench.lines()) == 2, 30, "it runs")
+        size, checkpoints = log.stat().st_size, [checkpoint.name for checkpoint in list_checkpoints(bench.run)]
+        for pid in reversed(there):
+            os.kill(pid, signal.SIGCONT)
+        wait_for(lambda: not set(there) & set(bench.cluster.processes()), 20, "it has read the new epoch and left")
+        assert log.stat().st_size == size, "not a line"
+        assert [checkpoint.name for checkpoint in list_checkpoints(bench.run)] == checkpoints, "and no checkpoint"
+        assert read_outcome(bench.run, bench.job, 1, 1) is None
+        assert all(node.running for node in bench.engine.observe(second))
+    finally:
+        bench.cluster.start("n2")
+
+
+def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    go = threading.Event()
+
+    def slow(*command: str, text: str | None = None) -> str:
+        assert go.wait(60)
+        return call(*command, text=text)
+
+    monkeypatch.setattr(slurm, "call", slow)
+    monkeypatch.setattr(slurm, "_PATIENCE", 0.2)
+    gang = bench.gang("exit 4")
+    plan = bench.engine.plan(gang)
+    for _ in range(3):
+        asked = time.monotonic()
+        with pytest.raises(NotYet, match="Slurm: slurmctld has not answered yet; see `scontrol ping`") as late:
+            bench.engine.launch(plan)
+        assert late.value.unknown and time.monotonic() - asked < 5
+    go.set()
+    handle = bench.launch(gang)
+    assert [node.exit_code for node in bench.ended(handle)] == [4]
+    assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
+
+
+def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: Bench, tmp_path: Path) -> None:
+    served = Serving(tmp_path / "home", "--engine", "slurm")
+    daemon = bench.cluster.daemons["slurmctld"]
+    try:
+        job = served.gang("import time; print('ready', flush=True); time.sleep(600)", env={"MUSTER_DIRECTORY": "/tmp"})
+        served.wait(job, "RUNNING")
+        daemon.send_signal(signal.SIGSTOP)
+        command = [MUSTER, "stop", job]
+        stopping = subprocess.Popen(
+            command, env={**os.environ, "MUSTER_HOME": str(served.home)}, stderr=subprocess.PIPE, text=True
+        )
+        assert stopping.stderr is not None
+        assert "stopped by the user; waits for Slurm: slurmctld " in stopping.stderr.readline()
+        daemon.send_signal(signal.SIGCONT)
+        assert stopping.wait(120) == 0 and served.detail(job)["status"] == "FAILED"
+    finally:
+        daemon.send_signal(signal.SIGCONT)
+        served.close()
+
+
+@pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="half a minute: MUSTER_LONG=1, in make bits")
+def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(POLITE, 2))
+    bench.ready(handle, 2)
+    bench.saved(handle)
+    bench.cluster.kill("slurmctld")
+    with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
+        bench.launch(bench.gang(suffix="2"))  # asks again while there is no answer
+    assert all(node.running for node in bench.engine.observe(handle)), "no news is no end"
+    with pytest.raises(EngineError, match=r"^slurmctld does not answer \(.*\); see `scontrol ping`$"):
+        SlurmEngine()
+    bench.cluster.start("slurmctld")
+    wait_for(lambda: "UP" in bench.cluster.run("scontrol", "ping", check=False), 30, "it is back")
+
+    def launched() -> str | None:
+        try:
+            return bench.launch(bench.gang("exit 4", suffix="2"))
+        except NotYet:
+            return None
+
+    second = wait_for(launched, 30, "it is submitted")
+    assert [node.exit_code for node in bench.ended(second)] == [4]
+    bench.engine.stop(handle, 30.0)
+    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
+
+
+def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: Bench) -> None:
+    # Slurm announces up to a minute early: with 90 s of notice, a limit of one minute is announced at once
+    handle = bench.launch(bench.gang(POLITE, 2, options={"time": "1"}))
+    assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
+    assert bench.log().count("saved") == 2 and "TIMEOUT" not in bench.state(handle)
+
+
+def test_a_partition_with_priority_preempts_and_the_nodes_save_and_leave(bench: Bench) -> None:
+    low = bench.launch(bench.gang(POLITE, 3, cpus=4))
+    bench.ready(low, 3)
+    high = bench.launch(bench.gang(nodes=3, cpus=4, suffix="2", options={"partition": "urgent"}))
+    assert [node.exit_code for node in bench.ended(low)] == [75, 75, 75]
+    assert bench.log().count("saved") == 3
+    bench.ready(high, 3, "2")

@@ -1,0 +1,329 @@
+"""No request, however malformed, yields a 500 or a traceback: fuzzing over HTTP against a real server.
+
+``make test`` sends the same few hundred requests each time; ``make fuzz`` sends ten thousand others each time ($MUSTER_FUZZ says
+how many). The server has too little to start anything, so that nothing of what is submitted ever runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import random
+import socket
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import boto3
+import httpx
+import pytest
+import requests
+import schemathesis
+from botocore.config import Config
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.errors import Unsatisfiable
+
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
+from orchestrator.keys import KeyStore
+from tests.conftest import MUSTER, Serving, processes_of
+from tests.support.conformance import fuzz_requests as good
+from tests.support.conformance import fuzzing
+from tests.support.conformance.fuzzing import Call
+
+EXAMPLES = int(os.environ.get("MUSTER_FUZZ", "300"))
+IS_LONG = "MUSTER_FUZZ" in os.environ
+TOKEN = "fuzz-token-for-tests"
+KEPT = {"default", "local", "fuzz", "fair", "spare", "made"}
+"""Queues and compute environments that the requests name; others are removed now and then, since there may be only 50."""
+
+
+def share(part: float) -> settings:
+    """This part of all examples; the same ones each time, unless many are asked for."""
+    return settings(
+        max_examples=max(1, int(EXAMPLES * part)),
+        derandomize=not IS_LONG,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+class Fuzzed(Serving):
+    """A server with a token (so that odd Host headers get past the guard), whose errors are kept in a file."""
+
+    command: tuple[str, ...] = (MUSTER,)
+
+    def __init__(self, home: Path, *options: str) -> None:
+        self.names: dict[str, str] = {}
+        """Ids for the placeholders of drawn requests."""
+        self.counts: Counter[int] = Counter()
+        """Requests by the status of the answer."""
+        self.heard = 0
+        super().__init__(home, *options)
+
+    def start(self) -> None:
+        self.errors = self.home.parent / "stderr"
+        with open(self.errors, "ab") as errors:
+            self.process = subprocess.Popen(
+                [*self.command, "serve", "--port", "0", *self.options],
+                env={**os.environ, "MUSTER_HOME": str(self.home), "MUSTER_TOKEN": TOKEN},
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+            )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith("Muster serves "), line + self.errors.read_text()
+        self.url = line.split()[2]
+        self.client = Client(self.url, TOKEN)
+        self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
+
+    def restart(self, *options: str) -> None:
+        """Go on with other options on the same home."""
+        super().close()
+        self.options = options
+        self.start()
+
+    def restore(self) -> None:
+        """Bring back what requests have deleted or changed, so that names go on hitting something."""
+        for queue in self._names("DescribeJobQueues", "jobQueues", "jobQueueName") - KEPT:
+            self._try("UpdateJobQueue", jobQueue=queue, state="DISABLED")
+            self._try("DeleteJobQueue", jobQueue=queue)
+        for pool in self._names("DescribeComputeEnvironments", "computeEnvironments", "computeEnvironmentName") - KEPT:
+            self._try("UpdateComputeEnvironment", computeEnvironment=pool, state="DISABLED")
+            self._try("DeleteComputeEnvironment", computeEnvironment=pool)
+        for name in ("fuzz", "spare", "made"):
+            self._try("CreateComputeEnvironment", **good.environment(name))
+            self._try("CreateSchedulingPolicy", **good.policy(name))
+            self._try("CreateJobQueue", **good.queue(name))
+        self._try("CreateJobQueue", **good.queue("fair", schedulingPolicyArn=good.POLICY))
+        for queue in self._names("DescribeJobQueues", "jobQueues", "jobQueueName") & KEPT:
+            self._try("UpdateJobQueue", jobQueue=queue, state="ENABLED")
+        for name in ("gang", "single"):
+            if not self.client.batch("DescribeJobDefinitions", jobDefinitionName=name, status="ACTIVE")[
+                "jobDefinitions"
+            ]:
+                self._try("RegisterJobDefinition", **getattr(good, name)(name))
+        for name, more in (("waiting", {}), ("array", {"arrayProperties": {"size": 3}})):
+            submitted = self._try("SubmitJob", **good.submission("single", **more))
+            self.names |= {name: submitted["jobId"]} if submitted else {}
+
+    def _names(self, operation: str, member: str, key: str) -> set[str]:
+        return {each[key] for each in self.client.batch(operation)[member]}
+
+    def _try(self, operation: str, **request: Any) -> dict[str, Any] | None:
+        try:
+            return self.client.batch(operation, **request)
+        except ApiError as error:
+            assert error.status < 500, error
+            return None
+
+    def send(self, call: Call) -> None:
+        """Send the call as it is and check what every answer must be."""
+        if sum(self.counts.values()) % 100 == 99:
+            self.restore()
+        call = call.fill({**self.names, "new": f"new-{sum(self.counts.values())}"})
+        given = {"Authorization": f"Bearer {TOKEN}", **call.headers}
+        headers = [(name.encode(), value.encode("latin-1")) for name, value in given.items()]
+        target = {"target": call.target.encode()}
+        with self.http.stream(call.method, "/", headers=headers, content=call.body, extensions=target) as answer:
+            if "eventstream" not in answer.headers.get("content-type", ""):  # which would go on for hours
+                answer.read()
+            self.check(answer, call)
+
+    def check(self, answer: httpx.Response, call: Call) -> None:
+        self.counts[answer.status_code] += 1
+        said = self.complaints()
+        assert answer.status_code < 500 and "Traceback" not in said, f"{answer.status_code} for {call}\n{said[-6000:]}"
+        if answer.status_code >= 400:
+            assert answer.headers.get("x-amzn-errortype"), (call, answer.status_code, answer.headers)
+            if call.method != "HEAD":
+                message = answer.json()["message"]
+                assert isinstance(message, str) and message, call
+        elif answer.is_success and "json" in (kind := answer.headers.get("content-type", "")) and call.method != "HEAD":
+            for document in answer.content.splitlines() if "ndjson" in kind else [answer.content]:
+                json.loads(document, parse_constant=lambda name: pytest.fail(f"{name} in the answer to {call}"))
+
+    def complaints(self) -> str:
+        """What the server wrote to its standard error since the last call."""
+        with open(self.errors) as errors:
+            errors.seek(self.heard)
+            said = errors.read()
+            self.heard = errors.tell()
+        return said
+
+    def close(self) -> None:
+        super().close()
+        self.http.close()
+
+
+@pytest.fixture(scope="module")
+def fuzzed(tmp_path_factory: pytest.TempPathFactory, fuzz_report: Counter[str]) -> Iterator[Fuzzed]:
+    """A server that has seen a gang, a single job and a run with logs, and has no room for anything more."""
+    server = Fuzzed(tmp_path_factory.mktemp("fuzz") / "home", "--cpus", "2")
+    batch = server.client.batch
+    native = {"MUSTER_ON_CHILD_FAILURE": "restart", "MUSTER_SPEC": json.dumps({"name": "native", "command": ["true"]})}
+    for name, changes in (("gang", {}), ("single", {}), ("native", {"environment": native})):
+        definition = good.gang(name) if name != "single" else good.single(name)
+        for each in definition.get("nodeProperties", {}).get("nodeRangeProperties", []):
+            pairs = [{"name": key, "value": value} for key, value in changes.get("environment", {}).items()]
+            each["container"]["environment"] += pairs
+        batch("RegisterJobDefinition", **definition)
+        server.names[name] = batch("SubmitJob", jobName=name, jobQueue="default", jobDefinition=name)["jobId"]
+    runs = [server.wait(server.names[name])["run"] for name in ("gang", "single", "native")]
+    server.names["run"] = runs[-1]
+    server.restart("--cpus", "0.1", "--rate-limit", "0")
+    server.restore()
+    yield server
+    for status, count in sorted(server.counts.items()):
+        fuzz_report[f"malformed requests, answered with {status}"] += count
+    server.close()
+
+
+def test_single_faults(fuzzed: Fuzzed) -> None:
+    """One value of a request that works is replaced; some of all such requests, or (``make fuzz``) as good as all."""
+    calls = fuzzing.single_faults()
+    random.Random(None if IS_LONG else 1).shuffle(calls)
+    for operation, request in calls[: EXAMPLES * 2 if IS_LONG else EXAMPLES // 3]:
+        fuzzed.send(fuzzing.call_of(operation, request))
+
+
+@share(0.35)
+@given(call=fuzzing.batch_calls(spoil=False))
+def test_batch_requests_within_the_schema(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+@share(0.3)
+@given(call=fuzzing.batch_calls(spoil=True))
+def test_batch_requests_with_faults(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+@share(0.12)
+@given(call=fuzzing.logs_calls())
+def test_logs_requests(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+@share(0.08)
+@given(call=fuzzing.tag_calls())
+def test_tag_requests(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+@share(0.05)
+@given(call=fuzzing.stray_calls())
+def test_stray_paths(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+@share(0.05)
+@given(call=fuzzing.resume_calls())
+def test_resume_requests(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
+def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
+    schema = schemathesis.openapi.from_url(
+        f"{fuzzed.url}/api/openapi.json", headers={"Authorization": f"Bearer {TOKEN}"}
+    )
+    operations = [each.ok() for each in schema.get_all_operations()]
+    known = st.sampled_from(
+        (None, None, fuzzed.names["gang"], "gang", fuzzed.names["run"], f"{fuzzed.names['array']}:1")
+    )
+    with requests.Session() as session:
+        session.trust_env = False
+
+        def probe(case: schemathesis.Case, name: str | None) -> None:
+            for key in case.path_parameters if name else ():
+                case.path_parameters[key] = name
+            case.query.pop("follow", None)  # the answer goes on until the job is over
+            sent = {"session": session, "headers": {"Authorization": f"Bearer {TOKEN}"}, "timeout": 60}
+            answer = case.call(base_url=fuzzed.url, **sent)
+            case.validate_response(answer, checks=[schemathesis.checks.not_a_server_error])
+            fuzzed.counts[answer.status_code] += 1
+
+        for operation, mode in itertools.product(operations, schemathesis.GenerationMode):
+            cases = operation.as_strategy(generation_mode=mode)
+            with contextlib.suppress(Unsatisfiable):  # no input is wrong where any text will do
+                share(0.3 / len(operations))(given(case=cases, name=known)(probe))()
+    assert "Traceback" not in fuzzed.complaints()
+
+
+GARBAGE = (
+    b"\r\n\r\n",
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"POST http://elsewhere/v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\n\r\n{}",
+    b"OPTIONS * HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: -1\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999999999999999\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n{}\r\n0\r\n\r\n",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: gzip\r\n\r\n{}",
+    b"POST /v1/listjobs HTTP/1.1\r\nHost: a\r\nHost: b\r\nContent-Length: 2\r\n\r\n{}",
+    b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Amz-Target: \xff\xfe\r\nContent-Length: 2\r\n\r\n{}",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"X: " + b"y" * 100_000 + b"\r\n\r\n",
+    b"GET /" + b"x" * 100_000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    b"GET / HTTP/1.0\r\n\r\n",
+)
+
+
+@pytest.mark.parametrize("token", ("", TOKEN))
+@pytest.mark.parametrize("data", GARBAGE, ids=range(len(GARBAGE)))
+def test_bytes_that_are_hardly_http(fuzzed: Fuzzed, data: bytes, token: str) -> None:
+    data = data.replace(b"\r\nHost: 127.0.0.1", b"\r\nHost: 127.0.0.1\r\nAuthorization: Bearer " + token.encode())
+    address = httpx.URL(fuzzed.url)
+    with socket.create_connection((address.host, address.port), timeout=60) as connection:
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        try:
+            answer = connection.recv(1 << 16)
+        except ConnectionResetError:
+            answer = b""
+    assert not answer or answer.split()[1].startswith(b"4"), answer
+    assert "Traceback" not in (said := fuzzed.complaints()), said
+
+
+def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed) -> None:
+    """What all these requests have left behind spoils no answer, no pass of the scheduler and no start."""
+    key = KeyStore(fuzzed.home).create("reader")
+    statuses = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+    for _ in range(2):
+        batch = boto3.client(
+            "batch",
+            endpoint_url=fuzzed.url,
+            region_name="us-east-1",
+            aws_access_key_id=key.access_key_id,
+            aws_secret_access_key=key.secret,
+            config=Config(retries={"max_attempts": 0}),
+        )
+
+        def pages(operation: str, member: str, client: Any = batch, **request: Any) -> list[Any]:
+            return [each for page in client.get_paginator(operation).paginate(**request) for each in page[member]]
+
+        assert pages("describe_compute_environments", "computeEnvironments")
+        assert pages("describe_job_definitions", "jobDefinitions") and pages(
+            "list_scheduling_policies", "schedulingPolicies"
+        )
+        jobs = {status: 0 for status in statuses}
+        for queue in pages("describe_job_queues", "jobQueues"):
+            batch.get_job_queue_snapshot(jobQueue=queue["jobQueueName"])
+            for status in statuses:
+                found = pages("list_jobs", "jobSummaryList", jobQueue=queue["jobQueueName"], jobStatus=status)
+                jobs[status] += len(found)
+                for start in range(0, len(found), 100):
+                    some = [each["jobId"] for each in found[start : start + 100]]
+                    assert len(batch.describe_jobs(jobs=some)["jobs"]) == len(some)
+        assert jobs["SUCCEEDED"] == 3 and jobs["STARTING"] == jobs["RUNNING"] == 0 < jobs["RUNNABLE"]
+        assert processes_of(fuzzed.home) == []
+        fuzzed.restart("--cpus", "0.1")
+    assert "Traceback" not in fuzzed.complaints()

@@ -1,0 +1,249 @@
+"""Keys: their file and their command, when they are demanded, and what the application learns of who asks."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Route
+
+from orchestrator.api.auth import Access, Guard
+from orchestrator.api.limits import RateLimit
+from orchestrator.api.permissions import current_identity
+from orchestrator.database import Database
+from orchestrator.errors import ServerError
+from orchestrator.home import HomeLock
+from orchestrator.keys import KeyStore
+from orchestrator.server import Server
+from orchestrator.tables import JobQueue
+from tests.conftest import Serving, run_muster
+from tests.integration.conformance.test_security import client, refused
+
+
+def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -> None:
+    created = json.loads(run_muster("keys", "create", "a", "--read-only", "--json", home=tmp_path).stdout)
+    assert len(created["accessKeyId"]) == 20 and len(created["secretAccessKey"]) == 40
+    path = tmp_path / "keys.json"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    listed = run_muster("keys", "list", "--json", home=tmp_path).stdout
+    assert json.loads(listed)[0] == {key: value for key, value in created.items() if key != "secretAccessKey"}
+    for text in (listed, run_muster("keys", "list", home=tmp_path).stdout, repr(KeyStore(tmp_path).load())):
+        assert created["accessKeyId"] in text and created["secretAccessKey"] not in text
+    path.chmod(0o640)
+    for command in (["serve", "--port", "0"], ["keys", "list"], ["keys", "create", "b"]):
+        done = run_muster(*command, home=tmp_path)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1 and "chmod 600" in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["create", "../x"],
+        ["create", "a"],
+        ["create", "b", "--queue", "arn:x/y z"],
+        ["delete", "nobody"],
+        ["create", ""],
+    ],
+)
+def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
+    KeyStore(tmp_path).create("a")
+    done = run_muster("keys", *arguments, home=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
+    assert [each.name for each in KeyStore(tmp_path).load().values()] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        (b"{", "Invalid JSON"),
+        (b"\xff\xfe\x00", "Invalid JSON"),
+        (b"[]", "should be an object"),
+        (b'{"keys": [{"name": "a"}]}', "keys.0.accessKeyId"),
+        (b"", "Invalid JSON"),
+    ],
+)
+def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: bytes, part: str) -> None:
+    (tmp_path / "keys.json").write_bytes(text)
+    (tmp_path / "keys.json").chmod(0o600)
+    done = run_muster("serve", "--port", "0", home=tmp_path)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert f"{tmp_path}/keys.json: " in done.stderr and part in done.stderr, done.stderr
+
+
+def test_a_keys_file_damaged_later_leaves_the_last_good_keys_and_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = KeyStore(tmp_path)
+    key = store.create("a")
+    good = store.path.read_bytes()
+    assert list(store.current()) == [key.access_key_id]
+    store.path.write_bytes(b"damaged")
+    for _ in range(3):
+        assert list(store.current()) == [key.access_key_id]
+    assert [record.message.count("keys.json") for record in caplog.records] == [1], caplog.text
+    assert "until then the 1 keys" in caplog.text and key.secret not in caplog.text
+    store.path.write_bytes(good)
+    store.delete("a")
+    assert store.current() == {}
+    assert not Access(store).demanded()
+    store.path.write_bytes(b"damaged")
+    assert Access(store).demanded()
+
+
+def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
+    store = KeyStore(tmp_path)
+    server = Serving(tmp_path, "--cpus", "1")
+    try:
+        assert httpx.get(f"{server.url}/api/runs", headers={"Authorization": "AWS4-HMAC-SHA256 x"}).status_code == 200
+        client(server.url, "any", "any").list_jobs(jobQueue="default")
+        key = store.create("a")
+        refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
+        client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
+        done = run_muster("keys", "delete", "a", home=tmp_path)
+        assert "deleted key a\nit was the last one" in done.stdout, done.stdout
+        assert "on loopback from its own user" in done.stdout and "does not start until" in done.stdout
+        refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
+    finally:
+        server.close()
+
+
+def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path: Path) -> None:
+    done = run_muster("serve", "--host", "0.0.0.0", "--port", "0", home=tmp_path)
+    assert done.returncode == 1 and "muster keys create" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    key = KeyStore(tmp_path).create("a")
+    server = Serving(tmp_path, "--host", "0.0.0.0", "--cpus", "1")
+    try:
+        client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
+        bearer = {"Authorization": f"Bearer {key.access_key_id}:{key.secret}"}
+        for origin in ("http://evil.example", "null", "http://[", server.url + "0"):
+            answer = httpx.get(f"{server.url}/api/runs", headers={**bearer, "Origin": origin})
+            refused(answer, "AccessDeniedException", "other web pages")
+        assert httpx.get(f"{server.url}/api/runs", headers={**bearer, "Origin": server.url}).status_code == 200
+        assert httpx.get(f"{server.url}/api/runs", headers={**bearer, "Host": "muster.example"}).status_code == 200
+    finally:
+        server.close()
+
+
+def test_the_rate_counts_each_client_and_submissions_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("orchestrator.api.limits.time.monotonic", lambda: now)
+    limit = RateLimit(rate=10, submit_rate=2)
+    assert [limit.refusal("a", "submitjob") for _ in range(4)] == [None] * 4
+    assert "submit 2 jobs" in str(limit.refusal("a", "submitjob"))
+    assert [limit.refusal("a", "listjobs") for _ in range(15)] == [None] * 15
+    assert "10 requests" in str(limit.refusal("a", "listjobs"))
+    assert limit.refusal("b", "submitjob") is None
+    now = 101.0
+    assert [bool(limit.refusal("a", "listjobs")) for _ in range(12)] == [False] * 10 + [True] * 2
+    failed = [limit.refusal_of_failures("10.0.0.1") for _ in range(150)]
+    assert failed[:100] == [None] * 100 and "wrong token" in str(failed[100])  # whatever the rate for right ones is
+    assert limit.refusal_of_failures("10.0.0.2") is None
+    now = 150.0
+    limit.refusal("c", "")
+    assert len(limit._buckets) == 1
+    assert not any(RateLimit(rate=0).refusal("a", "submitjob") for _ in range(5000))
+
+
+@pytest.mark.parametrize("token", ["x", "fifteen-letters", "abababababababababababab"])
+def test_a_token_that_can_be_guessed_is_refused_at_the_start(tmp_path: Path, token: str) -> None:
+    with pytest.raises(ServerError, match="MUSTER_TOKEN is too easy to guess: use at least 16 characters"):
+        Server(tmp_path, token=token)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_client_s_key_is_not_taken_for_the_controller_s_own_token(tmp_path: Path) -> None:
+    key = KeyStore(tmp_path).create("wall", read_only=True)
+    with pytest.raises(ServerError, match=f"MUSTER_TOKEN is the key {key.access_key_id} of a client"):
+        Server(tmp_path, token=f"{key.access_key_id}:{key.secret}")
+
+
+def test_a_proxy_is_trusted_by_its_address_and_only_where_keys_are_demanded(tmp_path: Path) -> None:
+    with pytest.raises(ServerError, match="--trust-proxy: 'proxy' does not appear"):
+        Server(tmp_path, trusted_proxies=["proxy"])
+    with pytest.raises(
+        ServerError, match="--trust-proxy: the server is reachable from other machines: first create a key"
+    ):
+        Server(tmp_path, trusted_proxies=["127.0.0.1"])
+
+
+def test_a_home_directory_is_its_users_alone_and_an_open_one_is_closed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = os.umask(0o022)
+    try:
+        HomeLock(tmp_path / "new").release()
+        assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o700 and not caplog.records
+        for name in ("older", "shared"):
+            (tmp_path / name).mkdir(mode=0o755)
+        (tmp_path / "older" / "controller.lock").touch()
+        (tmp_path / "older" / "muster.db").touch(mode=0o644)
+        (tmp_path / "shared" / "of somebody").touch()
+        for name, mode, words in (("older", 0o700, "it is closed to them now"), ("shared", 0o755, "run chmod 700")):
+            HomeLock(tmp_path / name).release()
+            assert stat.S_IMODE((tmp_path / name).stat().st_mode) == mode
+            [record] = caplog.records
+            assert words in record.message and str(tmp_path / name) in record.message
+            caplog.clear()
+        (tmp_path / "elsewhere").mkdir(mode=0o755)
+        for name in ("store", "ray"):
+            (tmp_path / "shared" / name).mkdir(mode=0o755)
+        (tmp_path / "shared" / "kernels").rmdir()
+        (tmp_path / "shared" / "kernels").symlink_to(tmp_path / "elsewhere")
+        HomeLock(tmp_path / "shared").release()
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "shared").iterdir()}
+        assert {name: modes[name] for name in ("store", "ray", "supervisors", "kernels", "of somebody")} == {
+            **dict.fromkeys(("store", "ray", "supervisors"), 0o700),
+            "kernels": 0o755,  # it lies elsewhere, and may be shared
+            "of somebody": 0o644,
+        }
+        said = caplog.records[0].message
+        assert "since it also holds 'of somebody'" in said and "Muster's directories in it are closed" in said
+        database = Database.at(tmp_path / "older")
+        with database.session() as session:
+            session.add(JobQueue(name="x", environments=[]))
+        found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "older").glob("muster.db*")}
+        database.close()
+        assert found == dict.fromkeys(("muster.db", "muster.db-wal", "muster.db-shm", "muster.db.lock"), 0o600)
+    finally:
+        os.umask(before)
+
+
+def test_the_application_sees_who_asks(tmp_path: Path) -> None:
+    key = KeyStore(tmp_path).create("a", ("robots",), read_only=True)
+
+    def who(request: Request) -> JSONResponse:  # in another thread, as all our operations are
+        identity = current_identity.get()
+        assert request.state.identity is identity
+        return JSONResponse([identity.name, sorted(identity.queues or ()), identity.read_only])
+
+    inner = Starlette(routes=[Route("/", who)])
+
+    async def ask(access: Access, token: str) -> Any:
+        transport = httpx.ASGITransport(Guard(inner, access, RateLimit()))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
+            return (await http.get("/", headers={"Authorization": f"Bearer {token}"})).json()
+
+    access = Access(KeyStore(tmp_path), "the-token")
+    assert asyncio.run(ask(access, f"{key.access_key_id}:{key.secret}")) == ["key a", ["robots"], True]
+    assert asyncio.run(ask(access, "the-token")) == ["MUSTER_TOKEN", [], False]
+    assert asyncio.run(ask(access, access.own_token)) == ["this process", [], False]
+    assert asyncio.run(ask(Access(), "any")) == ["address 127.0.0.1", [], False]
+    assert current_identity.get().name == "this process"
+
+
+def test_muster_run_gets_into_the_controller_that_it_brings(tmp_path: Path) -> None:
+    KeyStore(tmp_path).create("a")
+    spec = tmp_path / "job.yaml"
+    spec.write_text("name: own\nresources: {cpus: 0.1}\ncommand: ['true']\n")
+    assert "MUSTER_TOKEN" not in os.environ
+    done = run_muster("run", str(spec), home=tmp_path)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,387 @@
+"""The aws-batch engine on a second Muster, which plays AWS: boto3 reaches it as it would reach AWS itself.
+
+The controller and its store are one home directory, "AWS" and the volume of its nodes are another.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import boto3
+import pytest
+
+from orchestrator.engines import aws_batch
+from orchestrator.engines.aws_batch import AwsBatchEngine
+from orchestrator.engines.aws_config import is_mounted_from
+from orchestrator.engines.base import EngineError, NotYet, Placement
+from shared_store.epoch import Claim, raise_epoch, read_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower
+from tests.conftest import Serving, processes_of, run_muster, wait_for
+from tests.support.engines.aws_bench import JOB, Bench, close
+from tests.support.engines.sites import POLITE, WAIT
+
+LAST = (
+    f'[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/{JOB}/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
+    "do sleep 0.05; done"
+)
+"""Shell: the main node, whose end ends the others wherever they are, waits until they have ended by themselves."""
+
+
+@pytest.fixture(scope="module")
+def aws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    """The second Muster."""
+    serving = Serving(tmp_path_factory.mktemp("aws"), "--cpus", "16")
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "any")
+        yield serving
+    serving.close()
+
+
+@pytest.fixture
+def bench(aws: Serving, tmp_path: Path) -> Iterator[Bench]:
+    found = Bench(aws, tmp_path)
+    yield found
+    close(found)
+
+
+@pytest.fixture
+def workstation(aws: Serving, tmp_path: Path) -> Iterator[Bench]:
+    """A controller whose store is the volume itself."""
+    found = Bench(aws, tmp_path, store_is_shared=True)
+    yield found
+    close(found)
+
+
+PRINT = "env | grep -E '^(AWS_|MASTER_|MUSTER_|NODE_RANK|NNODES|RANK|WORLD_SIZE|GREETING)' | sort"
+
+
+def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_home(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(f"{PRINT}; {LAST}", 3, main=1))
+    assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], bench.log()
+    facts = json.loads(handle)
+    lines = [line for line in LogFollower(bench.run, JOB).drain() if line.rank is not None]
+    told = [dict(line.text.split("=", 1) for line in lines if line.node == index) for index in range(3)]
+    main = told[1]["MUSTER_ADDRESS"]
+    for index, env in enumerate(told):
+        assert env["GREETING"] == "hello" and env["MUSTER_ON_CHILD_FAILURE"] == "restart"
+        assert (env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"], env["WORLD_SIZE"]) == (main, "29500", "3", "3")
+        assert env["NODE_RANK"] == env["RANK"] == str({1: 0, 0: 1, 2: 2}[index])
+        assert env["AWS_BATCH_JOB_ID"] == f"{facts['aws']}#{index}", "AWS's own"
+        assert (env["AWS_BATCH_JOB_NODE_INDEX"], env["AWS_BATCH_JOB_MAIN_NODE_INDEX"]) == (str(index), "1")
+        assert env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") == (None if index == 1 else main)
+        assert (env["MUSTER_JOB_ID"], env["MUSTER_RUN"], env["MUSTER_EPOCH"]) == (JOB, "run", "1")
+        assert env["MUSTER_STORE"] == str(bench.volume.path) and env["MUSTER_GANG"] == f"{JOB}/1/1"
+        assert not {"MUSTER_NODE", "MUSTER_ENVIRONMENT", "MUSTER_BUS", "MUSTER_BUS_TOKEN"} & set(env)
+    assert len({env["MUSTER_ADDRESS"] for env in told}) == 3
+    assert [bench.outcome(index).reason for index in range(3)] == ["done"] * 3
+    volume = bench.volume.run("run")
+    assert read_epoch(volume) == 1 and volume.description() is not None, "the nodes made the run on their volume"
+
+
+def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: Bench) -> None:
+    script = (
+        "import json, os, time\n"
+        "error = {'message': {'message': 'RuntimeError: no', 'extraInfo': {'py_callstack': 'trace', 'timestamp': '1'}}}\n"
+        "json.dump(error, open(os.environ['TORCHELASTIC_ERROR_FILE'], 'w')); raise SystemExit(3)"
+    )
+    handle = bench.launch(bench.gang(nodes=1, commands=[["python", "-c", script]]))
+    [node] = bench.ended(handle)
+    outcome = bench.outcome(0)
+    assert node.exit_code == 3 and outcome.exit_code == 3
+    assert outcome.error is not None and outcome.error.message == "RuntimeError: no", outcome
+
+
+def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tmp_path: Path) -> None:
+    bench = Bench(aws, tmp_path, image="1.dkr.ecr/muster:2", file_system="fs-1", access_point="fsap-1", efa=True)
+    gang = bench.gang(nodes=3, timeout=100, placements=[Placement("h", ("0", "1"), 3.5, 4096)] * 3)
+    plan = bench.engine.plan(gang)
+    document = json.loads(plan.document)
+    definition, submission = document["RegisterJobDefinition"], document["SubmitJob"]
+    [entry] = definition["nodeProperties"]["nodeRangeProperties"]
+    container = entry["container"]
+    assert (entry["targetNodes"], container["image"]) == ("0:2", "1.dkr.ecr/muster:2")
+    assert container["command"] == ["python", "-P", "-m", "worker.aws_node", "--", "sh", "-c", WAIT]
+    amounts = {each["type"]: each["value"] for each in container["resourceRequirements"]}
+    assert amounts == {"VCPU": "4", "MEMORY": "4096", "GPU": "2"}, "AWS takes whole vCPUs only"
+    assert container["linuxParameters"]["sharedMemorySize"] == 2048
+    assert container["linuxParameters"]["devices"][0]["hostPath"] == "/dev/infiniband/uverbs0"
+    assert container["volumes"][0]["efsVolumeConfiguration"] == {
+        "fileSystemId": "fs-1",
+        "transitEncryption": "ENABLED",
+        "authorizationConfig": {"accessPointId": "fsap-1", "iam": "ENABLED"},
+    }
+    assert container["mountPoints"][0]["containerPath"] == str(bench.volume.path)
+    assert container["logConfiguration"]["options"] == {"awslogs-group": "/aws/batch/job"}
+    assert definition["retryStrategy"] == {"attempts": 1} and submission["timeout"] == {"attemptDurationSeconds": 700}
+    names = {each["name"] for each in container["environment"]}
+    assert not any(name.startswith("AWS_BATCH") for name in names), "reserved on AWS"
+    again = json.loads(bench.engine.plan(bench.gang(nodes=3, attempt=2, placements=gang.placements)).document)
+    assert again["RegisterJobDefinition"] == definition, "one definition for all attempts"
+    tagged = bench.gang(nodes=1, options={"job-queue": "night", "image": "other:1", "share": "alice"}, priority=7)
+    changed = json.loads(bench.engine.plan(tagged).document)["SubmitJob"]
+    assert (changed["jobQueue"], changed["shareIdentifier"], changed["schedulingPriorityOverride"]) == (
+        "night",
+        "alice",
+        7,
+    )
+
+
+def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: Bench) -> None:
+    kinds = [["sh", "-c", f"echo kind {kind}"] for kind in (0, 0, 1)]
+    handle = bench.launch(bench.gang(nodes=3, commands=kinds, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 3))
+    bench.ended(handle)
+    assert [line for line in bench.log() if line == "kind 0"] and bench.outcome(0).exit_code == 0
+    many = [["echo", str(kind)] for kind in range(6)]
+    with pytest.raises(EngineError, match="of 6 kinds; AWS Batch takes at most 5"):
+        bench.engine.plan(bench.gang(nodes=6, commands=many))
+
+
+def test_what_was_submitted_by_a_controller_that_died_is_found(bench: Bench) -> None:
+    gang = bench.gang()
+    handle = bench.launch(gang)
+    successor = AwsBatchEngine(bench.home)
+    assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
+    bench.ready(2)
+    assert len(bench.processes()) == len({*bench.processes()}) and len(processes_of(bench.volume.path)) == 2
+    bench.engine.stop(handle, 1.0)
+    second = bench.gang("exit 0", attempt=2)
+    assert json.loads(bench.launch(second))["aws"] != json.loads(handle)["aws"]
+    definitions = bench.aws.client.batch("DescribeJobDefinitions", jobDefinitionName=f"muster-{gang.title}")
+    assert len(definitions["jobDefinitions"]) == 2, "another command is another revision"
+
+
+def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(POLITE, 2))
+    bench.ready(2)
+    bench.engine.stop(handle, 10.0)
+    assert bench.processes() == []
+    assert bench.outcome(0).exit_code == 75 and bench.log().count("saved") == 2, bench.log()
+    assert [node.running for node in bench.engine.observe(handle)] == [False, False]
+
+
+@pytest.mark.parametrize("store", ["bench", "workstation"])
+def test_a_child_whose_supervisor_is_killed_ends_the_gang(request: pytest.FixtureRequest, store: str) -> None:
+    """AWS itself would let it run for ever; no controller looks meanwhile."""
+    bench = request.getfixturevalue(store)
+    handle = bench.launch(bench.gang(nodes=3))
+    bench.ready(3)
+    os.kill(_supervisor(bench, 2), signal.SIGKILL)
+    wait_for(lambda: bench.processes() == [], 30, "the end of all nodes without a controller")
+    status = bench.ended(handle)
+    assert all(node.exit_code for node in status), status
+    assert bench.outcome(0).reason == "node 2 vanished: its supervisor or its host died"
+    assert bench.outcome(0).exit_code == 143 and bench.log().count("ready") == 3
+
+
+def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_does_not(bench: Bench) -> None:
+    failing = "echo ready; case $NODE_RANK in 0) exec sleep 600;; 1) exit 0;; 2) sleep 1; exit 3;; esac"
+    bench.ended(bench.launch(bench.gang(failing, 3)))
+    assert bench.outcome(0).reason == "node 2: rank 2 exited with code 3"
+    assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
+
+
+def test_where_a_child_s_death_is_ignored_it_is(bench: Bench) -> None:
+    script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
+    handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
+    assert bench.ended(handle)[0].exit_code == 0
+    assert bench.log() == ["done without it"] and bench.outcome(1).exit_code == 3
+
+
+def test_an_image_without_muster_runs_as_it_is(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("echo plain $GREETING $AWS_BATCH_JOB_NODE_INDEX; exit 4", 1, native=False))
+    [node] = bench.ended(handle)
+    assert node.exit_code == 4
+    wait_for(lambda: "plain hello 0" in bench.log(), 10, "its log")
+    assert bench.outcome(0).exit_code == 4
+
+
+def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
+    script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
+    running = bench.launch(bench.gang(script, 1, native=False))
+    wait_for(lambda: bench.engine.observe(running) and "tick 1" in bench.log(), 20, "its first line")
+    for attempt in (2, 3):
+        short = bench.launch(bench.gang("true", 1, native=False, attempt=attempt))
+        bench.ended(short)
+        bench.engine.stop(short, 1.0)
+    bench.ended(running)
+    bench.engine.stop(running, 1.0)
+    ticks = [line for line in bench.log() if line.startswith("tick")]
+    assert ticks == [f"tick {i}" for i in range(1, 101)]
+    assert [node.exit_code for node in bench.ended(running)] == [0], "it is remembered, or asked for anew"
+    assert bench.log().count("tick 100") == 1
+
+
+def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workstation: Bench) -> None:
+    handle = workstation.launch(workstation.gang(f"echo rank $RANK; {LAST}; exit $RANK", 2))
+    assert [node.exit_code for node in workstation.ended(handle)][1] == 1
+    assert sorted(workstation.log())[:2] == ["rank 0", "rank 1"] and len(workstation.log()) == 2
+    assert workstation.outcome(1).reason == "rank 1 exited with code 1"
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0, reason="NOT TESTED: the EFS volume of a definition is a mount, and mounting needs root"
+)
+def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path: Path) -> None:
+    bench = Bench(aws, tmp_path, file_system="fs-1", store=str(tmp_path / "mount"))
+    handle = bench.launch(bench.gang("touch $MUSTER_STORE/models", 1, run="mounted"))
+    assert [node.exit_code for node in bench.ended(handle)] == [0]
+    volume = Store(aws.home / "store")  # what lies on the file system of whatever plays AWS
+    assert read_epoch(volume.run("mounted")) == 1 and (volume.path / "models").exists()
+    assert list((tmp_path / "mount").iterdir()) == [], "nobody else sees it there"
+    close(bench)
+
+
+def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: Bench) -> None:
+    volume = bench.volume.run("run")
+    volume.create({"run": "run"})
+    raise_epoch(volume, 9)
+    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
+    assert node.exit_code == 3 and read_epoch(volume) == 9
+    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    assert not any("wrote" in line for line in lines)
+    assert any("the run now belongs to epoch 9" in line for line in lines), lines
+
+
+def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(bench: Bench) -> None:
+    volume = bench.volume.run("run")
+    volume.create({"run": "run"})
+    raise_epoch(volume, 1, Claim("", "another-job", 2))
+    [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
+    assert node.exit_code == 3
+    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    assert not any("wrote" in line for line in lines)
+    assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
+
+
+def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -> None:
+    handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
+
+    def reason() -> str:
+        [node] = bench.engine.observe(handle)
+        assert node.running
+        return node.waiting if "500" in node.waiting else ""
+
+    said = wait_for(reason, 10, "the reason")
+    assert said.startswith("AWS Batch: ") and "CPUs" in said
+    host = bench.engine.capacity()[0]
+    assert (host.name, host.single) == ("aws-batch/default", False) and host.cpus > 0
+    away = Bench(bench.aws, bench.home)
+    nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
+    away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
+    [node] = away.engine.observe(handle)
+    assert node.running and "does not answer" in node.waiting
+    with pytest.raises(NotYet, match="does not answer"):
+        away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
+
+
+MOUNTS = """\
+22 1 259:1 / / rw - ext4 /dev/root rw
+40 22 0:50 / /muster/volume rw - nfs4 fs-1.efs.us-east-1.amazonaws.com:/ rw
+41 22 0:51 / /home rw - nfs4 server:/home rw
+42 22 0:52 / /tunnel rw - nfs4 127.0.0.1:/ rw
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "volume", "found"),
+    [
+        ("/muster/volume/muster", "fs-1", True),
+        ("/muster/volume/muster", "fs-2", False),
+        ("/tunnel/store", "fs-1", True),
+        ("/home/me/.muster/store", "fs-1", False),
+        ("/home/me/.muster/store", None, True),
+        ("/var/store", None, False),
+    ],
+)
+def test_a_store_that_is_mounted_from_the_volume_is_the_volume(path: str, volume: str | None, found: bool) -> None:
+    assert is_mounted_from(Path(path), volume, MOUNTS) is found
+
+
+def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match=r"aws\.json is missing: .*muster aws up"):
+        AwsBatchEngine(tmp_path)
+    (tmp_path / "aws.json").write_text('{"regoin": "eu-west-1"}')
+    with pytest.raises(EngineError, match=r"unknown key regoin; valid: .*region"):
+        AwsBatchEngine(tmp_path)
+    (tmp_path / "aws.json").write_text('{"region": "us-east-1", "job_queue": "q", "image": "i", "poll": "2"}')
+    with pytest.raises(EngineError, match=r'aws\.json: poll: expected a number, found "2"$'):
+        AwsBatchEngine(tmp_path)
+
+
+def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match=r"127\.0\.0\.1:9\) does not answer: .*endpoint_url in aws\.json"):
+        Bench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
+    with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
+        Bench(aws, tmp_path / "queue", job_queue="robots")
+    assert run_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
+    keyed = Serving(tmp_path / "keyed")
+    try:
+        with pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
+            Bench(keyed, tmp_path / "credentials")
+    finally:
+        keyed.close()
+
+
+def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: Bench) -> None:
+    examined = run_muster("doctor", "--engine", "aws-batch", home=bench.home)
+    assert examined.returncode == 0 and "ok  engine aws-batch 1 host" in examined.stdout, examined.stdout
+
+
+YAML = """
+name: survivor
+nodes: 3
+resources: {{cpus: 0.1, memory: 32MiB}}
+retry: {{attempts: 3}}
+command: [sh, -c, 'echo ready $AWS_BATCH_JOB_ATTEMPT; while [ ! -e {gate}/$AWS_BATCH_JOB_ATTEMPT ]; do sleep 0.05; done; echo done']
+"""
+
+
+def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench: Bench) -> None:
+    (bench.home / "job.yaml").write_text(YAML.format(gate=bench.home))
+    controller = Serving(bench.home, "--engine", "aws-batch", "--store", str(bench.home / "store"))
+    try:
+        submitted = controller.muster("submit", str(bench.home / "job.yaml"))
+        assert submitted.returncode == 0, submitted.stderr
+        job = json.loads(controller.muster("list", "--json").stdout)[0]["jobId"]
+        wait_for(lambda: controller.log(job).count("ready 1") == 3, 60, "attempt 1 is ready")
+        os.kill(_rank(bench, 2), signal.SIGKILL)
+        wait_for(lambda: controller.log(job).count("ready 2") == 3, 60, "attempt 2 is ready")
+        controller.kill()
+        (bench.home / "2").touch()
+        wait_for(lambda: not processes_of(bench.volume.path), 30, "the gang ends while nobody looks")
+        controller.start()
+        detail = controller.wait(job)
+        assert detail["status"] == "SUCCEEDED", detail
+        assert detail["attempts"][0]["statusReason"].startswith("node 2: rank 2 was killed by SIGKILL"), detail
+        log = controller.log(job)
+        assert [log.count(line) for line in ("ready 1", "ready 2", "done")] == [3, 3, 3], log
+    finally:
+        controller.close()
+
+
+def _supervisor(bench: Bench, node: int) -> int:
+    return next(
+        pid for pid in processes_of(bench.aws.home) if _is(pid, node) and b"worker.aws_node" in _words(pid)[4:5]
+    )
+
+
+def _rank(bench: Bench, node: int) -> int:
+    return next(pid for pid in processes_of(bench.volume.path) if _is(pid, node))
+
+
+def _words(pid: int) -> list[bytes]:
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    return [b"", *words] if b"worker.aws_node" in words[:4] else words
+
+
+def _is(pid: int, node: int) -> bool:
+    return f"AWS_BATCH_JOB_NODE_INDEX={node}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")

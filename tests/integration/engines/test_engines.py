@@ -1,0 +1,104 @@
+"""Choosing an engine: mistakes are one line, before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orchestrator.engines import ENGINES, make_engine, slurm_commands
+from orchestrator.engines.base import EngineError
+from orchestrator.engines.mounts import Mount, with_mounts
+from orchestrator.engines.ray_cluster import ray_environment
+from tests.conftest import run_muster
+from tests.support.engines.slurm_cluster import need_slurm
+
+
+def test_an_unknown_engine_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    refused = run_muster("serve", "--port", "0", "--engine", "dokcer", home=tmp_path)
+    assert (
+        refused.returncode == 2
+        and refused.stderr == f"muster: --engine dokcer: there is no such engine; there are {', '.join(ENGINES)}\n"
+    )
+    assert not (tmp_path / "muster.db").exists(), "nothing was made"
+
+
+def test_without_a_docker_engine_nothing_starts(tmp_path: Path) -> None:
+    refused = run_muster(
+        "serve", "--port", "0", "--engine", "docker", home=tmp_path, DOCKER_HOST="unix:///nowhere.sock"
+    )
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
+    assert refused.stderr == (
+        "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
+    )
+
+
+def test_without_slurm_s_commands_or_its_controller_nothing_starts(tmp_path: Path) -> None:
+    refused = run_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, PATH="/nowhere")
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
+    assert refused.stderr.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
+    need_slurm()
+    configuration = tmp_path / "slurm.conf"
+    configuration.write_text(
+        "ClusterName=away\nSlurmctldHost=localhost\nSlurmctldPort=1\nAuthType=auth/none\nCredType=cred/none\n"
+        "NodeName=n1\nPartitionName=p Nodes=n1\nMessageTimeout=2\n"
+    )
+    refused = run_muster("serve", "--port", "0", "--engine", "slurm", home=tmp_path, SLURM_CONF=str(configuration))
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1, refused.stderr
+    assert refused.stderr.startswith("muster: slurmctld does not answer (")
+    assert refused.stderr.endswith("see `scontrol ping`\n")
+
+
+def test_slurm_without_its_configuration_is_said_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need_slurm()
+    if Path("/etc/slurm/slurm.conf").exists():
+        pytest.skip("this machine belongs to a cluster")
+    monkeypatch.delenv("SLURM_CONF", raising=False)
+    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path)
+    assert bad.returncode == 1
+    assert "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/" in bad.stdout
+    bad = run_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf", timeout=20)
+    assert "SLURM_CONF is /no/slurm.conf, which is not there; set it to the cluster's slurm.conf" in bad.stdout
+
+
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    with pytest.raises(
+        EngineError, match=f"^volume /mnt: the {engine} engine mounts only as root; start `muster serve`"
+    ):
+        with_mounts(["true"], [Mount("/data", "/mnt")], engine)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("-h", "/mnt"),
+        ("--", "/mnt"),
+        ("data", "/mnt"),
+        ("/data", "--"),
+        ("/data", "mnt"),
+        ("/data", "/"),
+        ("/a/../b", "/mnt"),
+    ],
+)
+def test_what_is_mounted_and_where_are_absolute_paths(source: str, target: str) -> None:
+    with pytest.raises(EngineError, match=r"^volume .*: two absolute paths without '..' are needed$"):
+        with_mounts(["true"], [Mount(source, target)])
+
+
+def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
+    assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
+    with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):
+        make_engine("kubernetes", tmp_path)
+
+
+def test_what_an_engine_s_own_commands_hand_on_to_jobs_is_without_the_other_engines_secrets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"):
+        monkeypatch.setenv(name, "secret")
+    assert {name for name, value in slurm_commands.environment().items() if value == "secret"} == {"SLURM_JWT"}
+    assert {name for name, value in ray_environment("h:1").items() if value == "secret"} == {
+        *("RAY_AUTH_TOKEN", "SLURM_JWT")
+    }

@@ -1,0 +1,354 @@
+"""The Slurm engine on a real cluster of one slurmctld and three slurmd: submitted, placed, found again, stopped, and gone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.engines import slurm_commands, slurm_script
+from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
+from orchestrator.engines.slurm import SlurmEngine
+from orchestrator.engines.slurm_commands import SlurmJob, list_hosts
+from orchestrator.engines.slurm_words import ending, waiting
+from tests.conftest import Serving, wait_for
+from tests.support.engines.sites import POLITE, STUBBORN, WAIT
+from tests.support.engines.slurm_bench import Bench, slurm_bench
+from tests.support.engines.slurm_cluster import GPUS, NODES
+
+bench = slurm_bench
+
+
+def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: Bench) -> None:
+    hosts = bench.engine.capacity()
+    assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
+        (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
+    ]
+    bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
+    try:
+        assert [host.away for host in SlurmEngine().capacity()] == [False, True, False]
+        handle = bench.launch(bench.gang(nodes=3))
+        wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].waiting, 20, "it is queued")
+        bench.engine.stop(handle, 0.0)
+    finally:
+        bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
+
+
+def test_a_job_for_more_hosts_than_there_are_now_is_taken_and_says_what_it_waits_for(
+    bench: Bench, tmp_path: Path
+) -> None:
+    spec = tmp_path / "job.yaml"
+    spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
+    bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
+    served = Serving(tmp_path / "home", "--engine", "slurm")
+    try:
+
+        def waits(reason: str) -> None:
+            wait_for(lambda: reason in served.detail("large")["statusReason"], 20, reason)
+
+        done = served.muster("submit", str(spec))
+        assert done.returncode == 0, done.stderr
+        waits("Slurm: nodes that it needs are down, drained or reserved")
+        served.muster("stop", "large")
+        done = served.muster("submit", str(spec), "--set", "nodes=4")
+        assert done.returncode == 0, done.stderr
+        waits("needs 4 hosts, one for each node; there are 3")
+        refused = served.muster("submit", str(spec), "--set", "resources.cpus=9")
+        assert refused.returncode == 2 and "the largest host has 4 CPUs" in refused.stderr, refused.stderr
+        assert served.muster("stop", "large").returncode == 0
+    finally:
+        served.close()
+        bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
+
+
+@pytest.mark.parametrize(
+    ("state", "away"),
+    [
+        ("IDLE", False),
+        ("MIXED+PLANNED", False),
+        ("IDLE+CLOUD+POWERED_DOWN", False),
+        ("IDLE+CLOUD+POWERING_DOWN", False),
+        ("ALLOCATED+CLOUD+NOT_RESPONDING+POWERING_UP", False),
+        ("DOWN*", True),
+        ("DOWN+CLOUD+POWERED_DOWN", True),
+        ("IDLE+DRAIN", True),
+        ("IDLE+NOT_RESPONDING", True),
+        ("IDLE+MAINTENANCE", True),
+    ],
+)
+def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_is_away(
+    state: str, away: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = f"NodeName=n1 CPUTot=4 RealMemory=8192 State={state} Gres=gpu:2\nNodeName=n2 State=FUTURE\n"
+    monkeypatch.setattr(slurm_commands, "call", lambda *command: line)
+    assert [(host.name, host.away) for host in list_hosts()] == [("slurm/n1", away)]
+
+
+def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hard = "a'b\"c\nd $HOME `date` \\ é\tMUSTER\n@nodes@ %j"
+    monkeypatch.setenv("MUSTER_TOKEN", "secret")
+    monkeypatch.setenv("MUSTER_DATABASE", "secret")
+    monkeypatch.setenv("SBATCH_PARTITION", "closed")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
+    monkeypatch.setenv("FROM_THE_CONTROLLER", "kept")
+    show = "exec python3 -c \"import os, json; print(json.dumps({**os.environ, 'cwd': os.getcwd()}))\""
+    environments = [
+        {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart", "NODE": str(i)} for i in range(3)
+    ]
+    gang = bench.gang(
+        show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS, title='a "job" \\ é $HOME #1'
+    )
+    handle = bench.launch(gang)
+    assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(json.loads(handle)["output"]).read_text()
+    told = sorted((json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"]))
+    assert [env["AWS_BATCH_JOB_NODE_INDEX"] for env in told] == ["0", "1", "2"]
+    assert [env["RANK"] for env in told] == ["1", "0", "2"], "rank 0 is on the main node"
+    assert [env["SLURMD_NODENAME"] for env in told] == ["n2", "n1", "n3"], "which comes first"
+    addresses = bench.cluster.addresses
+    assert [env["MUSTER_ADDRESS"] for env in told] == [addresses[name] for name in ("n2", "n1", "n3")]
+    assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
+    for env in told:
+        assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
+        assert env["SLURM_JOB_NAME"] == gang.title
+        assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], told[0]["MASTER_PORT"])
+        assert env["CUDA_VISIBLE_DEVICES"] == "0,1", "as Slurm set it"
+        assert env["FROM_THE_CONTROLLER"] == "kept" and env["MUSTER_GANG"] == f"{bench.job}/1/1"
+        assert not {"MUSTER_TOKEN", "MUSTER_DATABASE", "SLURM_RESTART_COUNT"} & set(env)
+    assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in told[1]
+
+
+def test_without_gpus_a_node_sees_none_and_two_jobs_on_one_host_have_two_ports(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
+    script = f'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; {WAIT}'
+    pin = {"nodelist": "n1"}
+    first = bench.launch(bench.gang(script, options=pin))
+    second = bench.launch(bench.gang(script, options=pin, suffix="2"))
+    bench.ready(first)
+    bench.ready(second, suffix="2")
+    lines = [bench.log()[0], bench.log("2")[0]]
+    assert all(line.startswith("gpus[] port ") for line in lines) and lines[0] != lines[1], lines
+
+
+def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: Bench) -> None:
+    handle = bench.launch(
+        bench.gang("env | grep ^AWS_BATCH | sort; exit 3", is_gang=False, array=(4, 9), environments=[{}])
+    )
+    [node] = bench.ended(handle)
+    assert node.exit_code == 3
+    names = [line.partition("=")[0] for line in bench.log() if line.startswith("AWS_BATCH")]
+    assert "AWS_BATCH_JOB_ARRAY_INDEX=4" in bench.log() and not [name for name in names if "NODE" in name]
+
+
+def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitted(bench: Bench) -> None:
+    gang = bench.gang(nodes=2)
+    handle = bench.launch(gang)
+    successor = SlurmEngine()
+    assert successor.launch(successor.plan(gang)) == handle, "found, not submitted twice"
+    bench.ready(handle, 2)
+    assert all(node.running for node in SlurmEngine().observe(handle)) or wait_for(
+        lambda: all(node.running and not node.waiting for node in successor.observe(handle)), 10, "known by its handle"
+    )
+    bench.engine.stop(handle, 0.0)
+    assert successor.launch(successor.plan(gang)) == handle, "an ended one, too"
+    assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
+
+
+def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(bench: Bench) -> None:
+    handle = bench.launch(bench.gang("exit 0"))
+    bench.ended(handle)
+    facts = {**json.loads(handle), "slurm": "999999", "gang": "forgotten/1/1"}
+    assert [node.exit_code for node in look(json.dumps(facts))] == [0]
+    forgotten = {**facts, "job": "another"}
+    [node] = look(json.dumps(forgotten))
+    assert (node.running, node.detail) == (False, "Slurm has forgotten the job, and the node left no outcome")
+    bench.engine.stop(json.dumps(forgotten), 1.0)
+
+
+def look(handle: str) -> list[NodeStatus]:
+    """What an engine without a memory sees, once it has asked."""
+    engine = SlurmEngine()
+    return wait_for(  # type: ignore[no-any-return]
+        lambda: status if not (status := list(engine.observe(handle)))[0].running else None, 10, "an answer"
+    )
+
+
+def test_a_gang_waits_for_room_with_slurm_s_reason(bench: Bench) -> None:
+    big = bench.launch(bench.gang(nodes=3, cpus=4))
+    bench.ready(big, 3)
+    small = bench.launch(bench.gang(cpus=4, suffix="2"))
+
+    def waits(text: str, handle: str = small) -> bool:
+        [first, *_] = bench.engine.observe(handle)
+        return first.running and not first.address and text in first.waiting
+
+    wait_for(lambda: waits("waits for nodes to become free (Resources; job"), 20, "its reason")
+    many = bench.launch(bench.gang(nodes=4, suffix="4"))
+    wait_for(lambda: waits("more nodes than the partition has", many), 20, "its reason")
+    closed = bench.launch(bench.gang(suffix="5", options={"partition": "closed"}))
+    wait_for(lambda: waits("the partition is down", closed), 20, "its reason")
+    long = bench.launch(bench.gang(suffix="6", options={"partition": "short"}, timeout=3600))
+    wait_for(lambda: waits("more time than the partition allows", long), 20, "its reason")
+    bench.cluster.run("scancel", json.loads(closed)["slurm"])
+    [node] = bench.ended(closed)
+    assert node.detail.startswith("it was cancelled in Slurm, not by Muster (job "), node
+    bench.engine.stop(small, 5.0)
+    assert bench.state(small) == "CANCELLED" and not bench.engine.observe(small)[0].running
+    bench.engine.stop(big, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        (
+            {"options": {"partition": "gpu"}},
+            "for partition gpu: invalid partition specified: gpu; .*Invalid partition name",
+        ),
+        ({"gpus": 3}, "Slurm refuses the job: .*Requested node configuration is not available"),
+        ({"cpus": 5}, "Slurm refuses the job: .*Requested node configuration is not available"),
+        ({"options": {"nice": "much"}}, "muster:nice is 'much', not a whole number"),
+        ({"title": "a\nb"}, "title .* has a control character"),
+        (
+            {"nodes": 2, "placements": [Placement("a", (), 1, 64), Placement("b", (), 1, 128)]},
+            "nodes of one gang are of one size on Slurm, these are not .*64 MiB.*128 MiB",
+        ),
+        (
+            {
+                "containers": [
+                    {
+                        "volumes": [{"name": "v", "host": {"sourcePath": "/data"}}],
+                        "mountPoints": [{"sourceVolume": "v", "containerPath": "/mnt"}],
+                    }
+                ]
+            },
+            "volume /mnt: the slurm engine mounts nothing",
+        ),
+    ],
+)
+def test_what_slurm_can_t_do_is_refused_in_one_line(bench: Bench, changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(EngineError, match=why) as refused:
+        bench.launch(bench.gang(**changes))
+    assert "\n" not in str(refused.value) and not isinstance(refused.value, NotYet)
+    assert not bench.cluster.run("squeue", "-h")
+
+
+def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: Bench) -> None:
+    options = {"partition": "urgent", "qos": "high", "gpu": "a100", "nice": "100", "hosts": "x"}
+    gang = bench.gang(
+        nodes=2, gpus=2, options=options, timeout=3600, priority=30, title='my "job" é', bus="tcp/1", bus_token="secret"
+    )
+    document = bench.engine.plan(gang).document
+    for line in (
+        '--job-name="my \\"job\\" é"',
+        f"--comment={gang.name}",
+        "--nodes=2",
+        "--ntasks-per-node=1",
+        "--mem=64M",
+        "--gpus-per-node=a100:2",
+        "--partition=urgent",
+        "--qos=high",
+        "--nice=70",
+        "--time=62",
+        "--signal=B:USR1@35",
+        "--open-mode=append",
+        "--no-requeue",
+    ):
+        assert f"#SBATCH {line}\n" in document, document
+    assert "secret" not in document
+    assert (
+        "#SBATCH --time=0:20:00\n" in bench.engine.plan(dataclasses.replace(gang, options={"time": "0:20:00"})).document
+    )
+
+
+def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
+    polite = bench.launch(bench.gang(POLITE, 3))
+    bench.ready(polite, 3)
+    bench.engine.stop(polite, 30.0)
+    assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75, 75]
+    assert bench.log().count("saved") == 3 and not bench.processes(b"worker.supervisor")
+    stubborn = bench.launch(bench.gang(STUBBORN, suffix="2", grace=60.0))
+    bench.ready(stubborn, suffix="2")
+    asked = time.monotonic()
+    bench.engine.stop(stubborn, 1.0)
+    assert time.monotonic() - asked > 0.9
+    assert bench.engine.observe(stubborn)[0].exit_code == 137 and not bench.processes(b"worker.supervisor")
+
+
+def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: Bench) -> None:
+    for number, pause in enumerate((0.0, 0.3, 0.6)):
+        handle = bench.launch(bench.gang(nodes=2, suffix=str(number)))
+        time.sleep(pause)
+        bench.engine.stop(handle, 3.0)
+        assert not bench.processes(b"worker.supervisor") and not any(n.running for n in bench.engine.observe(handle))
+
+
+def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: Bench) -> None:
+    nowhere = bench.launch(bench.gang(nodes=2, directory="/no/such/place"))
+    # what a node with another disk at the store's path finds: no such epoch
+    other = bench.launch(bench.gang(nodes=1, epoch=2, suffix="2"))
+    for node, name in zip(bench.ended(nowhere), NODES, strict=False):
+        assert node.exit_code == 2
+        assert node.detail == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
+    [node] = bench.ended(other)
+    assert node.exit_code == 2 and node.detail.startswith(f"muster supervisor: store {bench.store.path} on "), node
+    assert " is not the controller's: run run has epoch 1 there, not 2" in node.detail
+
+
+def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "executable", "/no/python")
+        handle = bench.launch(bench.gang(nodes=2))
+    for node in bench.ended(handle):
+        assert not node.running and node.detail.endswith("/no/python: No such file or directory"), node
+    monkeypatch.setattr(slurm_script, "output_path", lambda gang: "/nowhere/slurm.out")
+    [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
+    assert (
+        node.detail.startswith("Slurm could not start it on n1: is ")
+        and "file system that all nodes share" in node.detail
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "words"),
+    [
+        (
+            "PENDING",
+            "QOSMaxCpuPerUserLimit",
+            "Slurm: a limit of the account or QOS is reached (QOSMaxCpuPerUserLimit; job 5)",
+        ),
+        ("PENDING", "ReqNodeNotAvail, UnavailableNodes:n1", "Slurm: nodes that it needs are down, drained or reserved"),
+        (
+            "PENDING",
+            "Nodes required for job are DOWN, DRAINED or reserved for jobs in higher priority partitions",
+            "Slurm: nodes that it needs are down, drained or reserved",
+        ),
+        ("PENDING", "SomethingNew", "Slurm: waits (SomethingNew; job 5)"),
+        ("CONFIGURING", "None", "Slurm: n1 is being made ready (job 5)"),
+    ],
+)
+def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason: str, words: str) -> None:
+    assert waiting(SlurmJob("5", state, reason, "n1", "")).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("state", "code", "words"),
+    [
+        ("PREEMPTED", 75, "preempted by Slurm, and did not leave in time (job 5)"),
+        ("TIMEOUT", 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)"),
+        ("OUT_OF_MEMORY", 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
+        ("NODE_FAIL", 137, "Slurm lost a node of n1 (job 5)"),
+        ("SOMETHING_NEW", 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
+    ],
+)
+def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(state: str, code: int, words: str) -> None:
+    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (code, words)

@@ -1,0 +1,132 @@
+"""A volume that runs full: nothing new starts or is accepted, what runs can be stopped, all is said, and all goes on with room."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from botocore.exceptions import ClientError
+from sqlalchemy import func, select, update
+
+from orchestrator.database import Database, DatabaseFull
+from orchestrator.disk import DEFAULT, Disk, MinFree
+from orchestrator.errors import ApiError
+from orchestrator.tables import JobQueue
+from tests.conftest import Serving, processes_of, run_muster, wait_for
+from tests.support.conformance.streams import client_of
+from tests.training.faults.test_store import fill
+
+SLEEP = "import time; print('begun', flush=True); time.sleep(3000)"
+FLOOD = "import os; os.execvp('timeout', ['timeout', '5', 'yes'])"
+
+
+@pytest.fixture
+def volume(tmp_path: Path) -> Iterator[Path]:
+    """A volume of its own of 40 MB, in memory."""
+    target = tmp_path / "volume"
+    target.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40m", "tmpfs", str(target)], capture_output=True)
+    if done.returncode:
+        pytest.skip(f"NOT TESTED: a full disk needs a small volume, which can't be mounted here: {done.stderr!r}")
+    yield target
+    subprocess.run(["umount", "-l", str(target)], check=False)
+
+
+def free(volume: Path) -> int:
+    found = os.statvfs(volume)
+    return found.f_bavail * found.f_frsize
+
+
+def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_not_fill_it(volume: Path) -> None:
+    server = Serving(volume / "home", "--cpus", "2")
+    with open(volume.parent / "stderr", "wb") as log:  # it must not fill its own pipe, nor the volume
+        copying = subprocess.Popen(["cat"], stdin=server.process.stderr, stdout=log)
+        try:
+            sleeper = server.gang(SLEEP, name="sleeper")
+            server.wait(sleeper, "RUNNING")
+            flood = server.gang(FLOOD, name="flood")
+            waiting = server.gang("print('at last')", name="waiting", cpus="1.95")
+            server.wait(flood, "RUNNING")
+            wait_for(lambda: any("left out" in line for line in server.log(flood)), 30, "more lines than the log keeps")
+            assert free(volume) > 10 << 20, "a flood does not fill the volume"
+            filler = fill(volume)
+            wait_for(lambda: "MB free" in server.detail(waiting)["statusReason"], 60, "the reason of what waits")
+            assert "--min-free" in server.detail(sleeper)["statusReason"], "a running job says so, too"
+
+            batch = client_of(server.url, "batch")
+            batch.terminate_job(jobId=sleeper, reason="make room")
+            assert server.wait(sleeper)["statusReason"] == "make room"
+            ended = server.wait(flood)
+            assert ended["status"] == "FAILED" and ended["attempts"][0]["nodes"][0]["exitCode"] == 124, ended
+            assert server.detail(waiting)["status"] == "RUNNABLE"
+            with pytest.raises(ClientError, match="MB free") as refused:
+                batch.submit_job(jobName="more", jobQueue="default", jobDefinition="sleeper")
+            assert refused.value.response["ResponseMetadata"]["HTTPStatusCode"] == 503
+            assert refused.value.response["Error"]["Code"] == "ServerException"
+            with pytest.raises(ApiError, match="nothing new is accepted"):
+                server.gang("pass", name="another")
+            shown = server.muster("show", waiting)
+            assert "MB free" in " ".join(shown.stdout.split()), shown.stdout
+
+            filler.unlink()
+            assert server.wait(waiting)["status"] == "SUCCEEDED" and "at last" in server.log(waiting)
+            assert server.wait(server.gang("pass", name="another"))["status"] == "SUCCEEDED"
+        finally:
+            server.close()
+            copying.wait(10)
+    said = (volume.parent / "stderr").read_text()
+    assert "Traceback" not in said and len(said) < 4000, said
+    assert "MB free" in said and "the volumes have enough free space again" in said
+    assert not processes_of(server.home)
+
+
+def test_the_database_ends_jobs_on_a_volume_without_a_free_byte(volume: Path) -> None:
+    database = Database.at(volume)
+    with database.session() as session:
+        session.add(JobQueue(name="q", priority=1, environments=[], tags={}, limits=[]))
+    fill(volume)
+    for priority in range(2000):
+        with database.session() as session:
+            session.execute(update(JobQueue).values(priority=priority))
+    with pytest.raises(DatabaseFull, match="its volume is full; make room there"), database.session() as session:
+        for number in range(200):
+            session.add(JobQueue(name=f"q{number}", priority=1, environments=["x" * 100_000], tags={}, limits=[]))
+    with database.session() as session:
+        assert session.scalar(select(func.count()).where(JobQueue.name.startswith("q"))) == 1
+    database.close()
+
+
+def test_the_database_may_lie_on_another_volume_than_the_home(tmp_path: Path, volume: Path) -> None:
+    server = Serving(tmp_path / "home", "--cpus", "1", "--database", str(volume / "jobs.db"))
+    try:
+        assert (volume / "jobs.db").exists() and not (tmp_path / "home" / "muster.db").exists()
+        fill(volume)
+        time.sleep(1.5)  # a look at the volume
+        with pytest.raises(ApiError, match=r"the volume of the database \(.*volume\) has 0 MB free"):
+            server.gang("pass")
+    finally:
+        server.close()
+
+
+def test_a_minimum_is_a_size_a_share_or_nothing() -> None:
+    assert DEFAULT.of(10 << 40) == 1 << 30 and DEFAULT.of(1 << 30) == (1 << 30) // 20
+    assert MinFree.parse("512MiB").of(1) == 512 << 20 and MinFree.parse("2.5%").of(1000) == 25
+    assert MinFree.parse("0").of(1 << 40) == 0
+    for wrong in ("", "much", "1", "101%", "-1GiB", "1 EiB"):
+        with pytest.raises(ValueError, match="expected a size such as 1GiB"):
+            MinFree.parse(wrong)
+
+
+def test_only_the_volume_that_is_short_is_named(tmp_path: Path) -> None:
+    disk = Disk({"store": tmp_path, "database": tmp_path / "gone"}, MinFree(share=1.0))
+    assert "the volume of the store" in str(disk.shortage()) and disk.shortage("database") is None
+
+
+def test_a_wrong_minimum_is_told_in_one_line(tmp_path: Path) -> None:
+    said = run_muster("serve", "--min-free", "lots", home=tmp_path)
+    assert said.returncode != 0 and said.stderr.count("\n") == 1
+    assert "--min-free lots: expected a size such as 1GiB, a share such as 5%, or 0" in said.stderr

@@ -1,0 +1,441 @@
+"""The database on SQLite and on a real PostgreSQL server: migrations, locks, history, and a controller on top."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from sqlalchemy import create_engine, select, text
+from sqlalchemy.exc import IntegrityError
+
+from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
+from orchestrator.database import Database, DatabaseError, find_job
+from orchestrator.errors import ApiError, ServerError
+from orchestrator.roster import Roster
+from orchestrator.schema import MIGRATIONS, NEWEST
+from orchestrator.server import Server
+from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
+from shared_store.layout import Store
+from tests.conftest import Serving, wait_for
+from tests.support.orchestrator import postgres
+from tests.support.orchestrator.rows import job
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[postgres.Server]:
+    binaries = postgres.programs()
+    if binaries is None:
+        pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
+    with postgres.serving(binaries) as running:
+        yield running
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'muster.db'}"
+    return str(request.getfixturevalue("server").new_database())
+
+
+@pytest.fixture
+def opened(url: str) -> Iterator[Callable[[], Database]]:
+    """Opens the database; all are closed at the end."""
+    databases: list[Database] = []
+
+    def make() -> Database:
+        databases.append(Database(url))
+        return databases[-1]
+
+    yield make
+    for database in databases:
+        database.close()
+
+
+@pytest.mark.parametrize("history", ["new", "migrated"])
+def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
+    url: str, opened: Callable[[], Database], history: str
+) -> None:
+    if history == "migrated":
+        _migrate(url, "upgrade", "head")
+    database = opened()
+    with database.engine.connect() as connection:
+        context = MigrationContext.configure(connection)
+        assert compare_metadata(context, Base.metadata) == [] and context.get_current_revision() == NEWEST
+    with database.session() as session:
+        assert [queue.name for queue in session.scalars(select(JobQueue))] == ["default"]
+        assert [each.name for each in session.scalars(select(ComputeEnvironment))] == ["local"]
+
+
+def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_jobs(
+    url: str, opened: Callable[[], Database]
+) -> None:
+    _migrate(url, "upgrade", "0001")
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
+        connection.execute(
+            text(
+                "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
+                "attempts_allowed) VALUES ('j1', 'old', 'default', 'arn', '{}', '{}', 'r', 'FAILED', 5, 3)"
+            )
+        )
+        connection.execute(
+            text(
+                "INSERT INTO attempts (job_id, number, epoch, nodes, created_at, spent) VALUES ('j1', 1, 1, '[]', 5, :spent)"
+            ),
+            {"spent": True},
+        )
+    engine.dispose()
+    with opened().session() as session:
+        old = session.get_one(Job, "j1")
+        assert [attempt.number for attempt in old.attempts] == [1]
+        assert (old.name, old.attempts_allowed, old.kind, old.tags, old.evaluate_on_exit) == (
+            "old",
+            3,
+            "multinode",
+            {},
+            [],
+        )
+
+
+def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_definition(
+    url: str, opened: Callable[[], Database]
+) -> None:
+    _migrate(url, "upgrade", "0003")
+    engine = create_engine(url)
+    insert = (
+        "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
+        "attempts_allowed, kind, tags, parent) VALUES (:id, 'old', 'default', 'arn', '{}', :properties, :id, 'RUNNABLE', 5, "
+        '3, :kind, \'{"a": "b"}\', :parent)'
+    )
+    with engine.begin() as connection:
+        for each, kind, parent in (("p", "array", None), ("p:0", "container", "p"), ("alone", "container", None)):
+            row = {"id": each, "kind": kind, "parent": parent, "properties": '{"numNodes": 1}'}
+            connection.execute(text(insert), row)
+    engine.dispose()
+    with opened().session() as session:
+        stored = dict(session.execute(text("SELECT id, node_properties IS NULL FROM jobs")).tuples().all())
+        assert {name: bool(shared) for name, shared in stored.items()} == {"p": False, "p:0": True, "alone": False}
+        for name in ("p", "p:0", "alone"):
+            job_ = session.get_one(Job, name)
+            assert (job_.node_properties, job_.tags, job_.parameters) == ({"numNodes": 1}, {"a": "b"}, {})
+    _migrate(url, "downgrade", "0003")
+    engine = create_engine(url)
+    with engine.connect() as connection:
+        assert connection.scalar(text("SELECT count(*) FROM jobs WHERE node_properties IS NULL")) == 0
+    engine.dispose()
+
+
+def test_runs_of_an_older_database_belong_to_the_queue_and_owner_of_their_first_job(
+    url: str, opened: Callable[[], Database]
+) -> None:
+    _migrate(url, "upgrade", "0004")
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for number, (run, queue, key, epoch) in enumerate(
+            [
+                ("a", "lab", "key x/1/2", 1),
+                ("a", "default", None, 2),
+                ("b", "default", None, 1),
+                ("c", "lab", None, None),
+            ]
+        ):
+            connection.execute(
+                text(
+                    "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
+                    "attempts_allowed, idempotency_key, first_epoch) "
+                    "VALUES (:id, 'j', :queue, 'arn', '{}', '{}', :run, 'FAILED', :at, 1, :key, :epoch)"
+                ),
+                {"id": f"j{number}", "at": number, "run": run, "queue": queue, "key": key, "epoch": epoch},
+            )
+    engine.dispose()
+    with opened().session() as session:
+        runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}
+        assert runs == {"a": ("lab", "key x"), "b": ("default", None)}  # c never started: there is no run of it
+        assert session.get_one(Job, "j0").owner == "key x"
+
+
+def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:
+    database = Database.at(tmp_path)
+    with pytest.raises(IntegrityError), database.session() as session:
+        session.add(Attempt(job_id="no such job", number=1, epoch=1, nodes=[]))
+    database.close()
+
+
+def test_down_and_up_again_leaves_the_tables_as_they_are(url: str, opened: Callable[[], Database]) -> None:
+    opened().close()
+    _migrate(url, "downgrade", "0001")
+    _migrate(url, "downgrade", "base")
+    with opened().engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+
+
+def test_a_database_of_a_newer_version_is_refused_in_one_line(url: str, opened: Callable[[], Database]) -> None:
+    first = opened()
+    with first.engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    first.close()
+    with pytest.raises(DatabaseError, match=r"written by a newer Muster \(schema 9999\); install that version"):
+        Database(url)
+
+
+def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseError, match=r"^database sqlite:///.*nowhere/x.db: .*unable to open database file$"):
+        Database(f"sqlite:///{tmp_path}/nowhere/x.db")
+    with pytest.raises(DatabaseError) as refused:
+        Database("postgresql+psycopg://muster:secret@127.0.0.1:1/none")
+    assert "secret" not in str(refused.value) and "127.0.0.1:1/none" in str(refused.value)
+    with pytest.raises(DatabaseError, match="nosuch"):
+        Database("nosuch://x/y")
+
+
+def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(server: postgres.Server) -> None:
+    url = server.new_database()
+    script = f"from orchestrator.database import Database; d = Database({url!r}); print('up', flush=True); input()"
+    first = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert first.stdout is not None and first.stdout.readline() == b"up\n"
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        Database(url)
+    first.kill()
+    first.wait()
+    Database(url).close()
+
+
+@pytest.mark.parametrize("how", ["{}", "sqlite:///{}"])
+def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path: Path, how: str) -> None:
+    path = tmp_path / "m.db"
+    (tmp_path / "link.db").symlink_to(path)
+    before = os.umask(0o022)
+    try:
+        first = Server(tmp_path / "a", database=how.format(path))
+        for other in (path, tmp_path / "link.db"):
+            with pytest.raises(ServerError) as refused:
+                Server(tmp_path / "b", database=how.format(other))
+            said = f"database sqlite:///{other}: another controller has it; use that one, or stop it first"
+            assert str(refused.value) == said
+        modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in ("m.db", "m.db-wal", "m.db-shm")}
+        assert set(modes.values()) == {0o600}, modes
+        first.close()
+        path.chmod(0o644)
+        Server(tmp_path / "b", database=how.format(path)).close()
+        assert path.stat().st_mode & 0o777 == 0o600
+    finally:
+        os.umask(before)
+
+
+def test_a_controller_that_lost_its_database_to_another_refuses_writes_and_goes_on_reading(
+    server: postgres.Server, tmp_path: Path
+) -> None:
+    url = server.new_database()
+    losing = Server(tmp_path, database=url)
+    losing.start()
+    other, waiter = create_engine(url).connect(), create_engine(url).connect()
+    lock = f"SELECT pg_advisory_lock({0x6D7573746572})"
+    waiting = threading.Thread(target=waiter.execute, args=(text(lock),), daemon=True)
+    waiting.start()
+    queued = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted")
+    wait_for(lambda: other.scalar(queued), 30, "the other one to wait for the lock")
+    other.execute(text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND granted"))
+    with httpx.Client(base_url=losing.url, timeout=60) as client:
+        try:
+            wait_for(lambda: losing.controller.trouble, 30, "that it notices")
+            for operation, request in (
+                ("canceljob", {"jobId": "x", "reason": "x"}),
+                ("submitjob", {"jobName": "x", "jobQueue": "default", "jobDefinition": "x"}),
+            ):
+                answer = client.post(f"/v1/{operation}", json=request)
+                assert answer.status_code == 503 and "another controller has it" in answer.json()["message"]
+            assert client.post("/v1/listjobs", json={"jobQueue": "default"}).status_code == 200
+            waiter.invalidate()
+            waiter.close()
+            wait_for(lambda: client.get("/healthz").status_code == 200, 30, "that it has the database again")
+            answer = client.post("/v1/canceljob", json={"jobId": "x", "reason": "x"})
+            assert answer.status_code == 400 and "does not exist" in answer.json()["message"]
+        finally:
+            waiter.close()
+            other.close()
+            losing.close()
+
+
+def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:
+    database = opened()
+    told: list[set[str]] = []
+    database.committed = lambda jobs: told.append({each.id for each in jobs})
+    with database.session() as session:
+        session.add_all([job("a"), job("b")])
+    with pytest.raises(RuntimeError), database.session() as session:
+        session.get_one(Job, "a").stop_reason = "never"
+        session.flush()
+        raise RuntimeError
+    with database.session() as session:
+        session.get_one(Job, "b").status_reason = "changed"
+    assert told == [{"a", "b"}, {"b"}]
+
+
+def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
+    database, live = opened(), Roster()
+    database.committed = live.note
+    with database.session() as session:
+        states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
+        session.add_all(job(status, status=status) for status in states)
+        session.add(job("ending", status="RUNNABLE", stop_reason="enough"))
+    fresh = Roster()
+    with database.session() as session:
+        fresh.load(session)
+    for roster, due in ((live, ["SUBMITTED", "ending"]), (fresh, ["PENDING", "SUBMITTED", "ending"])):
+        assert [entry.job for entry in roster.waiting()] == ["RUNNABLE"]
+        assert sorted(roster.active()) == ["RUNNING", "STARTING"]
+        assert sorted(roster.take_due()) == due, "what was pending may have become ready while nobody looked"
+
+
+def test_a_stop_that_comes_while_the_controller_writes_is_looked_at() -> None:
+    roster, stale = Roster(), job("a", status="RUNNABLE")
+    roster.look_again(["a"])  # a request has just ended the job
+    roster.note([stale])  # the controller commits what it had read before
+    assert list(roster.take_due()) == ["a"]
+
+
+def test_an_array_keeps_its_children_until_the_last_is_over(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        session.add_all(
+            [job("p", status="PENDING", kind="array"), job("p:0", status="FAILED", stopped_at=1, parent="p")]
+        )
+        session.add(job("p:1", status="RUNNING", parent="p"))
+        session.commit()
+        assert forget_before(session, 2000) == 0
+        for each in session.scalars(select(Job)):
+            each.status, each.stopped_at = "FAILED", 2
+        session.commit()
+        assert [forget_before(session, 2000) for _ in range(3)] == [2, 1, 0], "the array after its children"
+
+
+def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Database]) -> None:
+    over = {"status": "SUCCEEDED", "stopped_at": 1000}
+    with opened().session() as session:
+        session.add_all([job("old", **over), job("needed", **over), job("waits", status="PENDING")])
+        session.add(job("young", status="SUCCEEDED", stopped_at=now()))
+        session.add(Attempt(job_id="old", number=1, epoch=1, nodes=[]))
+        session.add(Dependency(job_id="waits", on_id="needed"))
+        session.commit()
+        assert forget_before(session, 2000) == 1
+        assert sorted(session.scalars(select(Job.id))) == ["needed", "waits", "young"]
+        assert session.scalars(select(Attempt.job_id)).all() == []
+
+
+def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Database], tmp_path: Path) -> None:
+    run = Store(tmp_path / "store").open().run("r")
+    nodes = [{"gpus": ["0", "1"], "cpus": 4.0}, {"gpus": ["2", "3"], "cpus": 4.0}]
+    failed = Attempt(job_id="a", number=1, epoch=1, nodes=nodes, created_at=10_000, stopped_at=70_000, ending="failed")
+    charge(failed, run, 70_000)
+    assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
+    assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
+    done = Attempt(job_id="a", number=2, epoch=2, nodes=nodes, created_at=10_000, stopped_at=20_000, ending="succeeded")
+    charge(done, run, 20_000)
+    assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
+    assert resource_seconds(failed, 70_000) == 240.0
+
+
+def test_what_a_share_used_halves_with_its_decay_time(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        add_usage(session, "default", "red", 100.0, 60, 1_000_000)
+        add_usage(session, "default", "red", 10.0, 60, 1_060_000)
+        assert usage_at(session, 1_060_000, {"default": 60}, []) == {("default", "red"): pytest.approx(60.0)}
+        assert usage_at(session, 1_000_000, {"default": 60}, []) == {("default", "red"): pytest.approx(60.0)}
+        assert usage_at(session, 1_060_000, {}, []) == {}
+
+
+def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) -> None:
+    with opened().session() as session:
+        session.add_all([job("aaaa1111", name="x"), job("aaaa2222", name="y"), job("aaaa2222:0", parent="aaaa2222")])
+        session.flush()
+        found = {text: find_job(session, text) for text in ("aaaa1111", "y", "aaaa2", "aaaa", "aaa", "aaaa2222:0")}
+    assert {text: each and each.id for text, each in found.items()} == {
+        "aaaa1111": "aaaa1111",
+        "y": "aaaa2222",
+        "aaaa2": "aaaa2222",
+        "aaaa": None,
+        "aaa": None,
+        "aaaa2222:0": "aaaa2222:0",
+    }
+
+
+def test_a_controller_whose_lock_was_lost_takes_it_again_or_says_who_has_it(server: postgres.Server) -> None:
+    url = server.new_database()
+    database, others = Database(url), create_engine(url)
+
+    def cut() -> None:
+        with others.connect() as connection:
+            connection.execute(
+                text(
+                    "SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND pid != pg_backend_pid()"
+                )
+            )
+
+    cut()
+    database.keep_lock()
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        Database(url)
+    cut()
+    second = Database(url)
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        database.keep_lock()
+    second.close()
+    database.keep_lock()
+    database.close()
+    others.dispose()
+
+
+def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.Server, tmp_path: Path) -> None:
+    url = server.new_database()
+    serving = Serving(tmp_path / "home", "--cpus", "2", "--database", url)
+    try:
+        job = serving.gang("print('hello from', __import__('os').environ['MUSTER_RUN'])", nodes=2, name="on-postgres")
+        assert serving.wait(job)["status"] == "SUCCEEDED"
+        for operation, request in (("DescribeJobs", {"jobs": ["a\0"]}), ("ListJobs", {"jobQueue": "a\0"})):
+            with pytest.raises(ApiError, match="the database refuses a value") as refused:
+                serving.client.batch(operation, **request)
+            assert refused.value.status == 400
+        running = serving.gang("import time; time.sleep(600)", name="running")
+        serving.wait(running, "RUNNING")
+        with server.away():
+            with pytest.raises(ApiError, match="database postgresql") as away:
+                serving.gang("pass")
+            assert away.value.status == 503
+            health = f"{serving.url}/healthz"
+            wait_for(
+                lambda: (a := httpx.get(health)).status_code == 503 and "postgresql" in a.json()["message"],
+                30,
+                "its trouble",
+            )
+        wait_for(lambda: httpx.get(health).status_code == 200, 30, "that it serves again")
+        assert serving.wait(serving.gang("print('again')"))["status"] == "SUCCEEDED"
+        assert serving.detail(running)["status"] == "RUNNING"
+        serving.client.batch("TerminateJob", jobId=running, reason="enough")
+        serving.wait(running)
+        serving.kill()
+        serving.start()
+        detail = serving.detail(job)
+        assert detail["status"] == "SUCCEEDED" and detail["attempts"][0]["cpuSeconds"] > 0
+        assert any("hello from on-postgres-" in line for line in serving.log(job))
+        assert not (serving.home / "muster.db").exists()
+    finally:
+        serving.close()
+
+
+def _migrate(url: str, direction: str, revision: str) -> None:
+    config, engine = Config(), create_engine(url)
+    config.set_main_option("script_location", str(MIGRATIONS))
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        getattr(command, direction)(config, revision)
+    engine.dispose()

@@ -1,0 +1,371 @@
+"""How a node ends: by itself, by a failure, on request, by force, and what is told of it. All of it is real."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from shared_store.contract import sealed
+from shared_store.epoch import raise_epoch
+from shared_store.outcomes import LONGEST_TEXT
+from tests.conftest import alive, wait_for
+from tests.support.worker.node import Nodes, gone
+
+# -- ends -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_exception_is_told_with_its_traceback(node: Nodes) -> None:
+    n = node()
+    script = "import sys\nprint('a warning', file=sys.stderr)\ndef f():\n    raise ValueError('bad reward')\nf()"
+    assert n.python(script) == 1
+    outcome = n.ended()
+    assert outcome.reason == "rank 0 exited with code 1: ValueError: bad reward"
+    assert outcome.error
+    assert (outcome.error.rank, outcome.error.message) == (0, "ValueError: bad reward")
+    assert outcome.error.traceback.startswith("Traceback (most recent call last):\n")
+    assert "in f" in outcome.error.traceback
+    assert outcome.error.traceback.endswith("\nValueError: bad reward")
+    assert n.lines()[-1] == (None, "o", f"node 0 ended: {outcome.reason}")
+
+
+def test_of_several_tracebacks_the_last_one_counts(node: Nodes) -> None:
+    n = node()
+    script = "import traceback\ntry: {}['handled']\nexcept KeyError: traceback.print_exc()\nraise OSError('fatal')"
+    assert n.python(script) == 1
+    assert n.ended().error.message == "OSError: fatal"  # type: ignore[union-attr]
+
+
+def test_without_a_traceback_the_last_line_on_standard_error_is_the_error(node: Nodes) -> None:
+    n = node()
+    assert n.shell("echo first >&2; echo 'fatal: no such device' >&2; echo >&2; echo out; exit 9") == 9
+    outcome = n.ended()
+    assert outcome.reason == "rank 0 exited with code 9: fatal: no such device"
+    assert (outcome.error.message, outcome.error.traceback) == ("fatal: no such device", "")  # type: ignore[union-attr]
+
+
+def test_a_silent_failure_is_told_by_its_code(node: Nodes) -> None:
+    n = node()
+    assert n.shell("exit 9") == 9
+    assert (n.ended().reason, n.ended().error) == ("rank 0 exited with code 9", None)
+
+
+@pytest.mark.parametrize(
+    ("content", "message", "traceback", "when"),
+    [
+        (
+            {"message": {"message": "CUDA broke", "extraInfo": {"py_callstack": "Traceback …", "timestamp": "1234"}}},
+            "CUDA broke",
+            "Traceback …",
+            1234.0,
+        ),
+        ({"message": "just a text"}, "just a text", "", None),
+        ({"message": 3}, "on stderr", "", None),
+        ({"message": {"message": "m", "extraInfo": {"timestamp": "soon"}}}, "on stderr", "", None),
+        ([], "on stderr", "", None),
+        ("", "on stderr", "", None),
+        ({"message": {"message": "m", "extraInfo": [1]}}, "on stderr", "", None),
+        ({"message": {"message": "m", "extraInfo": {"time": -1e300}}}, "m", "", None),
+        ({"message": "x" * 100_000}, "x" * (LONGEST_TEXT - 64) + " … (83680 characters left out)", "", None),
+    ],
+)
+def test_the_error_file_of_torchrun_is_honoured_if_it_holds_an_error(
+    node: Nodes, content: object, message: str, traceback: str, when: float | None
+) -> None:
+    n = node()
+    text = json.dumps(content) if content else ""
+    script = f"import os, sys; open(os.environ['TORCHELASTIC_ERROR_FILE'], 'w').write({text!r}); sys.exit('on stderr')"
+    assert n.python(script) == 1
+    error = n.ended().error
+    assert error
+    assert (error.message, error.traceback) == (message, traceback)
+    assert error.time == when if when else abs(error.time - time.time()) < 20
+
+
+@pytest.mark.parametrize(
+    ("write", "problem"),
+    [
+        ("file.write('[' * 200_000)", "nested too deep"),
+        ("file.write('x' * 60_000_000)", "more than 1048576 bytes"),
+        ("file.close(); os.remove(path); os.mkfifo(path)", "not a regular file"),
+    ],
+)
+def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time(
+    node: Nodes, write: str, problem: str
+) -> None:
+    n = node()
+    begin = "import os, sys; path = os.environ['TORCHELASTIC_ERROR_FILE']; file = open(path, 'w'); "
+    assert n.python(f"{begin}{write}; sys.exit(7)") == 7
+    ended = n.ended()
+    assert ended.error and ended.error.message.endswith(f"error-0.json: {problem}")
+    assert ended.reason == f"rank 0 exited with code 7: {ended.error.message}"
+
+
+def test_what_a_program_writes_to_the_progress_pipe_never_ends_its_supervisor(node: Nodes) -> None:
+    n = node(stall_timeout=600.0)
+    lines = [
+        "[1]",
+        "1",
+        "null",
+        '"x"',
+        "{",
+        "[" * 50_000,
+        '{"iteration": []}',
+        '{"iteration": 1e400}',
+        '{"said": {"a": 1}}',
+    ]
+    script = (
+        "import os, resource\nfd = int(os.environ['MUSTER_PROGRESS_FD'])\nos.set_blocking(fd, True)\n"
+        "def say(text):\n"
+        "    data = text.encode()\n"
+        "    while data: data = data[os.write(fd, data):]\n"
+        f"for line in {lines!r}: say(line + '\\n')\n"
+        "for name in range(20_000): say('{\"%d\": 1}\\n' % name)\n"
+        "for _ in range(100): say('x' * 1_000_000)\n"
+        "say('\\n{\"iteration\": 3}\\n')\n"
+        "peak = [l for l in open(f'/proc/{os.getppid()}/status') if l.startswith('VmHWM')][0].split()[1]\n"
+        "print(int(peak) < 100_000, peak)"
+    )
+    assert n.python(script) == 0
+    assert n.output()[0].startswith("True"), n.output()
+
+
+def test_torch_s_own_record_decorator_reports_through_the_supervisor(node: Nodes, tmp_path: Path) -> None:
+    if importlib.util.find_spec("torch") is None:
+        pytest.skip("torch is not installed")
+    n = node()
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from torch.distributed.elastic.multiprocessing.errors import record\n"
+        "@record\ndef main():\n    raise RuntimeError('recorded')\n"
+        "if __name__ == '__main__':\n    main()\n"
+    )
+    assert n.call(sys.executable, str(script)) == 1
+    error = n.ended().error
+    assert error
+    assert error.message == "RuntimeError: recorded"
+    assert "script.py" in error.traceback
+
+
+@pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (11, "SIGSEGV"), (15, "SIGTERM"), (40, "signal 40")])
+def test_a_rank_killed_by_a_signal_is_told_by_its_name(node: Nodes, number: int, name: str) -> None:
+    n = node()
+    assert n.shell(f"kill -{number} $$") == 128 + number
+    outcome = n.ended()
+    assert (outcome.exit_code, outcome.signal) == (128 + number, name)
+    assert outcome.reason == f"rank 0 was killed by {name}"
+
+
+def test_when_one_rank_fails_the_others_are_ended_and_the_first_failure_is_the_reason(node: Nodes) -> None:
+    n = node(ranks_per_node=3)
+    started = time.monotonic()
+    assert n.shell("if [ $RANK = 1 ]; then sleep 0.3; echo broken >&2; exit 3; fi; exec sleep 60") == 3
+    assert time.monotonic() - started < 5
+    outcome = n.ended()
+    assert outcome.reason == "rank 1 exited with code 3: broken"
+    assert outcome.error.rank == 1  # type: ignore[union-attr]
+
+
+def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node: Nodes) -> None:
+    asked = node()
+    asked.start("sh", "-c", "echo ready; exec sleep 60")
+    asked.wait_for_output("ready")
+    asked.process.terminate()
+    assert (asked.wait(), asked.ended().asked) == (143, True)
+    failed = node(attempt=2)
+    assert (failed.shell("exit 3"), failed.ended().asked) == (3, False)
+    gang = node(attempt=3, ranks_per_node=3)
+    assert gang.shell("[ $RANK = 1 ] && kill -9 $$; exec sleep 60") == 137
+    assert (gang.ended().reason, gang.ended().asked) == ("rank 1 was killed by SIGKILL", False)
+
+
+def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node: Nodes) -> None:
+    n = node()
+    n.start("sh", "-c", "echo $$; exec sleep 60")
+    wait_for(lambda: len(n.output()) == 1, 10, "the rank")
+    n.process.send_signal(signal.SIGSTOP)  # as under load: the rank is gone first
+    os.kill(int(n.output()[0]), signal.SIGTERM)
+    n.process.terminate()
+    n.process.send_signal(signal.SIGCONT)
+    assert (n.wait(), n.ended().asked) == (143, True)
+
+
+def test_a_rank_that_does_not_heed_the_failure_of_another_is_killed(node: Nodes) -> None:
+    n = node(ranks_per_node=2)
+    main = "import sys, worker.supervisor as s; s._PEER_GRACE = 0.5; sys.exit(s.main(sys.argv[1:]))"
+    script = 'if [ $RANK = 0 ]; then sleep 0.5; exit 3; fi; trap "" TERM; while :; do sleep 0.1; done'
+    n.start("sh", "-c", script, program=("-c", main))
+    assert n.wait() == 3
+    assert n.ended().reason == "rank 0 exited with code 3"
+
+
+def test_one_rank_that_is_done_does_not_end_the_others(node: Nodes) -> None:
+    n = node(ranks_per_node=2)
+    assert n.shell("if [ $RANK = 0 ]; then exit 0; fi; sleep 0.5; echo still here") == 0
+    assert n.output() == ["still here"]
+
+
+def test_a_rank_that_closes_its_output_is_still_waited_for(node: Nodes) -> None:
+    n = node()
+    assert n.shell("echo before; exec >&- 2>&-; sleep 0.3; exit 4") == 4
+    assert n.output() == ["before"]
+
+
+# -- being asked to leave ---------------------------------------------------------------------------------------------
+
+LEAVES = 'trap "echo leaving; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+STAYS = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_request_to_leave_reaches_the_ranks_and_exit_75_is_kept(node: Nodes, number: int) -> None:
+    n = node(ranks_per_node=2)
+    n.start("sh", "-c", LEAVES)
+    wait_for(lambda: n.output() == ["ready"] * 2, 10, "two ranks")
+    n.process.send_signal(number)
+    assert n.wait() == 75
+    assert [n.output().count(text) for text in ("ready", "leaving")] == [2, 2]
+    outcome = n.ended()
+    assert (outcome.exit_code, outcome.reason, outcome.error) == (75, "checkpointed and left on request", None)
+
+
+def test_a_node_whose_ranks_are_done_or_left_on_request_left_on_request(node: Nodes) -> None:
+    n = node(ranks_per_node=2)
+    assert n.shell("[ $RANK = 0 ] && exit 75; exit 0") == 75
+
+
+def test_a_rank_that_does_not_leave_within_the_grace_is_killed(node: Nodes) -> None:
+    n = node(grace=0.6)
+    n.start("sh", "-c", STAYS)
+    n.wait_for_output("ready")
+    asked = time.monotonic()
+    n.process.terminate()
+    assert n.wait() == 137
+    assert 0.5 < time.monotonic() - asked < 4
+    outcome = n.ended()
+    assert outcome.reason == "rank 0 did not leave within 0.6 s of SIGTERM and was killed"
+    assert outcome.signal == "SIGKILL"
+
+
+def test_asking_again_does_not_prolong_the_grace(node: Nodes) -> None:
+    n = node(grace=0.8)
+    n.start("sh", "-c", STAYS)
+    n.wait_for_output("ready")
+    asked = time.monotonic()
+    while n.process.poll() is None and time.monotonic() - asked < 10:
+        n.process.terminate()
+        time.sleep(0.1)
+    assert time.monotonic() - asked < 5
+
+
+def test_a_program_without_a_handler_ends_by_the_request(node: Nodes) -> None:
+    n = node()
+    n.start("sh", "-c", "echo ready; exec sleep 60")
+    n.wait_for_output("ready")
+    n.process.terminate()
+    assert n.wait() == 143
+    assert n.ended().reason == "rank 0 was killed by SIGTERM"
+
+
+def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node: Nodes) -> None:
+    n = node(grace=30.0)
+    script = (
+        "import os, sys\n"
+        "from shared_store.contract import NodeContract\n"
+        "from shared_store.layout import Store\n"
+        "from worker.supervisor import Supervisor\n"
+        "contract = NodeContract.from_env(os.environ)\n"
+        "supervisor = Supervisor(contract, Store(contract.store).run(contract.run), sys.argv[2:])\n"
+        "supervisor.stop('asked to leave', contract.grace)\n"
+        "sys.exit(supervisor.supervise())\n"
+    )
+    n.start("sleep", "60", program=("-c", script))
+    assert n.wait(10) == 143
+
+
+# -- the job's own environment ----------------------------------------------------------------------------------------
+
+
+def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_what_supervises_it(node: Nodes, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "queue.py").write_text("MINE = True\n")
+    job = {
+        "PYTHONPATH": str(tmp_path / "mine"),
+        "PYTHONHOME": "/nowhere",
+        "LD_LIBRARY_PATH": "/nowhere",
+        "TMPDIR": "/nowhere",
+        "RANK": "99",
+        "MUSTER_EPOCH": "99",
+    }
+    n = node()
+    script = "echo $PYTHONPATH $PYTHONHOME $LD_LIBRARY_PATH $TMPDIR $RANK $MUSTER_EPOCH; env | grep -c MUSTER_RANK_ENV_"
+    assert n.shell(script, **sealed(job, n.contract.to_env())) == 1, "grep found none"
+    assert n.output() == [f"{tmp_path}/mine /nowhere /nowhere /nowhere 0 1", "0"]
+
+
+# -- nothing outlives the node ----------------------------------------------------------------------------------------
+
+
+def test_descendants_in_sessions_and_environments_of_their_own_do_not_survive(node: Nodes) -> None:
+    n = node()
+    script = (
+        'setsid sh -c "echo \\$\\$; exec sleep 600" & '
+        '(env -i setsid sh -c "echo \\$\\$; exec sleep 600" &) ; sleep 0.5; exit 0'
+    )
+    assert n.shell(script) == 0
+    pids = [int(text) for text in n.output()]
+    assert len(pids) == 2
+    assert not any(alive(pid) for pid in pids), "they were ended before the supervisor left"
+    assert n.ended().exit_code == 0
+
+
+def test_ranks_die_when_their_supervisor_is_killed(node: Nodes) -> None:
+    n = node(ranks_per_node=2)
+    n.start("sh", "-c", 'trap "" TERM HUP; echo $$; while :; do sleep 0.05; done')
+    wait_for(lambda: len(n.output()) == 2, 10, "two ranks")
+    pids = [int(text) for text in n.output()]
+    n.process.kill()
+    n.process.wait()
+    gone(*pids)
+    assert n.outcome is None
+
+
+def test_a_newer_epoch_ends_everything_at_once_and_nothing_is_written(node: Nodes) -> None:
+    n = node(grace=30.0)
+    n.start("sh", "-c", f'setsid sh -c "echo \\$\\$; exec sleep 600" & echo $$; {STAYS}')
+    wait_for(lambda: "ready" in n.output() and len(n.output()) == 3, 10, "the rank and its child")
+    pids = [int(text) for text in n.output() if text.isdigit()]
+    before = n.lines()
+    raise_epoch(n.run, 2)
+    assert n.wait(5) == 3
+    gone(*pids)
+    assert n.lines() == before
+    assert n.outcome is None
+    assert n.stderr.read_text() == (
+        "muster supervisor: run run: this attempt has epoch 1, the run now belongs to epoch 2; leaving\n"
+    )
+
+
+def test_a_node_of_an_old_attempt_does_not_even_start(node: Nodes, tmp_path: Path) -> None:
+    n = node(epoch=1)
+    raise_epoch(n.run, 2)
+    assert n.call("touch", str(tmp_path / "started")) == 3
+    assert not (tmp_path / "started").exists()
+    assert {name.partition(".")[0] for name in os.listdir(n.run.path)} == {"EPOCH"}
+    assert n.stderr.read_text().count("\n") == 1
+
+
+def test_an_epoch_that_can_not_be_read_for_a_while_does_not_stop_the_ranks(node: Nodes) -> None:
+    n = node()
+    n.start("sh", "-c", "echo ready; sleep 2.5; echo done")
+    n.wait_for_output("ready")
+    (n.run.path / "EPOCH").unlink()
+    (n.run.path / "EPOCH").mkdir()  # reading it fails, as it does on a volume that is away
+    assert n.wait() == 0
+    assert n.output() == ["ready", "done"]

@@ -1,0 +1,167 @@
+"""Every engine in its place, for the tests that each of them passes: a controller that has it, and what it needs around it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Serving, alive, parent, wait_for
+from tests.support.engines.images import PATH, SUPERVISED, host_files
+
+WAIT = "echo ready; exec sleep 600"
+POLITE = 'trap "echo saved; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
+STUBBORN = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
+
+
+@dataclass
+class Site:
+    """One engine."""
+
+    engine: str
+    serving: Serving
+    volume: Path
+    """The nodes' store, as this machine sees it."""
+    container: dict[str, Any] = field(default_factory=dict)
+    """What a job's ``containerProperties`` need there."""
+    environment: dict[str, str] = field(default_factory=dict)
+    """What its environment needs."""
+
+    def submit(self, script: str, nodes: int, attempts: int = 1, cpus: str = "0.25", **env: str) -> str:
+        """A native gang of ``sh -c script``; returns the job id."""
+        environment = {"MUSTER_ON_CHILD_FAILURE": "restart", **self.environment, **env}
+        container = {
+            "image": "muster",
+            "command": ["sh", "-c", script],
+            "environment": [{"name": name, "value": value} for name, value in environment.items()],
+            "resourceRequirements": [{"type": "VCPU", "value": cpus}, {"type": "MEMORY", "value": "128"}],
+            **self.container,
+        }
+        properties = {
+            "numNodes": nodes,
+            "mainNode": 0,
+            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
+        }
+        registered = self.serving.client.batch(
+            "RegisterJobDefinition",
+            jobDefinitionName="suite",
+            type="multinode",
+            nodeProperties=properties,
+            retryStrategy={"attempts": attempts},
+        )
+        submitted = self.serving.client.batch(
+            "SubmitJob", jobName="suite", jobQueue="default", jobDefinition=registered["jobDefinitionArn"]
+        )
+        return str(submitted["jobId"])
+
+    def printed(self, job: str, attempt: int | None = None) -> list[str]:
+        """What the job's ranks printed."""
+        query = {} if attempt is None else {"attempt": attempt}
+        return [line["text"] for line in self.serving.client.logs(job, **query) if line["rank"] is not None]
+
+    def ready(self, job: str, attempt: int, nodes: int) -> None:
+        wait_for(lambda: self.printed(job, attempt).count("ready") == nodes, 60, f"attempt {attempt} of {nodes} nodes")
+
+
+def processes(job: str, **variables: str) -> dict[int, list[bytes]]:
+    """Commands by pid of all that carries the job's id, and these variables, on this machine: in containers, too."""
+    wanted = {f"{name}={value}".encode() for name, value in {"MUSTER_JOB_ID": job, **variables}.items()}
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with contextlib.suppress(OSError):
+            there = set((entry / "environ").read_bytes().split(b"\0"))
+            if wanted <= there and alive(int(entry.name)):
+                found[int(entry.name)] = (entry / "cmdline").read_bytes().split(b"\0")
+    return found
+
+
+def kill_rank(job: str, rank: int) -> None:
+    """SIGKILL to one rank."""
+    for pid in processes(job, RANK=str(rank)):
+        os.kill(pid, signal.SIGKILL)
+
+
+def kill_supervisor(job: str, node: int) -> None:
+    """SIGKILL to the supervisor of one node: what started its rank, which has what is not of the job for a parent."""
+    ranks = processes(job, RANK=str(node))
+    for pid in ranks:
+        with contextlib.suppress(OSError):
+            if (supervisor := parent(pid)) not in ranks:
+                os.kill(supervisor, signal.SIGKILL)
+
+
+def freeze(job: str, node: int) -> None:
+    """SIGSTOP to the supervisor of one node and all of its rank, as when its machine stands still."""
+    ranks = processes(job, RANK=str(node))
+    for pid in {*map(parent, ranks), *ranks}:
+        os.kill(pid, signal.SIGSTOP)
+
+
+@contextlib.contextmanager
+def local(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    yield from _served("local", home, "--cpus", "8")
+
+
+@contextlib.contextmanager
+def docker(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    request.getfixturevalue("docker_client")
+    container = {"image": SUPERVISED, **host_files()}
+    yield from _served("docker", home, "--cpus", "8", container=container, environment={"PATH": PATH})
+
+
+@contextlib.contextmanager
+def ray(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    request.getfixturevalue("ray_cluster")
+    yield from _served("ray", home)
+
+
+@contextlib.contextmanager
+def slurm(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    cluster = request.getfixturevalue("slurm_cluster")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SLURM_CONF", str(cluster.conf))
+        yield from _served("slurm", home)
+
+
+@contextlib.contextmanager
+def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
+    """A second Muster plays AWS; its nodes write to a volume that the controller does not see."""
+    from orchestrator.engines.aws_config import AwsConfig, save_config
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "any")
+        aws = Serving(home / "aws", "--cpus", "8")
+        try:
+            settings = {"store": str(home / "volume"), "poll": 0.1, "quiet": 1.0, "store_is_shared": False}
+            told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url}
+            (home / "home").mkdir()
+            save_config(home / "home", AwsConfig(**told, **settings))
+            yield from _served("aws-batch", home / "home", volume=home / "volume")
+        finally:
+            aws.close()
+
+
+def _served(engine: str, home: Path, *options: str, volume: Path | None = None, **needs: Any) -> Iterator[Site]:
+    serving = Serving(home, "--engine", engine, *options)
+    try:
+        yield Site(engine, serving, volume or home / "store", **needs)
+    finally:
+        serving.close()
+
+
+SITES: dict[str, Callable[..., Any]] = {
+    "local": local,
+    "docker": docker,
+    "ray": ray,
+    "slurm": slurm,
+    "aws-batch": aws_batch,
+}

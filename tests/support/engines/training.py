@@ -1,0 +1,45 @@
+"""A small cart-pole training on any engine, and whether two of them ended with the same bits."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from orchestrator import specfile
+from orchestrator.definition import compile_definition, compile_submission
+from tests.conftest import REPOSITORY, Serving
+from tests.support.engines.images import PATH, SUPERVISED, host_files
+
+SMALL = ("nodes=2", "train.worlds=16", "checkpoint.every=4", "resources.cpus=0.5")
+
+
+def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str) -> str:
+    """Go on with ``run`` until it has that many iterations; returns the job id."""
+    changes = [*SMALL, f"train.iterations={iterations}", *more]
+    spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), changes)
+    queue = serving.client.get("/api/capacity")["engines"][engine]
+    request = compile_definition(spec, str(REPOSITORY))
+    container = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    container["environment"].append({"name": "MUSTER_RUN", "value": run})
+    if engine == "docker":
+        container |= {"image": SUPERVISED, **host_files()}
+        container["environment"].append({"name": "PATH", "value": PATH})
+    arn = serving.client.batch("RegisterJobDefinition", **request)["jobDefinitionArn"]
+    submission = {**compile_submission(spec, arn), "jobQueue": queue}
+    job: str = serving.client.batch("SubmitJob", **submission)["jobId"]
+    return job
+
+
+def same_bits(store: Path, first: str, second: str) -> str:
+    """What ``worker.compare`` says of two runs, which must be equal."""
+    compared = subprocess.run(
+        [sys.executable, "-P", "-m", "worker.compare", first, second],
+        env={**os.environ, "MUSTER_STORE": str(store)},
+        capture_output=True,
+        text=True,
+        timeout=180,
+    )
+    assert compared.returncode == 0 and compared.stdout.startswith("equal: "), compared.stdout + compared.stderr
+    return compared.stdout

@@ -1,0 +1,133 @@
+"""A volume that fills up under home, database, store and logs: one class of a torture. Root only: it mounts a small volume."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+import sqlite3
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
+from tests.conftest import submit_gang, wait_for
+from tests.support.faults.home import Home
+from tests.support.faults.processes import end_all
+
+VOLUME = 48 << 20
+MOST_LOG = 1 << 20
+STEADY = "import time\nfor number in range(6000):\n    print(number, flush=True)\n    time.sleep(0.1)"
+FLOOD = "for number in range(20_000):\n    print('y' * 1000)"
+
+
+@contextlib.contextmanager
+def small_volume(directory: Path, size: int = VOLUME) -> Iterator[Path]:
+    """A volume of ``size`` bytes at ``directory``; skips where none may be mounted."""
+    directory.mkdir(parents=True)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", directory], capture_output=True, text=True
+    )
+    if mounted.returncode:
+        pytest.skip(f"a volume of its own can't be mounted here: {mounted.stderr.strip()}")
+    try:
+        yield directory
+    finally:
+        subprocess.run(["umount", "-l", directory], check=True)
+
+
+def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
+    """Fill the volume, ask for everything, make room: a job can always be stopped, and what was taken on ends."""
+    rng = random.Random(seed)
+    done, wrong = Counter[str](), list[str]()
+    with small_volume(directory / "volume") as volume:
+        home = Home(volume / "home", "--min-free", "2MiB")
+        try:
+            home.serve()
+            ballast = volume / "ballast"
+            with Client(home.url) as client:
+                steady = submit_gang(client, STEADY, name="steady")
+                wait_for(lambda: _status(client, steady) == "RUNNING", 60, "the steady job runs")
+                taken = [steady]
+                if rng.random() < 0.5:
+                    taken.append(submit_gang(client, FLOOD, name="flood"))
+                    done["floods"] += 1
+                    wait_for(lambda: _status(client, taken[-1]) not in ("SUBMITTED", "RUNNABLE"), 60, "the flood")
+                _fill(ballast)
+                done["disks filled"] += 1
+                taken += _submit(client, rng.randrange(1, 5), done)
+            if rng.random() < 0.4:
+                home.strike(9)
+                done["controllers killed"] += 1
+                with contextlib.suppress(Exception):  # a controller may say that it can't start now
+                    home.serve()
+            if home.up:
+                with Client(home.url) as client:
+                    client.batch("TerminateJob", jobId=steady, reason="the disk is full")
+                    wait_for(lambda: not _processes(home, steady), 60, "the steady job has ended")
+                    done["jobs stopped"] += 1
+            ballast.unlink()
+            home.serve()
+            with Client(home.url) as client:
+                if _status(client, steady) not in ("SUCCEEDED", "FAILED"):
+                    client.batch("TerminateJob", jobId=steady, reason="the disk was full")
+                for job in taken:
+                    wait_for(lambda j=job: _status(client, j) in ("SUCCEEDED", "FAILED"), 90, f"job {job} ends")
+                last = submit_gang(client, "print('again')", name="last")
+                wait_for(lambda: _status(client, last) == "SUCCEEDED", 60, "a job runs when there is room")
+                done["jobs"] += len(taken) + 1
+            if (said := home.errors.stat().st_size) > MOST_LOG:
+                wrong.append(f"the controllers wrote {said} bytes of errors")
+            if "Traceback" in home.errors.read_text():
+                wrong.append("the controllers wrote a traceback")
+            if sqlite3.connect(home.path / "muster.db").execute("PRAGMA integrity_check").fetchone() != ("ok",):
+                wrong.append("the database is damaged")
+        finally:
+            home.close()
+            end_all(home.path)
+            if wrong:
+                shutil.copy(home.errors, directory / "controllers.err")
+    return done, wrong
+
+
+def _fill(ballast: Path) -> None:
+    """Take every byte that is left; what others take in between, too."""
+    with contextlib.suppress(OSError), open(ballast, "ab", buffering=0) as file:
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            file.write(bytes(1 << 16))
+    with contextlib.suppress(OSError), open(ballast, "ab", buffering=0) as file:
+        for _ in range(1 << 12):
+            file.write(bytes(256))
+
+
+def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
+    """Jobs that were taken on though there is no room; a refusal has a reason and is no fault of the server."""
+    taken = []
+    for _ in range(count):
+        try:
+            taken.append(submit_gang(client, "print('hello')", name="late"))
+        except ApiError as error:
+            assert "free" in str(error) or "space" in str(error) or "full" in str(error), error
+            assert error.status != 500, error
+            done["submissions refused"] += 1
+    return taken
+
+
+def _status(client: Client, job: str) -> str:
+    return str(client.get(f"/api/jobs/{job}")["status"])
+
+
+def _processes(home: Home, job: str) -> list[str]:
+    found = []
+    for entry in os.listdir("/proc"):
+        with contextlib.suppress(OSError):
+            if entry.isdigit() and f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{entry}/environ").read_bytes():
+                found.append(entry)
+    return found

@@ -1,0 +1,46 @@
+"""The commands of a page of the documentation, run as they stand."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY, wait_for
+
+PORT = 8080
+"""The controller's, on the pages."""
+
+
+def run_page(page: str, directory: Path) -> str:
+    """What the ``sh`` blocks of a page print, run in their order by one shell in a copy of the repository below ``directory``.
+
+    The copy has this environment, and a home directory of its own; ``make test`` is left out, since it would run this test.
+    """
+    if taken():
+        pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
+    clone = directory / "muster"
+    shutil.copytree(REPOSITORY, clone, ignore=shutil.ignore_patterns(".*", "__pycache__"), symlinks=True)
+    (clone / ".venv").symlink_to(Path(sys.executable).parent.parent)
+    found = re.findall(r"^```sh\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)
+    script = "\n".join(found).replace("make test ", ": make test ")
+    hidden = ("MUSTER_HOME", "MUSTER_URL", "MUSTER_TOKEN", "VIRTUAL_ENV")
+    env = {name: value for name, value in os.environ.items() if name not in hidden}
+    ending = "trap 'kill $(jobs -p) 2>/dev/null; wait' EXIT"
+    command = ["bash", "-euxc", f"{ending}\n{script}"]
+    env |= {"HOME": str(directory), "PYTHONUNBUFFERED": "1"}
+    done = subprocess.run(command, cwd=clone, env=env, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-6000:]}"
+    wait_for(lambda: not taken(), 20, "the controller's end")
+    return done.stdout
+
+
+def taken() -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", PORT)) == 0

@@ -1,0 +1,34 @@
+"""What the worker's tests share."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import processes_of
+from tests.support.worker.node import Node
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Iterator[Callable[..., Node]]:
+    """Makes nodes on a store of the test's own; nothing of them is left behind."""
+    made: list[Node] = []
+
+    def make(**contract: Any) -> Node:
+        made.append(Node(tmp_path, **contract))
+        return made[-1]
+
+    yield make
+    for each in made:
+        if hasattr(each, "process"):
+            each.process.kill()
+            each.process.wait()
+    for pid in processes_of(tmp_path):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)

@@ -1,0 +1,263 @@
+"""The bus: presence, commands, and each trap that Zenoh has laid before, with a test that would have caught it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orchestrator.bus import Bus, BusError
+from shared_store.bus import LONGEST_ANSWER
+from shared_store.contract import NodeContract
+from tests.conftest import REPOSITORY, Serving, processes_of, wait_for
+from tests.training.e2e.test_training import submit, wait_for_iteration
+from worker.bus import NodeBus
+
+NODE = """
+import os, sys, time
+from shared_store.contract import NodeContract
+from worker.bus import NodeBus
+read, write = os.pipe2(os.O_NONBLOCK)
+bus = NodeBus(NodeContract(job="j", attempt=1, node_index={index}, node_count=2, main_index=0, master_address="127.0.0.1",
+    master_port=1, run="r", store="/", epoch=1, job_epoch=1, bus={endpoint!r}, bus_token={token!r}), write)
+bus.tend(None)
+"""
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[Bus]:
+    bus = Bus(tmp_path)
+    bus.open()
+    bus.expect("j", 1, nodes=2)
+    yield bus
+    bus.close()
+
+
+def start_node(bus: Bus, then: str, index: int = 0) -> subprocess.Popen[bytes]:
+    """A process with a node's session that goes on with ``then``."""
+    script = NODE.format(index=index, endpoint=bus.endpoint, token=bus.token("j", 1)) + then
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY)
+    wait_for(lambda: ("j", 1, index) in bus._gone, 20, "the node's token")
+    return process
+
+
+def contract(bus: Bus, index: int = 0) -> NodeContract:
+    return node_contract(bus.endpoint, bus.token("j", 1), index)
+
+
+def node_contract(endpoint: str | None, token: str | None, index: int = 0, job: str = "j") -> NodeContract:
+    return NodeContract(job, 1, index, 2, 0, "127.0.0.1", 1, "r", "/", 1, 1, bus=endpoint, bus_token=token)
+
+
+def test_a_killed_node_is_noticed_in_less_than_a_second(bus: Bus) -> None:
+    node = start_node(bus, "time.sleep(60)")
+    assert bus.silence("j", 1, 0) is None
+    noticed = threading.Event()
+    bus.changed = noticed.set
+    node.kill()
+    assert noticed.wait(1.0)
+    assert bus.silence("j", 1, 0) is not None
+    node.wait()
+
+
+def test_a_frozen_node_is_noticed_by_its_lease_and_welcomed_back(bus: Bus) -> None:
+    node = start_node(bus, "time.sleep(60)")
+    node.send_signal(signal.SIGSTOP)
+    wait_for(lambda: bus.silence("j", 1, 0) is not None, 6, "the loss of the frozen node")
+    node.send_signal(signal.SIGCONT)
+    wait_for(lambda: bus.silence("j", 1, 0) is None, 10, "its return")
+    node.kill()
+    node.wait()
+
+
+def test_a_node_whose_main_thread_fails_ends_at_once_with_its_own_exit_code(bus: Bus) -> None:
+    node = start_node(bus, "time.sleep(0.5); raise SystemExit(7)")
+    assert node.wait(timeout=5) == 7, "an open session must not keep a failed process alive"
+
+
+def test_commands_arrive_while_nobody_reads_the_telemetry(bus: Bus) -> None:
+    """A default channel that nobody reads blocks the whole session: ours have none, and commands only queue."""
+    then = (
+        "progress = {'iteration': 1, 'fill': 'x' * 1000}\n"
+        "for i in range(5000): bus._next_progress = 0; bus.tend(progress)\n"
+        "bus.commands.get().reply('heard'); time.sleep(60)"
+    )
+    node = start_node(bus, then)
+    assert bus.command("j", 1, 0, "checkpoint", 20) == "heard"
+    node.kill()
+    node.wait()
+
+
+def test_a_command_to_a_node_that_does_not_answer_ends_in_time_and_says_so(bus: Bus) -> None:
+    node = start_node(bus, "time.sleep(60)")
+    started = time.monotonic()
+    with pytest.raises(BusError, match="node 0 did not answer within 1 s"):
+        bus.command("j", 1, 0, "stacks", 1)
+    with pytest.raises(BusError, match="did not answer"):
+        bus.command("nobody", 1, 0, "stacks", 1)
+    assert time.monotonic() - started < 10
+    node.kill()
+    node.wait()
+
+
+def test_an_answer_that_is_too_long_for_the_router_comes_in_part(bus: Bus) -> None:
+    node = start_node(bus, "bus.commands.get().reply('é' * 5_000_000); time.sleep(60)")
+    assert bus.command("j", 1, 0, "stacks", 20) == "é" * LONGEST_ANSWER
+    node.kill()
+    node.wait()
+
+
+def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path) -> None:
+    """With blocking congestion control a slow reader stops the writer for seconds; ours drops."""
+    script = f"import sys, time; from pathlib import Path; from orchestrator.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token('j', 1), flush=True); time.sleep(60)"
+    router = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
+    assert router.stdout is not None
+    endpoint, token = router.stdout.readline().split()
+    _, write = os.pipe2(os.O_NONBLOCK)
+    node = NodeBus(node_contract(endpoint, token), write)
+    node.tend(None)
+    router.send_signal(signal.SIGSTOP)
+    longest, progress = 0.0, {"iteration": 1, "fill": "x" * 10_000}
+    for _ in range(3000):
+        node._next_progress = 0.0
+        started = time.monotonic()
+        node.tend(progress)
+        longest = max(longest, time.monotonic() - started)
+    router.kill()
+    router.wait()
+    node.close()
+    assert longest < 1.0, f"a put took {longest:.2f} s"
+
+
+def test_the_router_listens_on_loopback_only_and_wants_the_password(bus: Bus) -> None:
+    assert bus.endpoint is not None
+    port = int(bus.endpoint.rpartition(":")[2])
+    listening = []
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            address, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(address.rpartition(":")[2], 16) == port:
+                listening.append(address.rpartition(":")[0])
+    assert listening == ["0100007F"]
+    node = NodeBus(node_contract(bus.endpoint, "wrong"), 1)
+    node.tend(None)
+    assert node._session is None
+    assert [(bus._home / name).stat().st_mode & 0o777 for name in ("bus.json", "bus-users")] == [0o600, 0o600]
+
+
+def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_path: Path) -> None:
+    other = Bus(tmp_path / "other")
+    other._home.mkdir()
+    other.open()
+    other.expect("j", 1, nodes=2)
+    node = start_node(bus, "time.sleep(60)")
+    time.sleep(1.0)
+    assert other._gone == {} and other.endpoint != bus.endpoint
+    node.kill()
+    node.wait()
+    other.close()
+
+
+def test_processes_started_after_the_session_opened_work(bus: Bus) -> None:
+    """A forked copy of a session is deaf and a second open hangs in it: everything we start is executed anew."""
+    _, write = os.pipe2(os.O_NONBLOCK)
+    node = NodeBus(contract(bus), write)
+    node.tend(None)
+    child = start_node(bus, "time.sleep(60)", index=1)
+    assert bus.silence("j", 1, 1) is None
+    child.kill()
+    child.wait()
+    node.close()
+
+
+def test_training_does_not_notice_a_controller_that_is_killed_and_comes_back(server: Serving) -> None:
+    # no save but the one that is asked for: a later one would end its retention
+    job = submit(server, "train.iterations=100000", "nodes=1", "checkpoint.every=100000")
+    wait_for_iteration(server, job["run"], 5)
+    before = set(processes_of(server.home))
+    server.kill()
+    reached = _iteration(server, job["run"])
+    wait_for(lambda: _iteration(server, job["run"]) > reached + 10, 30, "progress without a controller")
+    server.start()
+    wait_for(lambda: server.muster("stacks", job["id"]).returncode == 0, 30, "the node on the new router")
+    said = server.muster("checkpoint", job["id"]).stdout
+    saved = re.fullmatch(r"checkpoint (\d{8})-e1\n", said)
+    assert saved, said
+    names = [each["name"] for each in server.client.get(f"/api/runs/{job['run']}/checkpoints")]
+    assert f"{saved[1]}-e1" in names
+    stacks = server.muster("stacks", job["id"]).stdout
+    assert "MainThread" in stacks and "(worker/train.py:" in stacks, stacks
+    detail = server.detail(job["id"])
+    assert len(detail["attempts"]) == 1 and set(processes_of(server.home)) == before
+    assert server.muster("stop", job["id"]).returncode == 0
+
+
+def test_a_training_that_still_starts_has_nothing_to_save(server: Serving) -> None:
+    starts = {"MUSTER_STALL_TIMEOUT": "300", "MUSTER_ON_CHILD_FAILURE": "restart"}  # as a training has them
+    job = server.gang("import time; time.sleep(600)", env=starts)
+    server.wait(job, "RUNNING")
+    wait_for(lambda: server.muster("stacks", job).returncode == 0, 30, "the node on the bus")
+    said = server.muster("checkpoint", job)
+    assert said.stdout == f"job {job[:8]} has not begun its first iteration: nothing to save yet\n"
+    assert said.returncode == 1
+
+
+def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(server: Serving) -> None:
+    job = submit(server, "train.iterations=100000", "stall_timeout=4s")
+    wait_for_iteration(server, job["run"], 6)
+    victim = next(
+        pid
+        for pid in processes_of(server.home)
+        if _is(pid, b"RANK=1") and _is(pid, b"LOCAL_RANK=0") and not _is_writer(pid)
+    )
+    os.kill(victim, signal.SIGSTOP)
+    wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 30, "the second attempt")
+    first = server.detail(job["id"])["attempts"][0]
+    assert re.search(
+        r"node 1: rank 1 made no progress for \d+ s after iteration \d+: it is stopped by a signal",
+        first["statusReason"],
+    )
+    log = "\n".join(server.log(job["id"], attempt=1))
+    assert "its stacks:" in log and "worker/learning/runner.py" in log
+    wait_for_iteration(server, job["run"], _iteration(server, job["run"]) + 2)
+    assert server.muster("stop", job["id"]).returncode == 0
+
+
+def test_without_the_bus_jobs_run_and_commands_say_why_they_can_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUSTER_BUS_OFF", "1")
+    server = Serving(tmp_path / "home")
+    try:
+        job = server.gang("import os, time; print('up'); time.sleep(20)")
+        server.wait(job, "RUNNING")
+        wait_for(lambda: server.log(job) == ["up"], what="the rank's line")
+        refused = server.muster("checkpoint", job)
+        assert refused.returncode == 1 and "the bus is off" in refused.stderr and "Traceback" not in refused.stderr
+        assert server.muster("stop", job).returncode == 0
+        over = server.muster("stacks", job)
+        assert over.returncode == 1 and "FAILED, not RUNNING" in over.stderr
+    finally:
+        server.close()
+
+
+def _iteration(server: Serving, run: str) -> int:
+    from tests.training.e2e.test_training import raw_iterations
+
+    return raw_iterations(server, run)[-1]
+
+
+def _is(pid: int, entry: bytes) -> bool:
+    return entry in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+
+
+def _is_writer(pid: int) -> bool:
+    return b"worker.saver" in Path(f"/proc/{pid}/cmdline").read_bytes()

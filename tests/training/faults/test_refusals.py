@@ -1,0 +1,211 @@
+"""What a run can't go on with is refused with one line that says what differs, before a process starts where that is possible."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from shared_store.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.layout import Store
+from tests.conftest import Serving
+from tests.support.worker.ranks import training
+from tests.training.worker.test_runner import runner, train
+from worker.errors import UserError
+from worker.learning.runner import Runner
+from worker.learning.trained import load_learner
+
+
+class Payload:
+    """Pickled, it calls ``os.mkdir`` where it is unpickled without care."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.marker),)
+
+
+def poison(checkpoint: Checkpoint, name: str, marker: Path) -> None:
+    """Hide code in a file of ``checkpoint``, with sizes and digests that fit: only the way of loading protects."""
+    path = checkpoint.path / name
+    content = torch.load(path, weights_only=True)
+    torch.save({**content, "extra": Payload(marker)}, path)
+    entry = {"size": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    edit_manifest(checkpoint, files={**checkpoint.manifest["files"], name: entry})
+    Checkpoint(checkpoint.path, checkpoint.iteration, checkpoint.epoch).verify()
+
+
+def edit_manifest(checkpoint: Checkpoint, **changes: Any) -> None:
+    path = checkpoint.path / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_the_payload_works_where_nothing_protects(tmp_path: Path) -> None:
+    torch.save({"extra": Payload(tmp_path / "executed")}, tmp_path / "file.pt")
+    torch.load(tmp_path / "file.pt", weights_only=False)
+    assert (tmp_path / "executed").is_dir()
+
+
+# -- through the command ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Serving, str]]:
+    """A server and a finished run of two iterations of eight worlds, with a checkpoint of each."""
+    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "4")
+    small = ["nodes=1", "train.worlds=8", "train.iterations=2", "train.ppo.learning_rate=0.001", "checkpoint.every=1"]
+    options = [part for change in small for part in ("--set", change)]
+    submitted = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)
+    detail = server.wait(submitted["jobId"], timeout=240)
+    assert detail["status"] == "SUCCEEDED", detail["statusReason"]
+    yield server, detail["run"]
+    server.close()
+
+
+def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
+    """The one line with which ``muster resume`` refuses; nothing was submitted, so no process starts."""
+    server, run = served
+    jobs = len(server.client.get(f"/api/runs/{run}")["jobs"])
+    done = server.muster("resume", run, "--set", "train.iterations=4", *arguments)
+    assert done.returncode == code and len(done.stderr.splitlines()) == 1, done.stderr
+    assert len(server.client.get(f"/api/runs/{run}")["jobs"]) == jobs
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        ("train.task=Ant", ["train.task is 'Cartpole' and can't become 'Ant'"]),
+        ("train.seed=9", ["train.seed is 1 and can't become 9"]),
+        ("train.config={force: 5.0}", ["train.config is {} and can't become {'force': 5.0}"]),
+        ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is the task's own and can't become [8]", "network"]),
+        ("train.ppo.activation=relu", ["train.ppo.activation is the task's own and can't become 'relu'"]),
+        ("train.ppo.init_std=0.5", ["train.ppo.init_std is the task's own and can't become 0.5", "network"]),
+        ("train.ppo.learning_rate=1.0e-3", ["train.ppo.learning_rate is 0.001 already", "train.ppo.schedule=fixed"]),
+        ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 nodes × 1 ranks × 9)", "leave train.worlds"]),
+        ("nodes=9", ["8 worlds can't be dealt out to 9 ranks; use fewer nodes"]),
+    ],
+)
+def test_another_task_seed_network_or_number_of_worlds(
+    served: tuple[Serving, str], change: str, parts: list[str]
+) -> None:
+    said = refused(served, 2, "--set", change)
+    assert all(part in said for part in (served[1], *parts)), said
+
+
+def test_a_checkpoint_of_a_newer_format(served: tuple[Serving, str]) -> None:
+    server, run = served
+    newest = list_checkpoints(Store(server.home / "store").run(run))[-1]
+    edit_manifest(newest, format=FORMAT + 1)
+    try:
+        for arguments in ([], ["--checkpoint", "2"]):
+            said = refused(served, 1, *arguments)
+            assert f"{newest.name}: has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster" in said
+    finally:
+        edit_manifest(newest, format=FORMAT)
+
+
+def test_code_in_a_checkpoint_fails_the_job_with_one_line_and_is_not_run(
+    served: tuple[Serving, str], tmp_path: Path
+) -> None:
+    server, run = served
+    newest = list_checkpoints(Store(server.home / "store").run(run))[-1]
+    poison(newest, "learner.pt", tmp_path / "executed")
+    changes = ["--set", "train.iterations=4", "--set", "retry.attempts=1"]
+    job = json.loads(server.muster("resume", run, "--json", *changes).stdout)["jobId"]
+    detail = server.wait(job, timeout=120)
+    assert detail["status"] == "FAILED"
+    assert f"checkpoint {newest.name}: learner.pt asks for " in detail["statusReason"]
+    assert "mkdir: only tensors and plain values are loaded, and nothing of it was run" in detail["statusReason"]
+    log = server.log(job)
+    assert sum("mkdir" in line for line in log if line.startswith("error: ")) == 1
+    assert not any("Traceback" in line for line in log)
+    assert not (tmp_path / "executed").exists()
+
+
+# -- by the worker, for a job that no controller checked -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with a run of two iterations."""
+    store = tmp_path_factory.mktemp("store")
+    train(training(store, iterations=2))
+    return store
+
+
+@pytest.fixture
+def store(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "store"))
+
+
+def go_on(store: Path, **changes: Any) -> Runner:
+    return runner(training(store, iterations=4, epoch=2, **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"task": "Other"}, "task is 'Point' there and 'Other' here"),
+        ({"seed": 4}, "train.seed is 3 there and 4 here"),
+        ({"config": {"limit": 2.0}}, "train.config is None there and {'limit': 2.0} here"),
+        ({"ppo": {"hidden_sizes": [8]}}, r"ppo.hidden_sizes is \[16, 16\] there and \[8\] here"),
+        ({"ppo": {"normalize_observations": False}}, "ppo.normalize_observations is True there and False here"),
+        ({"worlds": 9}, r"holds 8 worlds \(1 ranks of 8\), this job has 9"),
+    ],
+)
+def test_the_worker_refuses_what_differs(trained: Path, changes: dict[str, Any], difference: str) -> None:
+    with pytest.raises(UserError, match=f"checkpoint 00000002-e1 .*{difference}"):
+        go_on(trained, **changes)
+
+
+def test_the_worker_never_sets_a_newer_format_aside(store: Path) -> None:
+    (newest,) = list_checkpoints(Store(store).run("run"))
+    edit_manifest(newest, format=FORMAT + 1)
+    with pytest.raises(DamagedCheckpoint, match=f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}"):
+        go_on(store)
+    assert newest.path.is_dir()
+
+
+@pytest.mark.parametrize("name", ["learner.pt", "rank-0.pt"])
+def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, name: str) -> None:
+    (newest,) = list_checkpoints(Store(store).run("run"))
+    poison(newest, name, tmp_path / "executed")
+    with pytest.raises(UserError, match=rf"{name} asks for \w+\.mkdir: only tensors and plain values") as error:
+        go_on(store)
+    assert "\n" not in str(error.value)
+    if name == "learner.pt":
+        with pytest.raises(UserError, match="asks for"):  # as `muster export` and `evaluate` read it
+            load_learner(newest)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "learner.pt"),
+        (b"no archive at all", "learner.pt"),
+        ([1, 2], "learner.pt holds a list, not the state of a training"),
+        ({"progress": {}}, "does not fit this job's task and networks: 'ppo'"),
+    ],
+)
+def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str) -> None:
+    (newest,) = list_checkpoints(Store(store).run("run"))
+    path = newest.path / "learner.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    entry = {"size": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    edit_manifest(newest, files={**newest.manifest["files"], "learner.pt": entry})
+    with pytest.raises(UserError, match=said) as error:
+        go_on(store)
+    assert "\n" not in str(error.value)

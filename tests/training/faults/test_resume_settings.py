@@ -1,0 +1,150 @@
+"""Every setting of training that a resumed run is given is applied to what the learner uses, or refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from orchestrator.api import runs
+from orchestrator.spec import PPO as Written
+from orchestrator.spec import Train
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Store
+from tests.support.worker.point_task import Point
+from tests.support.worker.ranks import training
+from tests.training.worker.test_runner import assert_same_bits, runner, train
+from worker.errors import UserError
+from worker.learning import state
+from worker.learning.job import configure
+from worker.learning.ppo import PPO
+from worker.learning.runner import Runner
+from worker.tasks.config import PPOConfig
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with a run of two iterations, whose learning rate adapted itself."""
+    store = tmp_path_factory.mktemp("store")
+    train(training(store, iterations=2))
+    return store
+
+
+def go_on(store: Path, **changes: Any) -> Runner:
+    return runner(training(store, iterations=4, epoch=2, **changes))
+
+
+@pytest.fixture(scope="module")
+def unchanged(store: Path) -> Runner:
+    return go_on(store)
+
+
+def objective(index: int) -> Callable[[PPO], float]:
+    return lambda ppo: ppo._objective._numbers[index]
+
+
+APPLIED: dict[str, tuple[Any, Callable[[PPO], Any]]] = {
+    "steps": (4, lambda ppo: len(ppo.storage.rewards)),
+    "epochs": (3, lambda ppo: ppo._orders.view(ppo.num_learning_epochs, ppo.num_mini_batches, -1).shape[0]),
+    "minibatches": (4, lambda ppo: ppo._orders.view(ppo.num_learning_epochs, ppo.num_mini_batches, -1).shape[1]),
+    "learning_rate": (1e-4, lambda ppo: float(ppo.optimizer.param_groups[0]["lr"])),
+    "schedule": ("fixed", lambda ppo: ppo.schedule),
+    "desired_kl": (0.02, lambda ppo: ppo.desired_kl),
+    "gamma": (0.9, lambda ppo: ppo.gamma),
+    "lam": (0.8, lambda ppo: ppo.lam),
+    "clip": (0.1, objective(0)),
+    "value_loss_coef": (0.5, objective(1)),
+    "entropy_coef": (0.01, objective(2)),
+    "max_grad_norm": (0.5, lambda ppo: ppo.max_grad_norm),
+}
+"""Of each setting that a resumed run may change: another value, and where the learner has it."""
+REFUSED: dict[str, Any] = {
+    "hidden_sizes": [8],
+    "activation": "tanh",
+    "normalize_observations": False,
+    "init_std": 0.5,
+    "channels": [16, 32, 16],
+    "kernel_sizes": [8, 4, 2],
+    "strides": [4, 2, 2],
+}
+"""Of each setting that it can't change: another value."""
+
+
+def test_every_setting_is_in_one_of_the_two_tables(unchanged: Runner) -> None:
+    refused = {"task", "seed", "config", "worlds"}  # test_refusals.py
+    assert Train.model_fields.keys() == {*refused, "iterations", "ppo"}
+    assert unchanged.iterations == 4, "the run was started with 2"
+    settings = {item.name for item in dataclasses.fields(PPOConfig)}
+    assert settings == Written.model_fields.keys() == APPLIED.keys() | REFUSED.keys()
+    assert set(runs.NETWORK) == set(state.NETWORK) == REFUSED.keys()
+
+
+@pytest.mark.parametrize("name", APPLIED)
+def test_a_setting_that_is_accepted_is_what_the_learner_uses(store: Path, unchanged: Runner, name: str) -> None:
+    value, used = APPLIED[name]
+    after = go_on(store, ppo={name: value})
+    assert used(unchanged.ppo) != pytest.approx(value) and used(after.ppo) == pytest.approx(value)
+    assert after.resumed is not None
+    assert after.state._manifest()["ppo"][name] == pytest.approx(value)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_setting_that_the_network_holds_is_refused(store: Path, name: str) -> None:
+    with pytest.raises(UserError, match=rf"ppo\.{name} is .* there and .* here; start a new run for that"):
+        go_on(store, ppo={name: REFUSED[name]})
+
+
+def test_a_fixed_rate_is_the_rate_of_every_iteration_and_of_the_manifest(tmp_path: Path) -> None:
+    train(training(tmp_path, iterations=2))
+    resumed = train(training(tmp_path, iterations=4, epoch=2, ppo={"schedule": "fixed", "learning_rate": 2e-4}))
+    assert float(resumed.ppo.learning_rate_tensor) == pytest.approx(2e-4)
+    manifest = list_checkpoints(Store(tmp_path).run("run"))[-1].manifest
+    assert manifest["learning_rate"] == pytest.approx(2e-4) and manifest["ppo"]["schedule"] == "fixed"
+
+
+def test_an_adapted_rate_goes_on_unless_the_setting_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train(training(tmp_path, iterations=2))
+    (saved,) = list_checkpoints(Store(tmp_path).run("run"))
+    adapted = saved.manifest["learning_rate"]
+    assert adapted != pytest.approx(1e-3), "it was adapted"
+    kept = go_on(tmp_path)
+    assert float(kept.ppo.learning_rate_tensor) == torch.tensor(adapted) and kept.state.set_rate is None
+    # the task's own rate, now that it is asked for
+    assert float(go_on(tmp_path, ppo={"learning_rate": 1e-3}).ppo.learning_rate_tensor) == pytest.approx(1e-3)
+    changed = train(training(tmp_path, iterations=3, epoch=2, ppo={"learning_rate": 1e-4}))
+    assert "learning rate set to 0.0001" in capsys.readouterr().out
+    assert changed.state.learning_rate is not None and changed.state.learning_rate < 5e-4
+    again = runner(training(tmp_path, iterations=4, epoch=3, ppo={"learning_rate": 1e-4}))
+    assert again.state.set_rate is None, "the next attempt of that job goes on with the rate that it has adapted since"
+
+
+def test_a_run_with_a_fixed_rate_still_ends_with_the_same_bits(tmp_path: Path) -> None:
+    fixed = {"ppo": {"schedule": "fixed", "learning_rate": 3e-4}}
+    train(training(tmp_path, run="straight", iterations=4, **fixed))
+    train(training(tmp_path, run="stopped", iterations=2, **fixed))
+    train(training(tmp_path, run="stopped", iterations=4, epoch=2, **fixed))
+    ends = [list_checkpoints(Store(tmp_path).run(name))[-1].path for name in ("straight", "stopped")]
+    assert_same_bits(*ends)
+
+
+def test_a_task_whose_own_configuration_is_wrong_is_refused_in_one_line() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Careless(PPOConfig):
+        schedule: str = "linear"
+
+    @dataclasses.dataclass(frozen=True)
+    class Config(Point.config_type):  # type: ignore[name-defined, misc]
+        ppo: PPOConfig = dataclasses.field(default_factory=Careless)
+
+    class Task(Point):
+        config_type = Config
+
+    with pytest.raises(UserError) as error:
+        configure(Task, {})  # type: ignore[arg-type]
+    assert str(error.value) == (
+        "task Task: its own configuration: schedule: expected one of adaptive, fixed; got 'linear'"
+    )

@@ -1,0 +1,29 @@
+"""A short torture with a fixed seed; the long one is ``make torture``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.support.faults.fire import Fire, run_straight
+from tests.support.faults.home import Home
+from tests.support.faults.processes import end_all
+from tests.support.faults.schedule import SHARES, draw_plan
+
+ITERATIONS = 250
+PLAN = draw_plan("suite-518", 8)
+"""One node: its writer is hit at leisure and inside a commit, then its rank inside a commit, then the controller: frozen, and killed
+again and again while the gang starts anew."""
+
+
+def test_a_run_under_fire_ends_with_the_bits_of_a_straight_one(tmp_path: Path) -> None:
+    home = Home(tmp_path / "home")
+    try:
+        reference = run_straight(home, PLAN.nodes, ITERATIONS)
+        result = Fire(home, PLAN, ITERATIONS, print).carry_out(reference)
+    finally:
+        home.close()
+        end_all(home.path)
+    assert not result.verdict.violations
+    assert len(result.hits) == len(PLAN.blows) and {hit.target for hit in result.hits} < SHARES.keys()
+    assert result.verdict.attempts == 2 and result.verdict.checkpoints >= 3
+    assert result.controller_starts >= 3

@@ -1,0 +1,226 @@
+"""Gangs of real processes on Gloo: N ranks compute what one computes, and a rank that never came is named."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import torch.distributed as dist
+
+from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank
+from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
+from worker.errors import GangError
+
+WORLDS = 7  # two ranks get 3 and 4
+
+
+def learn() -> int:
+    """Body of a rank: saves what it computed to ``MUSTER_OUT``."""
+    torch.set_num_threads(1)
+    gang = connect(Placement.from_env(os.environ))
+    torch.save(compute(gang), f"{os.environ['MUSTER_OUT']}.{gang.rank}")
+    gang.close()
+    return 0
+
+
+def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
+    """Three iterations on whole batches."""
+    from tests.support.worker.point_task import Point, PointConfig, PointPPO
+    from worker.learning.ppo import PPO, Share
+
+    share = Share.of(gang.rank, gang.size, WORLDS)
+    config = PointPPO(epochs=1, minibatches=1)
+    task = Point(PointConfig(ppo=config), share.count, seed=2, first_world=share.first)
+    task.set_random_episode_length()
+    torch.manual_seed(7)
+    ppo = PPO(config, share, (2,), 1, gang, seed=4, extras=1)
+    found = []
+    for iteration in range(3):
+        ppo.begin_iteration(iteration)
+        for _ in range(config.steps):
+            task.step(ppo.act(task.observations))
+            ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
+        ppo.extra[0] = gang.rank + 1
+        ppo.compute_returns(task.observations)
+        losses = ppo.update()
+        norm = ppo.actor.obs_normalizer
+        found.append(
+            {
+                "losses": losses,
+                "gradients": torch.cat(ppo._gradients).clone(),
+                "rate": ppo.learning_rate_tensor.clone(),
+                "moments": torch.cat((norm._mean, norm._var, norm._std)).clone(),
+                "count": norm.count.clone(),
+                "extra": ppo.extra.clone(),
+                "weights": torch.cat([p.detach().flatten() for p in ppo.actor.parameters()]).clone(),
+                "time_outs": gang.sum(ppo._time_outs.sum()),
+            }
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], list[dict[str, torch.Tensor]]]:
+    """What each rank of a gang of one and of a gang of two computed, by (ranks, rank)."""
+    folder = tmp_path_factory.mktemp("learnt")
+    found = {(1, 0): compute(connect(Placement(), device="cpu"))}
+    for code, _, errors in run_ranks("test_distributed:learn", 2, {"MUSTER_OUT": str(folder / "two")}):
+        assert code == 0, errors
+    return found | {(2, rank): torch.load(folder / f"two.{rank}", weights_only=True) for rank in (0, 1)}
+
+
+def test_two_ranks_compute_what_one_does(learnt: dict) -> None:
+    assert sum(float(found["time_outs"]) for found in learnt[1, 0]) > 0, "the example has no time-out"
+    for one, two in zip(learnt[1, 0], learnt[2, 0], strict=True):
+        torch.testing.assert_close(two["moments"], one["moments"], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(two["gradients"], one["gradients"], rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(two["losses"], one["losses"], rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(two["weights"], one["weights"], rtol=1e-3, atol=1e-5)
+        assert two["rate"] == one["rate"]
+        assert two["count"] == one["count"]
+        assert two["time_outs"] == one["time_outs"]
+
+
+def test_all_ranks_hold_the_same_bits(learnt: dict) -> None:
+    for main, other in zip(learnt[2, 0], learnt[2, 1], strict=True):
+        for key in main:
+            assert torch.equal(main[key], other[key]), key
+
+
+def test_the_callers_numbers_are_summed(learnt: dict) -> None:
+    assert learnt[1, 0][0]["extra"].tolist() == [1.0]
+    assert learnt[2, 0][0]["extra"].tolist() == [3.0]
+
+
+def test_a_missing_rank_is_named_by_all() -> None:
+    env = {"MUSTER_REPORT_SECONDS": "2"}
+    port = free_port()
+    processes = [start_rank("test_distributed:report", rank, 3, port, env) for rank in (0, 1)]
+    for process in processes:
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert "error: rank 2 (node 2) did not report within 2 s: 2 of 3 ranks are here" in errors
+        assert "Traceback" not in errors
+
+
+def report() -> int:
+    """Body of a rank that only forms the gang."""
+    connect(Placement.from_env(os.environ), report_seconds=float(os.environ["MUSTER_REPORT_SECONDS"]))
+    return 0
+
+
+def test_a_missing_main_rank_is_named() -> None:
+    placement = Placement(rank=1, world_size=2, master_port=free_port())
+    with pytest.raises(
+        GangError, match=r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
+    ):
+        connect(placement, report_seconds=1.0)
+
+
+def test_a_port_in_use_is_named() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(GangError, match=rf"rank 0 can't listen on 127.0.0.1:{port} .*set MASTER_PORT"):
+            _listen("127.0.0.1", port)
+
+
+def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
+    script = tmp_path / "ranks.py"
+    script.write_text(
+        "import os, torch\n"
+        "from worker.distributed import Placement, connect\n"
+        "gang = connect(Placement.from_env(os.environ), device='cpu')\n"
+        "total = gang.sum(torch.tensor([gang.rank + 1.0])).item()\n"
+        # one write each: two ranks share this pipe
+        "os.write(1, f\"sum {total} {gang.tell('from 0' if gang.is_main else None)}\\n\".encode())\n"
+        "gang.close()\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=180, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("sum 3.0 from 0") == 2
+
+
+def test_the_store_listens_on_the_main_nodes_address_alone() -> None:
+    port = free_port()
+    os.close(held := _listen("127.0.0.1", port))
+    held = _listen("127.0.0.1", port)
+    try:
+        with socket.socket() as other, pytest.raises(ConnectionRefusedError):
+            other.connect(("127.0.0.2", port))
+    finally:
+        os.close(held)
+
+
+def build(warm: Path | None, sites: list[str]) -> list[tuple[str, int]]:
+    """Two ranks, as threads, that each take a moment to build; the order of their starts and ends."""
+    store, events = dist.HashStore(), []
+
+    def rank(number: int) -> None:
+        gang = Gang(Placement(rank=number, world_size=2), "cpu", store, sites)
+        with gang.build_in_turn(warm):
+            events.append(("start", number))
+            time.sleep(0.3)
+            events.append(("end", number))
+
+    threads = [threading.Thread(target=rank, args=(number,)) for number in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return events
+
+
+def test_a_cold_cache_is_filled_by_one_rank_first(tmp_path: Path) -> None:
+    marker = tmp_path / "built"
+    assert build(marker, ["host:cache"] * 2) == [("start", 0), ("end", 0), ("start", 1), ("end", 1)]
+    assert marker.exists()
+
+
+@pytest.mark.parametrize("warm", [True, False])
+def test_nobody_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, warm: bool) -> None:
+    events = build(tmp_path if warm else tmp_path / "cold", ["a:cache", "a:cache" if warm else "b:cache"])
+    assert [kind for kind, _ in events] == ["start", "start", "end", "end"]
+
+
+def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path))
+    first, second = warm_marker(Gang, "cpu"), warm_marker(Placement, "cpu")
+    assert first and second and first != second and first.parent.parent == tmp_path
+    monkeypatch.delenv("WARP_CACHE_PATH")
+    assert warm_marker(Gang, "cpu") is None
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ({"RANK": "x"}, "RANK is 'x', not a whole number"),
+        ({"RANK": "2", "WORLD_SIZE": "2"}, "RANK is 2 in a WORLD_SIZE of 2"),
+    ],
+)
+def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Placement.from_env(env)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this PyTorch can use a GPU")
+def test_a_rank_whose_gpu_pytorch_cannot_use_does_not_train_on_the_cpu_in_silence() -> None:
+    require_gpus("")
+    require_gpus("-1")
+    with pytest.raises(
+        ValueError, match=r"this rank has GPU 0,1, and PyTorch .* can't use it; install a PyTorch with CUDA"
+    ):
+        require_gpus("0,1")

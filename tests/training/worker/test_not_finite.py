@@ -1,0 +1,115 @@
+"""What is not finite: named by world and observation, kept from the policy, counted, and, past a limit, the end of the run."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from tests.support.worker.broken_task import Rooted
+from tests.support.worker.ranks import ROOT, training
+from tests.training.worker.test_tasks import put, statistics
+from worker.distributed import Gang, Placement
+from worker.errors import TrainingError
+from worker.learning.job import Job, StopRequest
+from worker.learning.runner import Runner
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+
+STILL = torch.zeros(4, 1)
+
+
+def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_next_step() -> None:
+    task = Rooted(CartpoleConfig(), 4, seed=1, first_world=100)
+    put(task, joint_q=[[0.0, 0.0], [0.0, 0.0], [0.0, -0.3], [0.0, 0.0]], joint_qd=[[0.0, 0.0]] * 4)
+    task.step(STILL)
+    assert task.observations[2, 2] == 0 and task.observations.isfinite().all() and not task.dones.any()
+    assert statistics(task)["nan_worlds"] == 0 and task.read_mishap(int(task.mishap)) is None
+    saved = task.state_dict()
+    task.step(STILL)
+    assert task.dones.tolist() == [False, False, True, False] and not task.time_outs.any()
+    assert task.rewards[2] == 0 and task.terminal_observations[2].isfinite().all()
+    assert task.observations[2, 1].abs() <= 0.15, "placed afresh"
+    totals = statistics(task)
+    assert totals["nan_worlds"] == 1 and totals["episodes"] == 0
+    assert task.read_mishap(int(task.mishap)) == (2, "its observation slider_velocity was not finite")
+    # it is part of the state: who resumes between the two steps sees the same
+    after = task.state_dict()
+    task.load_state_dict(saved)
+    task.step(STILL)
+    assert all(torch.equal(tensor, after[name]) for name, tensor in task.state_dict().items())
+
+
+def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None:
+    task = Cartpole(CartpoleConfig(rewards={"velocity": -1e38}), 4, seed=1)
+    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [900.0, 0.0], [0.0, 0.0], [math.nan, 0.0]])
+    task.step(STILL)
+    assert task.dones.tolist() == [False, True, False, True] and statistics(task)["nan_worlds"] == 2
+    assert task.read_mishap(int(task.mishap)) == (1, "its reward was not finite")
+    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 3 + [[math.nan, 0.0]])
+    task.step(STILL)
+    assert task.read_mishap(int(task.mishap)) == (
+        3,
+        "its physics failed (a joint faster than `fastest`, or not finite)",
+    )
+    put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 2 + [[0.0, 2000.0], [0.0, 0.0]])
+    task.step(STILL)
+    assert task.dones.tolist() == [False, False, True, False] and task.rewards[2] == 0, "finite, but past belief"
+
+
+def runner(path: Path, limit: float) -> Runner:
+    env = training(
+        path, iterations=3, worlds=16, config={"nan_limit": limit}, task="tests.support.worker.broken_task:Rooted"
+    )
+    job = Job.from_env(env, "train")
+    raise_epoch(job.run, job.epoch)
+    return Runner(job, Gang(Placement(), "cpu", None, ["here"]), Rooted, StopRequest())
+
+
+def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert runner(tmp_path, 10.0).train() == 0
+    output = capsys.readouterr().out
+    assert re.search(
+        r"warning: iteration \d: \d+ resets of worlds, among them world \d+: its observation slider_velocity was not finite",
+        output,
+    )
+    assert "nan_worlds" in output and "error" not in output
+
+
+def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError) as stop:
+        runner(tmp_path, 0.0).train()
+    found = re.fullmatch(
+        r"iteration (\d): (\d+) resets of worlds, among them (world \d+: its observation slider_velocity was not finite); that is more "
+        r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.replay (\S+)",
+        str(stop.value),
+    )
+    assert found, stop.value
+    assert [str(path) for path in Store(tmp_path).run("run").replays.iterdir()] == [found[4]]
+    again = subprocess.run(
+        [sys.executable, "-m", "worker.replay", found[4]], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.startswith(
+        f"iteration {found[1]} of tests.support.worker.broken_task:Rooted: 16 steps of 16 worlds\nstep "
+    )
+    assert found[3] in again.stdout and again.stdout.count("joint_q:") >= 1
+    angle = re.search(r"joint_q: \[\S+ (\S+)\]", again.stdout)
+    assert angle and float(angle[1]) < -0.2, "the pole leant to the left"
+
+
+def test_what_is_no_replay_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "nonsense").write_text("x")
+    (tmp_path / "empty").touch()
+    for name in ("nonsense", "missing", "empty"):
+        refused = subprocess.run(
+            [sys.executable, "-m", "worker.replay", str(tmp_path / name)], cwd=ROOT, capture_output=True, text=True
+        )
+        assert refused.returncode == 2 and refused.stderr.count("\n") == 1, refused.stderr
+        assert refused.stderr.startswith(f"error: {tmp_path / name}: no replay can be read from it (")

@@ -1,0 +1,177 @@
+"""A camera in every world: what it sees by hand, stacks, differing scenes, learning from bytes, export."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from tests.support.worker.ranks import training
+from tests.training.worker.test_runner import assert_same_bits, last
+from tests.training.worker.test_tasks import put
+from worker.distributed import Gang, Placement
+from worker.errors import UserError
+from worker.export import export
+from worker.learning.job import Job, StopRequest, configure
+from worker.learning.runner import Runner
+from worker.tasks.ant import Ant, AntConfig
+from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
+from worker.tasks.config import Randomization
+
+torch.set_num_threads(1)
+SKY = torch.tensor([0x90, 0xB0, 0xD0], dtype=torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> CartpolePixels:
+    return CartpolePixels(CartpolePixelsConfig(), 4, seed=1)
+
+
+def cart_column(image: torch.Tensor) -> float:
+    """Mean column of the cart, the only thing that is bluer than the sky is; ``image`` is (3, height, width)."""
+    red, _, blue = image.float()
+    return (blue > 3 * red).nonzero()[:, 1].float().mean().item()
+
+
+def test_the_image_shows_the_cart_where_a_pinhole_puts_it(pixels: CartpolePixels) -> None:
+    assert pixels.observation_shape == (6, 64, 64) and pixels.observations.dtype == torch.uint8
+    places = [-1.2, -0.4, 0.4, 1.2]
+    put(pixels, joint_q=[[place, 0.0] for place in places], joint_qd=[[0.0, 0.0]] * 4)
+    pixels.step(torch.zeros(4, 1))
+    assert torch.equal(pixels.observations[0, :3, 0, 0], SKY)
+    camera = pixels.config.camera
+    half_width = abs(camera.position[1]) * math.tan(camera.fov / 2)
+    for world, place in enumerate(places):
+        expected = 32.0 + 32.0 * place / half_width - 0.5
+        # the face of the cart that is seen is 0.12 m nearer than its middle
+        assert cart_column(pixels.observations[world, :3]) == pytest.approx(expected, abs=1.5)
+
+
+def test_an_observation_is_the_present_image_and_the_one_before(pixels: CartpolePixels) -> None:
+    put(pixels, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[1.2, 0.0]] * 4)
+    assert torch.equal(pixels.observations[:, :3], pixels.observations[:, 3:]), (
+        "an episode's first image stands for both"
+    )
+    for _ in range(6):
+        before = pixels.observations.clone()
+        pixels.step(torch.zeros(4, 1))
+        assert torch.equal(pixels.observations[:, 3:], before[:, :3])
+    assert not torch.equal(pixels.observations[:, :3], pixels.observations[:, 3:]), (
+        "the cart moved by 2 cm: half a pixel"
+    )
+    put(pixels, joint_q=[[0.0, 0.0]] * 3 + [[1.39, 0.0]], joint_qd=[[0.0, 0.0]] * 3 + [[3.0, 0.0]])
+    pixels.step(torch.zeros(4, 1))
+    assert pixels.dones.tolist() == [False, False, False, True]
+    assert torch.equal(pixels.observations[3, :3], pixels.observations[3, 3:]), "a new episode"
+    assert cart_column(pixels.observations[3, :3]) < 45, "and it is the new place that is seen"
+
+
+def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> None:
+    def build(count: int, first: int = 0, **scene: object) -> torch.Tensor:
+        config = CartpolePixelsConfig(start_position=0.0, start_angle=0.0, randomize=Randomization(**scene))  # type: ignore[arg-type]
+        return CartpolePixels(config, count, seed=3, first_world=first).observations.clone()
+
+    plain = build(3)
+    assert torch.equal(plain[0], plain[1]), "the same start, the same image"
+    for scene in ({"camera_position": 0.3}, {"camera_angle": 0.1}, {"colors": 0.5}, {"light": (0.4, 0.9)}):
+        images = build(3, **scene)
+        assert not torch.equal(images[0], images[1]) and not torch.equal(images[1], images[2]), scene
+        assert torch.equal(images[2:], build(1, first=2, **scene)), scene
+    dark = build(2, light=(0.5, 0.5))
+    assert torch.equal(dark[0, :3, 0, 0], (SKY.float() * 0.5).round().to(torch.uint8))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"camera": {"samples": 0}}, "camera.samples: expected 1 to 64, got 0"),
+        ({"camera": {"fov": 4.0}}, "camera.fov: expected an angle between 0 and pi"),
+        ({"camera": {"target": [0.0, -3.2, 1.4]}}, "camera.target: the camera stands there"),
+        ({"camera": {"position": [0.0, 1.0]}}, "camera.position: expected [x, y, z], got [0.0, 1.0]"),
+        ({"camera": {"target": [0.0, math.nan, 1.0]}}, "camera.target: expected [x, y, z], got [0.0, nan, 1.0]"),
+        ({"camera": {"witdh": 32}}, "config.camera.witdh: CameraConfig has no such key; did you mean width?"),
+        ({"randomize": {"light": [1.0]}}, "light: expected [least, greatest]"),
+        ({"randomize": {"colors": -1.0}}, "colors: expected a number of 0 or more"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_in_one_line(config: dict, message: str) -> None:
+    with pytest.raises(UserError) as refusal:
+        configure(CartpolePixels, {"config": config})
+    assert message in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_what_only_a_camera_sees_needs_one_and_the_other_way_round() -> None:
+    with pytest.raises(ValueError, match="randomize: colors, light: task Ant has no camera"):
+        Ant(AntConfig(randomize=Randomization(colors=0.1, light=(0.5, 1.0))), 1)
+    with pytest.raises(ValueError, match="observation_noise: it is for numbers, not for images"):
+        CartpolePixels(CartpolePixelsConfig(randomize=Randomization(observation_noise=0.1)), 1)
+
+
+def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Runner:
+    env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task="CartpolePixels")
+    job = Job.from_env(env, "train")
+    raise_epoch(job.run, epoch)
+    started = Runner(job, Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+    assert started.train() == 0
+    return started
+
+
+def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_path: Path) -> None:
+    straight = run(tmp_path, "straight", 3)
+    assert straight.ppo._observations.dtype == torch.uint8, "the rollout holds bytes"
+    gradients = [p.grad for p in straight.ppo.actor.cnns.parameters()]
+    assert all(g is not None and g.abs().max() > 0 for g in gradients), "the convolutions learn"
+    run(tmp_path, "stopped", 2)
+    run(tmp_path, "stopped", 3, epoch=2)
+    assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
+    store = Store(tmp_path).run("straight")
+    target = export(store, list_checkpoints(store)[-1])  # compares the file with the policy itself
+    import onnx
+
+    graph = onnx.load(str(target / "policy.onnx")).graph
+    kind = graph.input[0].type.tensor_type
+    assert kind.elem_type == onnx.TensorProto.UINT8
+    assert [axis.dim_value for axis in kind.shape.dim][1:] == [6, 64, 64]
+
+
+def test_it_is_a_gymnasium_environment_of_images() -> None:
+    worlds = gymnasium.make_vec(
+        "worker.tasks.gym:Muster/CartpolePixels-v0",
+        num_envs=2,
+        episode_seconds=0.05,
+        camera={"position": (0.0, -3.2, 1.4), "target": (0.0, 0.0, 1.4)},
+    )
+    first, _ = worlds.reset(seed=1)
+    assert worlds.single_observation_space == gymnasium.spaces.Box(0, 255, (6, 64, 64), np.uint8)
+    assert worlds.observation_space.contains(first)
+    seen = first
+    for _ in range(3):
+        before = seen
+        seen, _, _, truncated, info = worlds.step(np.zeros((2, 1), np.float32))
+    assert truncated.all() and np.array_equal(info["final_obs"][0], before[0]), "the last image of the episode"
+    worlds.close()
+
+
+@pytest.mark.parametrize(
+    ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [8, 8, 8]}, {})]
+)
+def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: Path, ppo: dict, camera: dict) -> None:
+    env = training(tmp_path, worlds=4, task="CartpolePixels", config={"camera": camera}, ppo=ppo)
+    with pytest.raises(
+        UserError, match=r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
+    ):
+        Runner(Job.from_env(env, "train"), Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+
+
+def test_layers_of_the_network_have_to_match() -> None:
+    with pytest.raises(UserError, match="channels, kernel_sizes and strides: give one number of each"):
+        configure(CartpolePixels, {"ppo": {"channels": [8, 8]}})
+    assert dataclasses.replace(CartpolePixelsConfig().ppo, channels=(8, 8, 8)).channels == (8, 8, 8)

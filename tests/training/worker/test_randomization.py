@@ -1,0 +1,199 @@
+"""Worlds that differ: what the solver holds of each, what happens to them, what is refused. Resume: test_resume.py."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from tests.training.worker.test_tasks import observe, play, put, same
+from worker.errors import UserError
+from worker.learning.job import configure
+from worker.tasks.ant import Ant, AntConfig
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.config import FACTORS, Randomization
+from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+
+ALL = Randomization(mass=(0.5, 2.0), friction=(0.5, 1.25), damping=(0.5, 3.0), gains=(0.8, 1.2), gravity=(0.9, 1.1))
+POSE = [0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0, *[0.0, 0.8, -1.6] * 4]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Quadruped:
+    return Quadruped(QuadrupedConfig(), 8, seed=1)
+
+
+@pytest.fixture(scope="module")
+def differing() -> Quadruped:
+    return Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=1)
+
+
+def test_the_solver_holds_of_each_world_what_was_drawn(plain: Quadruped, differing: Quadruped) -> None:
+    drawn = dict(zip(FACTORS, differing.randomizer.factors.numpy().T, strict=True))
+    before, after = plain.worlds.solver.mjw_model, differing.worlds.solver.mjw_model
+    assert torch.equal(plain.randomizer.factors, torch.ones(8, 5))
+    for name, values in drawn.items():
+        least, greatest = getattr(ALL, name)
+        assert len(set(values)) == 8 and (values >= least).all() and (values <= greatest).all()
+        assert values.min() < least + 0.4 * (greatest - least) and values.max() > greatest - 0.4 * (greatest - least)
+
+    def ratio(name: str) -> np.ndarray:
+        old, new = getattr(before, name).numpy().reshape(8, -1), getattr(after, name).numpy().reshape(8, -1)
+        assert np.array_equal(old == 0, new == 0)
+        return np.divide(new, old, out=np.ones_like(new), where=old != 0)
+
+    for names, factor in (
+        (("body_mass", "body_inertia", "body_subtreemass"), "mass"),
+        (("geom_friction",), "friction"),
+        (("dof_damping",), "damping"),
+        (("actuator_gainprm", "actuator_biasprm"), "gains"),
+    ):
+        for name in names:
+            change = ratio(name)
+            scaled = getattr(before, name).numpy().reshape(8, -1) != 0
+            assert scaled.any()
+            assert np.allclose(change[scaled], (drawn[factor][:, None] * np.ones_like(change))[scaled], rtol=1e-5), name
+    assert np.allclose(after.opt.gravity.numpy()[:, 2], -9.81 * drawn["gravity"])
+    # what the solver derives from masses: a heavier trunk is harder to move, in proportion but for the rotors' inertia
+    heavier = ratio("body_invweight0").reshape(8, -1, 2)[:, 1, 0]
+    assert np.allclose(heavier * drawn["mass"], 1.0, atol=0.02)
+
+
+def test_worlds_fall_as_their_gravity_says_and_motors_push_as_their_gains(differing: Quadruped) -> None:
+    put(differing, joint_q=[POSE] * 8, joint_qd=[[0.0] * 18] * 8)
+    differing.step(torch.zeros(8, 12))
+    gravity = differing.randomizer.factors[:, FACTORS.index("gravity")]
+    assert torch.allclose(differing.observations[:, 2], -9.81 / 50 * gravity, rtol=0.01), "in free fall for 0.02 s"
+
+    ant = Ant(AntConfig(randomize={"gains": [0.5, 2.0]}), 4, seed=1)
+    ant.step(0.5 * torch.ones(4, 8))
+    gains = ant.randomizer.factors[:, FACTORS.index("gains")]
+    assert torch.allclose(wp.to_torch(ant.worlds.arrays.drives)[:, 6:], 0.5 * 15.0 * gains[:, None].expand(4, 8))
+
+
+def test_what_a_world_is_like_depends_on_its_seed_and_global_index_alone(differing: Quadruped) -> None:
+    drawn = differing.randomizer.factors
+    for first in (0, 4):
+        half = Quadruped(QuadrupedConfig(randomize=ALL), 4, seed=1, first_world=first)
+        assert torch.equal(half.randomizer.factors, drawn[first : first + 4])
+        for name in ("body_mass", "geom_friction", "dof_damping", "actuator_gainprm"):
+            whole = getattr(differing.worlds.solver.mjw_model, name).numpy()[first : first + 4]
+            assert np.array_equal(getattr(half.worlds.solver.mjw_model, name).numpy(), whole), name
+    alone = Quadruped(QuadrupedConfig(randomize={"gains": ALL.gains}), 8, seed=1).randomizer.factors
+    column = FACTORS.index("gains")
+    assert torch.equal(alone[:, column], drawn[:, column]), "whatever else is drawn"
+    assert (alone[:, [index for index in range(5) if index != column]] == 1).all()
+    other = Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=2).randomizer.factors
+    assert not (other == drawn).any()
+
+
+def test_what_is_off_changes_nothing_and_draws_nothing(plain: Quadruped) -> None:
+    put(plain)
+    streams = plain.state_dict()["random"][:, 2].clone()
+    plain.step(torch.zeros(8, 12))
+    assert not plain.dones.any() and torch.equal(plain.state_dict()["random"][:, 2], streams)
+    assert not plain.state_dict().keys() & {"world_factors", "control_delays", "control_history"}
+    put(plain)
+    history = play(plain, 20, seed=3)
+    put(plain)
+    assert same(history, play(plain, 20, seed=3))
+
+
+def test_pushes_come_at_random_with_the_mean_that_was_asked_for() -> None:
+    task = Ant(AntConfig(randomize={"push_interval": 0.1, "push_velocity": 0.5}), 64, seed=1)
+    velocities = wp.to_torch(task.worlds.arrays.joint_qd)
+    changes = []
+    for _ in range(60):
+        before = velocities.clone()
+        task.randomizer.push()
+        changes.append(velocities - before)
+    changed = torch.stack(changes)
+    assert not changed[..., 2:].any(), "pushes are horizontal"
+    pushed = changed[..., :2].any(dim=2)
+    # one in 6 steps of 1/60 s: 640 of 3840, with a standard deviation of 23
+    assert 550 < pushed.sum() < 730
+    pushes = changed[..., :2][pushed]
+    assert pushes.abs().max() <= 0.5001 and pushes.abs().max() > 0.45 and abs(pushes.mean()) < 0.03
+    assert pushed.sum(dim=0).min() > 0 and len({tuple(world.tolist()) for world in pushed.T}) == 64
+
+
+def test_noise_has_its_deviation_and_leaves_the_simulation_alone() -> None:
+    clean = Cartpole(CartpoleConfig(), 256, seed=1)
+    noisy = Cartpole(CartpoleConfig(randomize={"observation_noise": 0.2}), 256, seed=1)
+    for task in (clean, noisy):
+        put(task, joint_q=[[0.0, 0.5]] * 2)  # two fall at once
+        task.actions.zero_()
+        observe(task)
+    noise = (noisy.observations - clean.observations)[2:]
+    assert torch.equal(wp.to_torch(noisy.worlds.arrays.joint_q)[2:], wp.to_torch(clean.worlds.arrays.joint_q)[2:])
+    assert abs(noise.mean()) < 0.03 and noise.std().item() == pytest.approx(0.2, rel=0.08)
+    assert torch.equal(noisy.rewards, clean.rewards)
+    terminal = (noisy.terminal_observations - clean.terminal_observations)[:2]
+    assert terminal.all() and terminal.abs().max() < 1.0
+    noisy.reset()
+    assert not torch.equal(noisy.observations[:, 0], wp.to_torch(noisy.worlds.arrays.joint_q)[:, 0])
+
+
+def test_controls_come_late_by_what_each_episode_drew() -> None:
+    task = Quadruped(QuadrupedConfig(randomize={"action_latency": 3}, action_scale=1.0, stand_thigh=0.0), 64, seed=1)
+    asked, given = [], []
+    for step in range(8):
+        task.step(torch.full((64, 12), 0.1 * step))
+        assert not task.dones.any()
+        asked.append(0.1 * step)
+        given.append(wp.to_torch(task.worlds.arrays.controls)[:, 1].clone())
+    delays = task.state_dict()["control_delays"]
+    assert set(delays.tolist()) == {0, 1, 2, 3}
+    for world, delay in enumerate(delays.tolist()):
+        expected = [asked[max(0, step - delay)] for step in range(8)]
+        assert [values[world].item() for values in given] == pytest.approx(expected, abs=1e-6)
+    assert torch.allclose(task.observations[:, 36:], torch.tensor(0.7)), "the policy sees what it asked for"
+    task.reset()
+    task.step(torch.full((64, 12), -0.5))
+    assert torch.allclose(wp.to_torch(task.worlds.arrays.controls)[:, 1], torch.tensor(-0.5)), (
+        "nothing of the old episode"
+    )
+    assert not torch.equal(task.state_dict()["control_delays"], delays)
+
+
+def test_a_state_of_worlds_with_other_physics_is_refused(differing: Quadruped) -> None:
+    other = Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=2)
+    with pytest.raises(ValueError, match="its worlds have other physics; use the same seed, first world and randomize"):
+        other.load_state_dict(differing.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("randomize", "message"),
+    [
+        ({"mas": [1, 2]}, "config.randomize.mas: Randomization has no such key; did you mean mass"),
+        ({"mass": 2}, "config.randomize.mass: expected a list, as in [1.0, 1.0]; got 2"),
+        ({"mass": [1.0]}, "config.randomize: mass: expected [least, greatest], two factors above 0; got [1.0]"),
+        ({"mass": [2, 1]}, "config.randomize: mass: expected [least, greatest], two factors above 0; got [2.0, 1.0]"),
+        ({"mass": [0, 1]}, "config.randomize: mass: expected [least, greatest], two factors above 0; got [0.0, 1.0]"),
+        ({"gains": [-1, 1]}, "config.randomize: gains: expected [least, greatest], two factors of 0 or more"),
+        ({"friction": [0, math.inf]}, "config.randomize: friction: expected [least, greatest], two factors"),
+        ({"friction": [0, "much"]}, "config.randomize.friction: expected float, as in 1.0; got 'much'"),
+        ({"push_interval": 5}, "config.randomize: push_interval and push_velocity: give both, or none"),
+        ({"observation_noise": -1}, "config.randomize: observation_noise: expected a number of 0 or more, got -1.0"),
+        ({"action_latency": 1.5}, "config.randomize.action_latency: expected int, as in 0; got 1.5"),
+        (
+            {"action_latency": 100},
+            "config.randomize: action_latency: expected a whole number of steps from 0 to 64, got 100",
+        ),
+        ([1], "config.randomize: expected a mapping of keys such as mass; got [1]"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(randomize: object, message: str) -> None:
+    with pytest.raises(UserError) as refusal:
+        configure(Ant, {"config": {"randomize": randomize}})
+    assert str(refusal.value).startswith(message) and "\n" not in str(refusal.value)
+
+
+def test_a_robot_that_is_fixed_is_not_pushed() -> None:
+    with pytest.raises(ValueError, match=r"randomize.push_velocity: the robot is fixed to the world"):
+        Cartpole(CartpoleConfig(randomize={"push_interval": 1.0, "push_velocity": 1.0}), 2)
+    with pytest.raises(ValueError, match=r"randomize: .*unexpected keyword argument 'mas'"):
+        CartpoleConfig(randomize={"mas": [1, 2]})

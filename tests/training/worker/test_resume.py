@@ -1,0 +1,103 @@
+"""Every task goes on bit for bit: in a fresh process, and with its worlds dealt out to another number of ranks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.worker.test_tasks import play, same
+from worker.tasks import BUILT_IN, find_task
+from worker.tasks.task import Task
+
+torch.set_num_threads(1)
+REPOSITORY = Path(__file__).parents[2]
+SETTINGS = {
+    "Cartpole": {},
+    "CartpolePixels": {},
+    "Ant": {"episode_seconds": 0.5},
+    "Humanoid": {"episode_seconds": 0.5},
+    "Quadruped": {"episode_seconds": 0.5, "command_seconds": 0.14},
+    "Quadruped in random worlds": {
+        "episode_seconds": 0.5,
+        "randomize": {
+            **{name: [0.8, 1.25] for name in ("mass", "friction", "damping", "gains", "gravity")},
+            "push_interval": 0.1,
+            "push_velocity": 1.0,
+            "observation_noise": 0.1,
+            "action_latency": 3,
+        },
+    },
+}
+"""Episodes and commands are short, so that there are resets and new commands before and after each point."""
+
+
+def make(name: str, worlds: int = 8, seed: int = 1, first_world: int = 0) -> Task:
+    task = find_task(name.split()[0])
+    return task(task.config_type(**SETTINGS[name]), worlds, seed=seed, first_world=first_world)
+
+
+def resume(saved: str, out: str) -> None:
+    """What the fresh process does."""
+    states = torch.load(saved, weights_only=True)
+    histories = {}
+    for name in SETTINGS:
+        # the seed of what happens is part of the state; the seed of what worlds are like must be the same
+        task = make(name, seed=99 if name in BUILT_IN else 1)
+        task.load_state_dict(states[name])
+        histories[name] = [list(step) for step in play(task, 80, seed=8)]
+    torch.save(histories, out)
+
+
+def test_every_built_in_task_is_tested() -> None:
+    assert SETTINGS.keys() >= BUILT_IN.keys()
+
+
+def test_a_fresh_process_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    tasks = {name: make(name) for name in SETTINGS}
+    saved = {}
+    for name, task in tasks.items():
+        task.set_random_episode_length()
+        play(task, 20, seed=7)
+        saved[name] = task.state_dict()
+        assert all(len(tensor) == 8 for tensor in saved[name].values())
+    torch.save(saved, tmp_path / "saved.pt")
+    script = "import sys; from tests.training.worker.test_resume import resume; resume(*sys.argv[1:])"
+    subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "saved.pt"), str(tmp_path / "out.pt")],
+        check=True,
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        timeout=600,
+    )
+    resumed = torch.load(tmp_path / "out.pt", weights_only=True)
+    for name, task in tasks.items():
+        going_on = play(task, 80, seed=8)
+        assert same(going_on, resumed[name]), name
+        assert sum(int(step[2].sum()) for step in going_on) > 8, "resets were compared, too"
+
+
+@pytest.mark.parametrize("name", ["Humanoid", "Quadruped", "Quadruped in random worlds"])
+def test_worlds_are_the_same_however_they_are_dealt_out(name: str) -> None:
+    whole = play(make(name), 60, seed=6)
+    parts = [play(make(name, 4, first_world=first), 60, seed=6) for first in (0, 4)]
+    joined = [tuple(torch.cat(pair) for pair in zip(*steps, strict=True)) for steps in zip(*parts, strict=True)]
+    assert same(whole, joined)
+    assert sum(int(step[2].sum()) for step in whole) > 8, "resets were compared, too"
+
+
+def test_what_a_task_keeps_from_step_to_step_belongs_to_the_state() -> None:
+    task = make("Quadruped")
+    play(task, 20, seed=7)
+    state = task.state_dict()
+    assert state["memory"].shape == (8, 16) and state["memory"][:, 4:].any()
+    exact = play(task, 10, seed=8)
+    task.load_state_dict(state | {"memory": state["memory"] * 0.5})
+    assert not same(exact, play(task, 10, seed=8))
+    task.load_state_dict(state)
+    assert same(exact, play(task, 10, seed=8))
+    assert "memory" not in make("Cartpole", 2).state_dict(), "a task that keeps nothing saves nothing"

@@ -1,0 +1,352 @@
+"""The loop around PPO: resuming bit for bit, leaving when asked, damage, full disks, user errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.support.worker.point_task import Point
+from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
+from worker.distributed import Gang, Placement
+from worker.errors import TrainingError, UserError
+from worker.learning.job import Job, StopRequest, configure
+from worker.learning.runner import Runner
+
+
+def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Runner:
+    """One attempt, to which the run is given first, as a controller does."""
+    job = Job.from_env(env, "train")
+    if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
+        raise_epoch(job.run, job.epoch)
+    return Runner(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
+
+
+def train(env: dict[str, str], gang: Gang | None = None) -> Runner:
+    """Train to the end, as one attempt."""
+    started = runner(env, gang)
+    assert started.train() == 0
+    return started
+
+
+def tensors(value: Any, path: str = "") -> dict[str, Any]:
+    """Every tensor and number in a loaded file, by path."""
+    if isinstance(value, dict):
+        return {k: v for key, item in value.items() for k, v in tensors(item, f"{path}/{key}").items()}
+    if isinstance(value, list | tuple):
+        return {k: v for i, item in enumerate(value) for k, v in tensors(item, f"{path}/{i}").items()}
+    return {path: value}
+
+
+def assert_same_bits(first: Path, second: Path) -> None:
+    """Two checkpoints hold the same files with the same content; how long training took may differ."""
+    names = sorted(path.name for path in first.glob("*.pt"))
+    assert names == sorted(path.name for path in second.glob("*.pt")) and names
+    for name in names:
+        one, two = (tensors(torch.load(folder / name, weights_only=True)) for folder in (first, second))
+        assert one.keys() == two.keys()
+        for key in one.keys() - {"/progress/seconds"}:
+            same = torch.equal(one[key], two[key]) if isinstance(one[key], torch.Tensor) else one[key] == two[key]
+            assert same, f"{name}{key}"
+
+
+def last(store: Path, run: str) -> Path:
+    return list_checkpoints(Store(store).run(run))[-1].path
+
+
+def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
+    train(training(tmp_path, run="straight", iterations=6))
+    train(training(tmp_path, run="stopped", iterations=3))
+    torch.manual_seed(99)  # a new process has other generator states
+    resumed = train(training(tmp_path, run="stopped", iterations=6, epoch=2))
+    assert resumed.resumed is not None and resumed.resumed.iteration == 3
+    assert last(tmp_path, "stopped").name == "00000006-e2"
+    assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
+    with pytest.raises(AssertionError):  # the comparison can fail
+        assert_same_bits(last(tmp_path, "straight"), list_checkpoints(Store(tmp_path).run("stopped"))[0].path)
+    history = read_metrics(Store(tmp_path).run("stopped"))
+    assert [record["iteration"] for record in history] == [1, 2, 3, 4, 5, 6]
+    assert [record["env_steps"] for record in history] == [64 * i for i in range(1, 7)]
+
+
+def resume_in_a_gang() -> int:
+    """Body of a rank: a straight run and a stopped and resumed one, in one gang."""
+    from worker.distributed import connect
+
+    torch.set_num_threads(1)
+    gang = connect(Placement.from_env(os.environ))
+    store = Path(os.environ["MUSTER_STORE"])
+    for settings in (
+        {"run": "straight", "iterations": 6},
+        {"run": "stopped", "iterations": 3},
+        {"run": "stopped", "iterations": 6, "epoch": 2},
+    ):
+        train(training(store, **settings), gang)
+    gang.close()
+    return 0
+
+
+@pytest.fixture(scope="module")
+def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with runs of two ranks of 8 worlds."""
+    store = tmp_path_factory.mktemp("two-ranks")
+    for code, output, errors in run_ranks("test_runner:resume_in_a_gang", 2, training(store)):
+        assert code == 0, output + errors
+    return store
+
+
+def test_a_resumed_gang_ends_with_the_same_bits(two_ranks: Path) -> None:
+    assert sorted(p.name for p in last(two_ranks, "straight").glob("*.pt")) == ["learner.pt", "rank-0.pt", "rank-1.pt"]
+    assert_same_bits(last(two_ranks, "straight"), last(two_ranks, "stopped"))
+
+
+def test_worlds_are_dealt_out_again_to_another_number_of_ranks(two_ranks: Path) -> None:
+    alone = runner(training(two_ranks, run="straight", worlds=16, iterations=7, epoch=3))
+    assert alone.resumed is not None and alone.state.progress.iteration == 6
+    shards = [
+        torch.load(last(two_ranks, "straight") / f"rank-{k}.pt", weights_only=True)["worlds"]["state"] for k in (0, 1)
+    ]
+    for name, tensor in alone.task.state_dict().items():
+        assert torch.equal(tensor, torch.cat([shard[name] for shard in shards])), name
+    assert alone.train() == 0
+
+
+def test_another_number_of_worlds_is_refused(two_ranks: Path) -> None:
+    with pytest.raises(
+        UserError, match=r"holds 16 worlds \(2 ranks of 8\), this job has 5 \(1 ranks of 5\).*product is 16"
+    ):
+        runner(training(two_ranks, run="stopped", worlds=5, epoch=4))
+
+
+def test_another_network_is_refused(two_ranks: Path) -> None:
+    with pytest.raises(UserError, match="does not fit this job's task and networks"):
+        runner(training(two_ranks, run="stopped", worlds=16, epoch=4, ppo={"hidden_sizes": [8]}))
+
+
+def test_a_damaged_checkpoint_is_named_set_aside_and_the_one_before_is_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    train(training(tmp_path, iterations=4, every=2))
+    path = last(tmp_path, "run") / "learner.pt"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    resumed = runner(training(tmp_path, iterations=6, epoch=2))
+    assert resumed.resumed is not None and resumed.resumed.name == "00000002-e1"
+    output = capsys.readouterr().out
+    assert "warning: checkpoint 00000004-e1: the content of learner.pt was altered" in output
+    assert "set aside as 00000004-e1.damaged" in output
+    assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
+
+
+def test_a_chosen_checkpoint_is_gone_on_from(tmp_path: Path) -> None:
+    train(training(tmp_path, iterations=4, every=2))
+    chosen = {"MUSTER_CHECKPOINT": "00000002-e1", "MUSTER_JOB_EPOCH": "2"}
+    assert runner(training(tmp_path, iterations=6, epoch=2) | chosen).state.progress.iteration == 2
+    train(training(tmp_path, iterations=6, epoch=2) | chosen)
+    assert runner(training(tmp_path, iterations=6, epoch=3) | chosen).state.progress.iteration == 6, (
+        "its own progress is newer"
+    )
+
+
+def test_a_finished_run_is_only_evaluated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    train(training(tmp_path, iterations=2))
+    capsys.readouterr()
+    train(training(tmp_path, iterations=2, epoch=2))
+    output = capsys.readouterr().out
+    assert "evaluation: mean episode length" in output and "iteration 1/" not in output
+    assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
+
+
+def test_what_a_run_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    train(training(tmp_path, iterations=3))
+    output = capsys.readouterr().out
+    run = Store(tmp_path).run("run")
+    assert "iteration 3/3  reward " in output
+    assert f"last checkpoint: {run.checkpoints / '00000003-e1'}" in output
+    assert f"reward plot: {run.metrics / 'reward.png'}" in output
+    assert (run.metrics / "reward.png").read_bytes().startswith(b"\x89PNG")
+    assert list(run.metrics.glob("events.out.tfevents.*"))
+    result = json.loads((run.evaluations / "00000003-e1.json").read_text())
+    assert result["episodes"] == 8 and result["max_length"] == 20 and 0 < result["mean_length"] <= 20
+    record = read_metrics(run)[-1]
+    wanted = "env_steps reward episode_length steps_per_second collect_seconds learn_seconds iteration_seconds learning_rate kl"
+    assert {*wanted.split(), "value_loss", "surrogate_loss", "entropy", "action_std", "time"} <= record.keys()
+    assert record["entropy"] == pytest.approx(1.4189 + torch.log(torch.tensor(record["action_std"])).item(), abs=0.02)
+
+
+def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
+    from worker.learning.evaluation import evaluate
+
+    started = train(training(tmp_path, iterations=1))
+    before = started.task.state_dict()
+    results = [evaluate(started.task, started.ppo, started.gang, checkpoint="x", episodes=9) for _ in range(2)]
+    assert results[0].episodes == 16, "whole rounds of all 8 worlds"
+    assert results[0].mean_return == results[1].mean_return
+    assert all(torch.equal(tensor, before[name]) for name, tensor in started.task.state_dict().items())
+
+
+def test_nan_stops_training_and_keeps_the_last_checkpoint(tmp_path: Path) -> None:
+    env = training(tmp_path, iterations=9, every=1, config={"poison_at": 20})  # in the third iteration of 8 steps
+    started = runner(env)
+    with pytest.raises(TrainingError, match=r"iteration 3: the loss is not finite .*checkpoint 00000002-e1 stands"):
+        started.train()
+    assert [c.iteration for c in list_checkpoints(started.job.run)] == [1, 2]
+
+
+def test_a_save_that_the_volume_refuses_is_told_and_training_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Store(tmp_path).run("run")
+    run.checkpoints.mkdir(parents=True)
+    obstacles = [run.checkpoints / ".00000002-e1.tmp", run.checkpoints / ".00000004-e2.tmp"]
+    train_with_obstacle(training(tmp_path, iterations=3, every=1), obstacles[0])
+    output = capsys.readouterr().out
+    assert "warning: iteration 2 could not be saved (File exists: " in output and "training goes on" in output
+    assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
+    with pytest.raises(TrainingError, match="its last checkpoint could not be saved"):
+        train_with_obstacle(training(tmp_path, iterations=4, epoch=2), obstacles[1])
+    assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
+
+
+def train_with_obstacle(env: dict[str, str], obstacle: Path) -> None:
+    """Train with a file where a checkpoint's hidden directory is to be (put there after the sweep at the start)."""
+    started = runner(env)
+    obstacle.write_bytes(b"")
+    started.train()
+
+
+def test_a_newer_attempt_stops_this_one(tmp_path: Path) -> None:
+    started = runner(training(tmp_path, iterations=1))
+    raise_epoch(started.job.run, 7)
+    with pytest.raises(StaleEpoch, match="epoch 7"):
+        started.train()
+    assert list_checkpoints(started.job.run) == []
+
+
+def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> None:
+    env = training(tmp_path, iterations=100000, config={"sleep": 0.002})
+    port = free_port()
+    ranks = [start_rank("train", rank, 2, port, env) for rank in (0, 1)]
+    try:
+        assert ranks[0].stdout
+        seen = next(line for line in ranks[0].stdout if line.startswith("iteration") and " 3/" in line)
+        assert seen
+        ranks[1].send_signal(signal.SIGTERM)
+        outputs = [rank.communicate(timeout=30) for rank in ranks]
+    finally:
+        for rank in ranks:
+            rank.kill()
+    assert [rank.returncode for rank in ranks] == [75, 75], outputs
+    (checkpoint,) = list_checkpoints(Store(tmp_path).run("run"))
+    checkpoint.verify()
+    assert checkpoint.iteration >= 3
+    assert f"asked to stop: left after iteration {checkpoint.iteration} of 100000" in outputs[0][0]
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: PointPPO has no such key; did you mean learning_rate?"),
+        ({"config": {"ppo": {}}}, "config.ppo: PointConfig has no such key"),
+        ({"ppo": {"steps": 1.5}}, "ppo.steps: expected int, as in 8; got 1.5"),
+        ({"ppo": {"normalize_observations": 1}}, "expected bool"),
+        ({"ppo": {"learning_rate": "fast"}}, "ppo.learning_rate: expected float"),
+    ],
+)
+def test_wrong_overrides_are_refused(section: dict, message: str) -> None:
+    with pytest.raises(UserError) as error:
+        configure(Point, section)  # type: ignore[arg-type]
+    assert message in str(error.value)
+
+
+def test_right_overrides_are_taken() -> None:
+    config = configure(Point, {"ppo": {"learning_rate": 1, "hidden_sizes": [8, 8]}, "config": {"limit": 2}})  # type: ignore[arg-type]
+    assert config.ppo.learning_rate == 1.0 and config.ppo.hidden_sizes == (8, 8) and config.limit == 2.0  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("command", "spec", "message", "code"),
+    [
+        ("train", None, "MUSTER_SPEC is not set", 2),
+        ("train", {"train": {"task": "Cartpol"}}, "did you mean Cartpole?", 2),
+        ("export", {"export": {"run": "nothing"}}, "run nothing has no checkpoint", 2),
+    ],
+)
+def test_user_errors_are_one_line_and_reach_the_supervisor(
+    tmp_path: Path, command: str, spec: dict | None, message: str, code: int
+) -> None:
+    errors = tmp_path / "error.json"
+    env = {
+        **os.environ,
+        **training(tmp_path),
+        "TORCHELASTIC_ERROR_FILE": str(errors),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
+    env["MUSTER_SPEC"] = json.dumps(spec) if spec else ""
+    done = subprocess.run(
+        [sys.executable, "-m", f"worker.{command}"], env=env, cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == code
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("error: ") and message in line
+    assert message in json.loads(errors.read_text())["message"]["message"]
+
+
+def test_an_unexpected_error_shows_its_traceback(tmp_path: Path) -> None:
+    errors = tmp_path / "error.json"
+    ((code, _, shown),) = run_ranks("test_runner:break_down", 1, {"TORCHELASTIC_ERROR_FILE": str(errors)})
+    message = json.loads(errors.read_text())["message"]
+    assert code == 1 and "Traceback" in shown
+    assert message["message"] == "ValueError: a defect" and "break_down" in message["extraInfo"]["py_callstack"]
+    assert int(message["extraInfo"]["timestamp"]) > 0
+
+
+def break_down() -> int:
+    raise ValueError("a defect")
+
+
+def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import numpy as np
+    import onnx
+    from onnx.reference import ReferenceEvaluator
+
+    from worker import export
+
+    started = train(training(tmp_path, iterations=2))
+    run = Store(tmp_path).run("run")
+    (checkpoint,) = list_checkpoints(run)
+    target = export.export(run, checkpoint)
+    assert sorted(path.name for path in target.iterdir()) == ["policy.json", "policy.onnx"]
+    facts = json.loads((target / "policy.json").read_text())
+    assert facts["observation_names"] == ["place", "velocity"] and facts["control_hz"] == 10.0
+    observations = np.array(facts["self_test"]["obs"], dtype=np.float32)
+    model = onnx.load(target / "policy.onnx")
+    (actions,) = ReferenceEvaluator(model).run(None, {"obs": observations})
+    np.testing.assert_allclose(actions, facts["self_test"]["actions"], atol=1e-5)
+    ours = started.ppo.act_mean(torch.from_numpy(observations)).numpy()
+    np.testing.assert_allclose(actions, ours, atol=1e-5)
+    assert json.loads({p.key: p.value for p in model.metadata_props}["muster"])["checkpoint"] == checkpoint.name
+    original = export.to_onnx
+
+    def altered(actor: Any, metadata: dict[str, Any]) -> bytes:
+        with torch.no_grad():
+            actor.mlp[0].weight.mul_(1.01)
+        return original(actor, metadata)
+
+    monkeypatch.setattr(export, "to_onnx", altered)
+    with pytest.raises(TrainingError, match="differs from the trained one"):
+        export.export(run, checkpoint)
+    assert json.loads((target / "policy.json").read_text()) == facts, "what was published stays"
+    assert [path.name for path in run.exports.iterdir()] == [checkpoint.name]

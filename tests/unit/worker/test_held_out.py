@@ -1,0 +1,96 @@
+"""How a training judges what it learns: the score by which checkpoints are compared, and the worlds of its evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from tests.support.worker.ranks import training
+from tests.training.worker.test_runner import train
+from worker.distributed import Gang, Placement
+from worker.learning.evaluation import evaluate
+from worker.learning.job import Job, StopRequest
+from worker.learning.runner import Runner
+from worker.learning.state import Progress
+from worker.tasks.cartpole import Cartpole
+
+
+def scores(iterations: list[tuple[int, float]], **settings: int) -> list[float | None]:
+    """The score after each iteration of 10 steps, of (episodes that ended, their mean return)."""
+    progress, found = Progress(), []
+    for episodes, mean in iterations:
+        progress.count(10, episodes, episodes * mean, **settings)
+        found.append(progress.score)
+    return found
+
+
+def test_early_falls_alone_make_no_score() -> None:
+    # episodes take up to 40 steps: what ends in the first 30 are falls
+    found = scores([(200, 1.0), (200, 1.0), (200, 1.0), (400, 21.0)], worlds=100, longest=40)
+    assert found == [None, None, None, pytest.approx(9.0)]
+
+
+def test_a_score_covers_an_episode_of_each_world_and_a_hundred_in_all() -> None:
+    assert scores([(150, 1.0), (150, 3.0)], worlds=300, longest=10) == [None, pytest.approx(2.0)]
+    assert scores([(4, 1.0)] * 24 + [(4, 26.0)], worlds=4, longest=10)[-2:] == [None, pytest.approx(2.0)]
+
+
+def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_best() -> None:
+    steady = scores([(100, 10.0)] * 8 + [(1, 500.0)] + [(100, 10.0)] * 8, worlds=100, longest=40)
+    assert steady[7] == pytest.approx(10.0) and steady[16] == pytest.approx(10.0)
+    assert max(score for score in steady if score is not None) < 13.0
+    better = scores([(100, 10.0)] * 8 + [(100, 20.0)] * 4, worlds=100, longest=40)
+    assert better[-1] == pytest.approx(20.0)
+
+
+def test_only_what_the_score_needs_is_kept() -> None:
+    progress = Progress()
+    for _ in range(1000):
+        progress.count(10, 50, 50.0, worlds=100, longest=40)
+    assert len(progress.recent) == 4
+
+
+def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -> None:
+    train(training(tmp_path, run="straight", worlds=64, iterations=8))
+    train(training(tmp_path, run="stopped", worlds=64, iterations=5))
+    train(training(tmp_path, run="stopped", worlds=64, iterations=8, epoch=2))
+    straight, stopped = (list_checkpoints(Store(tmp_path).run(name))[-1].manifest for name in ("straight", "stopped"))
+    assert isinstance(straight["score"], float) and straight["score"] == stopped["score"] != straight["reward"]
+
+
+# -- evaluation ------------------------------------------------------------------------------------------------------
+
+
+def cartpole(store: Path, epoch: int = 1, **train: Any) -> Runner:
+    env = training(store, epoch=epoch, task="Cartpole", worlds=16, iterations=2, **train)
+    job = Job.from_env(env, "train")
+    raise_epoch(job.run, epoch)
+    return Runner(job, Gang(Placement(), "cpu", None, ["here"]), Cartpole, StopRequest())
+
+
+def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Path) -> None:
+    settings = {"config": {"randomize": {"mass": [0.5, 2.0], "observation_noise": 0.01}}}
+    trained = cartpole(tmp_path / "a", **settings)
+    assert trained.train() == 0
+    before = trained.task.state_dict()
+    others = trained.held_out_worlds()
+    assert others.world_count == 16
+    assert not (others.randomizer.factors[:, 0][:, None] == trained.task.randomizer.factors[:, 0]).any()
+    found = evaluate(others, trained.ppo, trained.gang, checkpoint="x")
+    assert all(torch.equal(tensor, before[name]) for name, tensor in trained.task.state_dict().items())
+    again = cartpole(tmp_path / "a", epoch=2, **settings)
+    assert again.resumed is not None
+    worlds = again.held_out_worlds()
+    assert torch.equal(worlds.randomizer.factors, others.randomizer.factors)
+    assert evaluate(worlds, again.ppo, again.gang, checkpoint="x").mean_return == found.mean_return
+
+
+def test_where_worlds_are_alike_those_of_training_are_evaluated_from_new_starts(tmp_path: Path) -> None:
+    trained = cartpole(tmp_path, config={"randomize": {"observation_noise": 0.01}})
+    assert trained.held_out_worlds() is trained.task

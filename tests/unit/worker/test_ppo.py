@@ -1,0 +1,255 @@
+"""PPO against numbers worked out by hand, and against rsl-rl's own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from rsl_rl.algorithms.ppo import PPO as StockPPO
+from rsl_rl.models.mlp_model import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.storage.rollout_storage import RolloutStorage
+from tensordict import TensorDict
+from torch.distributions import Normal
+
+from tests.support.worker.point_task import Point, PointConfig, PointPPO
+from worker.distributed import Gang, Placement
+from worker.learning import linear
+from worker.learning.objective import Objective
+from worker.learning.ppo import LOSSES, PPO, Share
+from worker.learning.randomness import mix_seed
+
+
+def alone() -> Gang:
+    return Gang(Placement(), "cpu", None, ["here"])
+
+
+def make(worlds: int = 4, **settings: object) -> PPO:
+    torch.manual_seed(5)
+    return PPO(dataclasses.replace(PointPPO(), **settings), Share(0, worlds, worlds), (2,), 1, alone(), seed=1)
+
+
+class FirstComponent(torch.nn.Module):
+    """A critic that is known: the value is the first component of the observation."""
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        return latent[..., :1]
+
+
+def play(
+    ppo: PPO, observations: torch.Tensor, rewards: list, dones: list, time_outs: list, terminal: torch.Tensor
+) -> None:
+    """Put a rollout of one world into ``ppo``."""
+    ppo.begin_iteration(0)
+    for step, row in enumerate(zip(rewards, dones, time_outs, strict=True)):
+        ppo.act(observations[step].view(1, 2))
+        ppo.process_env_step(terminal[step].view(1, 2), *(torch.tensor([float(value)]) for value in row))
+
+
+# r = (1, 0, 2), V = (1, 2, 3), V after the last step 4, γ = 0.9, λ = 0.5; the second step ends an episode
+VALUES = torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]])
+RETURNS = dict(steps=3, gamma=0.9, lam=0.5, minibatches=1, normalize_observations=False)
+
+
+def test_gae_by_hand() -> None:
+    ppo = make(1, **RETURNS)
+    ppo.critic.mlp = FirstComponent()
+    play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 0, 0], torch.full((3, 2), float("nan")))
+    ppo.compute_returns(VALUES[3].view(1, 2))
+    # δ₂ = 2 + 0.9·4 − 3 = 2.6, δ₁ = 0 − 2 = −2 (ended), δ₀ = 1 + 0.9·2 − 1 = 1.8; A = (1.8 + 0.45·(−2), −2, 2.6)
+    assert ppo.storage.returns.flatten().tolist() == pytest.approx([1.9, 0.0, 5.6])
+    # mean 0.5, squares of the offsets 0.16 + 6.25 + 4.41, over n − 1 = 2: deviation √5.41
+    assert ppo.storage.advantages.flatten().tolist() == pytest.approx(
+        [0.4 / 5.41**0.5, -2.5 / 5.41**0.5, 2.1 / 5.41**0.5]
+    )
+
+
+def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:
+    ppo = make(1, **RETURNS)
+    ppo.critic.mlp = FirstComponent()
+    terminal = torch.tensor([[float("nan"), 0.0], [5.0, 0.0], [float("nan"), 0.0]])
+    play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 1, 0], terminal)
+    ppo.compute_returns(VALUES[3].view(1, 2))
+    # now δ₁ = 0 + 0.9·5 − 2 = 2.5 and A₀ = 1.8 + 0.45·2.5 = 2.925; V(s_t) = 2 in place of 5 would give −0.2 and 1.71
+    assert ppo.storage.returns.flatten().tolist() == pytest.approx([3.925, 4.5, 5.6])
+
+
+@pytest.mark.parametrize(
+    ("kl", "before", "after"),
+    [
+        (0.021, 3e-3, 2e-3),
+        (0.019, 3e-3, 3e-3),
+        (0.006, 3e-3, 3e-3),
+        (0.004, 3e-3, 4.5e-3),
+        (0.0, 3e-3, 3e-3),
+        (1.0, 1.2e-5, 1e-5),
+        (0.001, 9e-3, 1e-2),
+    ],
+)
+def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
+    ppo = make(desired_kl=0.01)
+    ppo.learning_rate = before
+    ppo._adapt_learning_rate(torch.tensor(kl))
+    assert ppo.learning_rate == pytest.approx(after)
+    assert ppo.optimizer.param_groups[0]["lr"] is ppo.learning_rate_tensor
+
+
+def test_a_fixed_schedule_keeps_the_learning_rate() -> None:
+    ppo = make(schedule="fixed")
+    ppo._adapt_learning_rate(torch.tensor(1.0))
+    assert ppo.learning_rate == pytest.approx(1e-3)
+
+
+def test_noise_belongs_to_worlds_not_to_ranks() -> None:
+    def actions(first: int, count: int, iteration: int) -> torch.Tensor:
+        torch.manual_seed(5)
+        ppo = PPO(PointPPO(), Share(first, count, 6), (2,), 1, alone(), seed=1)
+        ppo.begin_iteration(iteration)
+        drawn = []
+        for ppo.storage.step in range(3):
+            drawn.append(ppo.act(torch.zeros(count, 2)).clone())
+        return torch.stack(drawn)
+
+    whole = actions(0, 6, 4)
+    torch.testing.assert_close(whole, torch.cat((actions(0, 2, 4), actions(2, 4, 4)), 1))
+    assert not torch.allclose(whole, actions(0, 6, 5), atol=0.1)
+    assert len(torch.unique(whole)) == whole.numel()
+
+
+def test_shares_cover_all_worlds_once() -> None:
+    shares = [Share.of(rank, 3, 8) for rank in range(3)]
+    assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
+
+
+def test_fewer_samples_than_minibatches_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"ppo.minibatches: 9 minibatches .* a rank collects 8"):
+        make(1, minibatches=9)
+
+
+def test_seeds_differ() -> None:
+    assert len({mix_seed(1, 2), mix_seed(2, 1), mix_seed(1, 2, 0), mix_seed(12)}) == 4
+
+
+def stock_twin(ppo: PPO, config: PointPPO, worlds: int) -> StockPPO:
+    """rsl-rl's PPO with the same weights."""
+    example = TensorDict({"policy": torch.zeros(worlds, 2)}, batch_size=[worlds])
+    groups = {"actor": ["policy"], "critic": ["policy"]}
+    common = dict(hidden_dims=config.hidden_sizes, activation=config.activation, obs_normalization=True)
+    distribution = {"class_name": GaussianDistribution, "init_std": config.init_std}
+    actor = MLPModel(example, groups, "actor", 1, distribution_cfg=distribution, **common)
+    critic = MLPModel(example, groups, "critic", 1, **common)
+    actor.load_state_dict(ppo.actor.state_dict())
+    critic.load_state_dict(ppo.critic.state_dict())
+    return StockPPO(
+        actor,
+        critic,
+        RolloutStorage("rl", worlds, config.steps, example, [1]),
+        num_learning_epochs=config.epochs,
+        num_mini_batches=config.minibatches,
+        entropy_coef=config.entropy_coef,
+        learning_rate=config.learning_rate,
+        desired_kl=config.desired_kl,
+    )
+
+
+@pytest.mark.parametrize("entropy_coef", [0.0, 0.01])
+def test_an_update_is_that_of_rsl_rl(entropy_coef: float) -> None:
+    """Three iterations, four passes each, over whole batches (so that the order of samples, which differs, plays no part)."""
+    config = PointPPO(epochs=4, minibatches=1, entropy_coef=entropy_coef)
+    worlds = 6
+    ppo = make(worlds, epochs=4, minibatches=1, entropy_coef=entropy_coef)
+    stock = stock_twin(ppo, config, worlds)
+    task = Point(PointConfig(episode_seconds=1000.0), worlds)
+    for iteration in range(3):
+        ppo.begin_iteration(iteration)
+        for _ in range(config.steps):
+            stock.act(TensorDict({"policy": task.observations.clone()}, batch_size=[worlds]))
+            task.step(ppo.act(task.observations))
+            ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
+            stock.transition.rewards, stock.transition.dones = task.rewards.clone(), task.dones.clone()
+            stock.storage.add_transition(stock.transition)
+            stock.transition.clear()
+        stock.storage.actions.copy_(ppo.storage.actions)
+        # the actions are ours: rsl-rl's own draws would differ
+        stock.actor.distribution.update(stock.storage.distribution_params[0])
+        stock.storage.actions_log_prob[..., 0] = stock.actor.distribution.log_prob(stock.storage.actions).detach()
+        ppo.compute_returns(task.observations)
+        stock.compute_returns(TensorDict({"policy": task.observations}, batch_size=[worlds]))
+        torch.testing.assert_close(ppo.storage.advantages, stock.storage.advantages, rtol=1e-4, atol=1e-5)
+        losses = dict(zip(LOSSES, ppo.update().tolist(), strict=True))
+        theirs = stock.update()
+        assert losses["value_loss"] == pytest.approx(theirs["value"], rel=1e-4)
+        assert losses["surrogate_loss"] == pytest.approx(theirs["surrogate"], rel=1e-3, abs=1e-6)
+        assert losses["entropy"] == pytest.approx(theirs["entropy"], rel=1e-5)
+        assert ppo.learning_rate == pytest.approx(stock.learning_rate)
+    for ours, other in ((ppo.actor, stock.actor), (ppo.critic, stock.critic)):
+        for name, tensor in ours.state_dict().items():
+            torch.testing.assert_close(tensor, other.state_dict()[name], rtol=1e-3, atol=1e-4, msg=name)
+    assert stock.learning_rate != config.learning_rate, "the rule was never exercised"
+
+
+def test_losses_ignore_what_terminal_observations_hold_where_nothing_ended() -> None:
+    ppo = make()
+    task = Point(PointConfig(), 4)
+    ppo.begin_iteration(0)
+    for _ in range(8):
+        task.step(ppo.act(task.observations))
+        terminal = torch.where(task.time_outs.unsqueeze(1), task.terminal_observations, float("nan"))
+        ppo.process_env_step(terminal, task.rewards, task.dones, task.time_outs)
+    ppo.compute_returns(task.observations)
+    assert torch.isfinite(ppo.update()).all()
+
+
+def test_every_epoch_has_its_own_order() -> None:
+    ppo = make(epochs=3, minibatches=2)
+    ppo.begin_iteration(0)
+    first, second, third = ppo._orders.view(3, -1).clone()
+    assert not torch.equal(first, second) and not torch.equal(second, third)
+    for epoch in (first, second, third):  # each sample once
+        assert torch.equal(epoch.sort().values, torch.arange(32))
+    ppo.begin_iteration(1)
+    assert not torch.equal(first, ppo._orders.view(3, -1)[0])
+
+
+def test_gradients_of_a_layer_are_those_of_torch() -> None:
+    x, weight, bias = torch.randn(7, 3), torch.randn(4, 3), torch.randn(4)
+    found = []
+    for layer in (linear._Linear.apply, torch.nn.functional.linear):
+        leaves = [each.clone().requires_grad_() for each in (x, weight, bias)]
+        (layer(*leaves).tanh() ** 2).sum().backward()
+        found.append([each.grad for each in leaves])
+    torch.testing.assert_close(*found)
+
+
+def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
+    """Far from the old policy too, where ratios and values are clipped on either side."""
+    torch.manual_seed(3)
+    samples, actions, clip, value_coef, entropy_coef, weight = 500, 3, 0.2, 0.7, 0.02, 0.4
+    drawn, old_mean, mean = (0.7 * torch.randn(samples, actions) for _ in range(3))
+    old_std, std = torch.tensor([0.9, 1.0, 1.2]), torch.tensor([1.0, 0.8, 1.3])
+    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
+    advantages, returns, old_values, values = (torch.randn(samples) for _ in range(4))
+    leaves = [each.requires_grad_() for each in (mean, std, values.unsqueeze(1))]
+
+    policy, value = Normal(mean, std), leaves[2][:, 0]
+    ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
+    surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
+    near = old_values + (value - old_values).clamp(-clip, clip)
+    value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
+    entropy = policy.entropy().sum(1).mean()
+    kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
+    loss = weight * (surrogate + value_coef * value_loss - entropy_coef * entropy)
+    expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
+    assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
+
+    order = torch.randperm(samples)
+    rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
+    numbers = {"weight": weight, "clip": clip, "value_coef": value_coef, "entropy_coef": entropy_coef}
+    objective = Objective(samples, actions, "cpu", **numbers)
+    losses = objective.backward(order, rollout, old_std, *leaves)
+    torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
+
+    mean.data[7, 0] = float("nan")
+    assert objective.backward(order, rollout, old_std, *leaves)[[0, 3]].isnan().all()
+    assert mean.grad[7].isnan().all()

@@ -1,0 +1,151 @@
+"""Asynchronous saving: order, acknowledgement, a writer that dies, fencing, and how often ``auto`` saves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import StaleEpoch, raise_epoch
+from shared_store.layout import Run, Store
+from tests.unit.shared_store.test_files import durable_operations
+from worker.learning.beacon import Beacon
+from worker.learning.cadence import Cadence
+from worker.learning.saving import Saver
+from worker.saver import Orders, save
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Store(tmp_path).open().run("r")
+    run.create({})
+    raise_epoch(run, 1)
+    return run
+
+
+def content(iteration: int, size: int = 1000) -> dict[str, Callable[[], dict[str, torch.Tensor]]]:
+    return {"learner.pt": lambda: {"value": torch.full((size,), float(iteration))}}
+
+
+def test_saves_are_committed_in_order_and_verify(run: Run) -> None:
+    saver = Saver(run, 1, 0, 1, keep=None)
+    for iteration in range(1, 8):
+        saver.save(iteration, content(iteration), {"reward": None})
+    lines = saver.wait()
+    assert saver.committed == "00000007-e1"
+    checkpoints = list_checkpoints(run)
+    assert [c.iteration for c in checkpoints] == list(range(1, 8))
+    assert len(lines) <= 7 and lines[-1] == "checkpoint 00000007-e1"
+    for checkpoint in checkpoints:
+        checkpoint.verify()
+        loaded = torch.load(checkpoint.path / "learner.pt", weights_only=True)
+        assert torch.equal(loaded["value"], torch.full((1000,), float(checkpoint.iteration)))
+    assert sorted(os.listdir(run.checkpoints)) == [*[c.name for c in checkpoints], "LATEST"]
+    saver.close()
+
+
+def test_what_is_saved_is_the_state_at_the_order_not_at_the_writing(run: Run) -> None:
+    saver = Saver(run, 1, 0, 1, keep=None)
+    live = torch.zeros(200_000)
+    saver.save(1, {"learner.pt": lambda: {"value": live}}, {})
+    live.fill_(9.0)
+    saver.wait()
+    loaded = torch.load(list_checkpoints(run)[0].path / "learner.pt", weights_only=True)
+    assert torch.equal(loaded["value"], torch.zeros(200_000))
+    saver.close()
+
+
+def test_the_main_writer_commits_only_when_every_rank_is_durable(run: Run) -> None:
+    main, other = Saver(run, 1, 0, 2, keep=None), Saver(run, 1, 1, 2, keep=None)
+    main.save(4, content(4), {})
+    time.sleep(0.5)
+    assert main.poll() == [] and list_checkpoints(run) == []
+    other.save(4, {"rank-1.pt": lambda: {"value": torch.ones(3)}}, None)
+    assert main.wait() == ["checkpoint 00000004-e1"]
+    assert set(list_checkpoints(run)[0].manifest["files"]) == {"learner.pt", "rank-1.pt"}
+    main.save(5, content(5), {})
+    main.abandon()
+    assert "another rank could not write its files" in main.wait()[0]
+    main.close()
+    other.close()
+
+
+def test_a_writer_that_dies_is_told_and_replaced(run: Run) -> None:
+    saver = Saver(run, 1, 0, 2, keep=None)  # the second rank never comes: the writer waits
+    saver.save(1, content(1), {})
+    assert saver._process is not None
+    time.sleep(0.3)
+    os.kill(saver._process.pid, signal.SIGKILL)
+    (line,) = saver.wait()
+    assert line == "warning: iteration 1 could not be saved (its writer died with code -9); training goes on"
+    assert saver.failures == 1
+    alone = Saver(run, 1, 0, 1, keep=None)
+    alone.save(2, content(2), {})
+    assert alone.wait() == ["checkpoint 00000002-e1"]
+    alone.close()
+
+
+def test_a_sigterm_to_every_process_of_a_node_leaves_the_writer_at_work(run: Run) -> None:
+    """Slurm's way to end a job, or to tell it that it will: the last save is still to be written."""
+    saver = Saver(run, 1, 0, 1, keep=None)
+    saver.save(1, content(1), {})
+    assert saver._process is not None
+    os.kill(saver._process.pid, signal.SIGTERM)
+    assert saver.wait() == ["checkpoint 00000001-e1"]
+    os.kill(saver._process.pid, signal.SIGTERM)
+    saver.save(2, content(2), {})
+    assert saver.wait() == ["checkpoint 00000002-e1"]
+    saver.close()
+
+
+def test_a_stale_attempt_is_stopped_by_its_own_save(run: Run) -> None:
+    saver = Saver(run, 1, 0, 1, keep=None)
+    raise_epoch(run, 2)
+    saver.save(3, content(3), {})
+    with pytest.raises(StaleEpoch, match="now belongs to epoch 2"):
+        saver.wait()
+    assert list_checkpoints(run) == []
+
+
+def test_a_file_is_durable_before_its_writer_tells_the_others(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = os.memfd_create("snapshot")
+    os.pwrite(memory, b"state", 0)
+    order = {"run": str(run.path), "iteration": 1, "epoch": 1, "rank": 1, "ranks": 2, "memory": memory, "facts": None}
+    seen = durable_operations(monkeypatch)
+    answer = save({**order, "files": [("rank-1.pt", 0, 5)]}, Orders())
+    os.close(memory)
+    making = run.checkpoints / ".00000001-e1.tmp"
+    assert answer["written"] == "00000001-e1" and (making / "rank-1.pt").read_bytes() == b"state"
+    told = seen.index(("rename", str(making / ".rank-1.json")))
+    assert ("fsync", str(making / "rank-1.pt")) in seen[:told]
+
+
+def test_auto_saves_as_often_as_one_percent_allows() -> None:
+    cadence = Cadence("auto")
+    quiet = {"stall": 0.0, "iteration_seconds": 0.1}
+    assert [i for i in range(1, 11) if cadence.due(i, quiet)] == [5, 10]
+    slow = {"stall": 0.02, "iteration_seconds": 0.1}  # a stall of a fifth of an iteration: every 20 iterations
+    due = [i for i in range(11, 61) if cadence.due(i, slow)]
+    assert due == [30, 50] and cadence.every == 20
+    fixed = Cadence(25)
+    assert [i for i in range(1, 101) if fixed.due(i, slow)] == [25, 50, 75, 100]
+
+
+def test_the_beacon_never_waits_and_survives_a_supervisor_that_is_gone() -> None:
+    read, write = os.pipe2(os.O_NONBLOCK)
+    beacon = Beacon({"MUSTER_PROGRESS_FD": str(write)})
+    started = time.monotonic()
+    for iteration in range(20_000):
+        beacon.tell(iteration=iteration)
+    assert time.monotonic() - started < 5
+    os.close(read)
+    beacon.tell(iteration=1)
+    beacon.tell(iteration=2)
+    Beacon({}).tell(iteration=3)
+    os.close(write)
