@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import ast
-import os
 import subprocess
 import sys
-import venv
 from pathlib import Path
 
 import pytest
 
 from orchestrator.cli.catalogue import ENTRIES, load
-from tests.conftest import REPOSITORY, wait_for
+from tests.conftest import REPOSITORY
 
 HEAVY = {"torch", "warp", "newton", "rsl_rl", "gymnasium", "tensordict", "mujoco"}
 FORBIDDEN = {
@@ -67,31 +65,6 @@ def test_help_imports_no_command_and_each_says_what_its_own_help_says() -> None:
     for entry in ENTRIES:
         own = " ".join((load(entry.name).help or "").partition("\n\n")[0].split())
         assert own == entry.summary, entry.name
-
-
-def test_a_bare_installation_gives_a_working_controller_without_torch(tmp_path: Path) -> None:
-    venv.create(tmp_path / "bare", with_pip=True)
-    python = str(tmp_path / "bare" / "bin" / "python")
-    install = [python, "-m", "pip", "install", "-q", "-c", str(REPOSITORY / "constraints.txt"), str(REPOSITORY)]
-    subprocess.run(install, check=True, capture_output=True, timeout=300)
-    missing = (
-        "import importlib.util, sys; sys.exit(any(importlib.util.find_spec(m) for m in ('torch', 'warp', 'newton')))"
-    )
-    subprocess.run([python, "-c", missing], check=True)
-    spec = tmp_path / "job.yaml"
-    spec.write_text(
-        "name: bare\nnodes: 2\nresources: {cpus: 0.1, memory: 16MiB}\ncommand: [python, -c, 'print(6 * 7)']\n"
-    )
-    env = {**os.environ, "MUSTER_HOME": str(tmp_path / "home")}
-    done = subprocess.run(
-        [str(tmp_path / "bare" / "bin" / "muster"), "run", str(spec)],
-        env=env,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0 and "42" in done.stdout, done.stdout + done.stderr
-    wait_for(lambda: not (tmp_path / "home" / "controller.json").exists(), 5, "the embedded controller's end")
 
 
 def test_no_module_is_too_long_to_be_seen_whole() -> None:

@@ -23,7 +23,7 @@ def killed_at_every_step(action: Callable[[Path], None], prepared: Path, work: P
     """What each of the killed processes left, and last what the process left that was not killed."""
     name = f"{action.__module__}:{action.__name__}"
     command = [sys.executable, "-m", "tests.support.shared_store.crashes", name, str(prepared), str(work)]
-    subprocess.run(command, cwd=Path(__file__).parents[2], check=True, timeout=60)
+    subprocess.run(command, cwd=Path(__file__).parents[3], check=True, timeout=60)
     left = sorted(work.iterdir())
     assert len(left) > 3, "the action does nothing that could be cut"
     return left

@@ -15,7 +15,7 @@ from worker.tasks import BUILT_IN, find_task
 from worker.tasks.task import Task
 
 torch.set_num_threads(1)
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 SETTINGS = {
     "Cartpole": {},
     "CartpolePixels": {},

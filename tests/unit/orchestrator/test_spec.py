@@ -18,7 +18,7 @@ from orchestrator.spec import Spec, known_tasks, override, validate
 from orchestrator.specfile import load, read
 from worker.tasks.config import PPOConfig
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 SHIPPED = sorted((REPOSITORY / "job_specs").glob("*.yaml"))
 TRAIN = "train: {task: Cartpole, worlds: 4, iterations: 2}"
 COMMAND = "name: a\ncommand: [x]\n"

@@ -12,7 +12,7 @@ import yaml
 
 from orchestrator.spec import KINDS, Spec, known_tasks, schema
 
-SHIPPED = sorted((Path(__file__).parents[2] / "job_specs").glob("*.yaml"))
+SHIPPED = sorted((Path(__file__).parents[3] / "job_specs").glob("*.yaml"))
 
 
 def accepts(node: dict[str, Any], value: Any, document: dict[str, Any]) -> bool:
