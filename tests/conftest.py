@@ -28,7 +28,7 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
 os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
 
-PATIENCE = 3
+PATIENCE = 6
 """Every limit of a wait is this many times what an idle machine could need: a limit is there to end a test that hangs."""
 
 
@@ -193,7 +193,7 @@ class Serving:
         """End the server, and whatever a failed test left running."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-            self.process.wait(10)
+            self.process.wait(10 * PATIENCE)
         self.client.close()
         for pid in processes_of(self.home):
             try:

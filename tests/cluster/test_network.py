@@ -18,7 +18,7 @@ from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome
-from tests.conftest import REPOSITORY, processes_of, wait_for
+from tests.conftest import PATIENCE, REPOSITORY, processes_of, wait_for
 from tests.support.faults.link import ADDRESSES, Link
 
 SMALL = (
@@ -80,7 +80,7 @@ def test_loss_and_delay_cost_time_and_a_cut_is_found_and_named(link: Link, tmp_p
         link.order("delay 0.2")
         reach(3)
         link.order("cut")
-        codes = [node.wait(90) for node in nodes]
+        codes = [node.wait(90 * PATIENCE) for node in nodes]
     finally:
         for node in nodes:
             node.kill()

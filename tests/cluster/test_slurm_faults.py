@@ -18,7 +18,7 @@ from orchestrator.engines.slurm_commands import call
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import read_outcome
-from tests.conftest import MUSTER, Serving, parent, wait_for
+from tests.conftest import MUSTER, PATIENCE, Serving, parent, wait_for
 from tests.support.engines.sites import POLITE
 from tests.support.engines.slurm_bench import Bench, slurm_bench
 
@@ -108,7 +108,7 @@ def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: Bench, monkeypatc
     go = threading.Event()
 
     def slow(*command: str, text: str | None = None) -> str:
-        assert go.wait(60)
+        assert go.wait(60 * PATIENCE)
         return call(*command, text=text)
 
     monkeypatch.setattr(slurm, "call", slow)
@@ -140,7 +140,7 @@ def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: Bench, t
         assert stopping.stderr is not None
         assert "stopped by the user; waits for Slurm: slurmctld " in stopping.stderr.readline()
         daemon.send_signal(signal.SIGCONT)
-        assert stopping.wait(120) == 0 and served.detail(job)["status"] == "FAILED"
+        assert stopping.wait(120 * PATIENCE) == 0 and served.detail(job)["status"] == "FAILED"
     finally:
         daemon.send_signal(signal.SIGCONT)
         served.close()

@@ -16,7 +16,7 @@ from orchestrator.database import Database, DatabaseFull
 from orchestrator.disk import DEFAULT, Disk, MinFree
 from orchestrator.errors import ApiError
 from orchestrator.tables import JobQueue
-from tests.conftest import Serving, processes_of, run_muster, wait_for
+from tests.conftest import PATIENCE, Serving, processes_of, run_muster, wait_for
 from tests.support.conformance.streams import client_of
 from tests.training.faults.test_store import fill
 
@@ -77,7 +77,7 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
             assert server.wait(server.gang("pass", name="another"))["status"] == "SUCCEEDED"
         finally:
             server.close()
-            copying.wait(10)
+            copying.wait(10 * PATIENCE)
     said = (volume.parent / "stderr").read_text()
     assert "Traceback" not in said and len(said) < 4000, said
     assert "MB free" in said and "the volumes have enough free space again" in said

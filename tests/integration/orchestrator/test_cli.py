@@ -17,7 +17,7 @@ import httpx
 import pytest
 
 from orchestrator.cli.jobs import _gpus
-from tests.conftest import MUSTER, REPOSITORY, Serving, call_muster, run_muster, wait_for
+from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, run_muster, wait_for
 
 REQUIREMENTS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
 
@@ -304,7 +304,7 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     assert running.stdout is not None
     wait_for(lambda: "RUNNABLE" in running.stdout.readline(), 30, "the job waits")
     running.send_signal(signal.SIGTERM)  # is taken as Ctrl-C is
-    said, errors = running.communicate(timeout=60)
+    said, errors = running.communicate(timeout=60 * PATIENCE)
     assert (running.returncode, errors) == (130, ""), said
     assert "FAILED  cartpole (" in said and ": stopped with Ctrl-C" in said
     [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]

@@ -21,7 +21,7 @@ from orchestrator.errors import ApiError
 from orchestrator.jobs import Ending, NodeEnd, Verdict
 from orchestrator.server import Server
 from orchestrator.tables import Attempt, Job
-from tests.conftest import MAIN_LAST, MUSTER, Serving, parent, processes_of, submit_gang, wait_for
+from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, parent, processes_of, submit_gang, wait_for
 
 NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
 
@@ -204,7 +204,7 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving) ->
     detail = server.wait(job)
     assert detail["status"] == "SUCCEEDED" and len(detail["attempts"]) == 1
     assert [line for line in server.log(job, rank=1)] == [f"tick {i}" for i in range(60)]
-    followed = [json.loads(line) for line in [first, *follower.communicate(timeout=30)[0].splitlines()]]
+    followed = [json.loads(line) for line in [first, *follower.communicate(timeout=30 * PATIENCE)[0].splitlines()]]
     for rank in (0, 1):  # the follower took up where it was: no line twice, none left out
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
 

@@ -17,7 +17,7 @@ from shared_store.cgroups import own_group, remove_abandoned_groups, remove_grou
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.processes import end_all, find_process, marked
 from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
-from tests.conftest import alive, frozen, wait_for
+from tests.conftest import PATIENCE, alive, frozen, wait_for
 
 ESCAPE = (
     "env -i setsid sh -c 'echo $$ >>{pids}; exec sleep 600' & "
@@ -73,14 +73,14 @@ def known(shim: subprocess.Popen[str], group: str) -> NodeProcesses:
 @pytest.mark.parametrize(("end", "code"), [("exit 0", 0), ("exit 75", 75), ("kill -9 $$", 137), ("kill -TERM $$", 143)])
 def test_what_escaped_is_gone_when_the_supervisor_has_ended(group: str, pids: Path, end: str, code: int) -> None:
     shim = start(ESCAPE.format(pids=pids) + end, group)
-    assert shim.wait(20) == code
+    assert shim.wait(20 * PATIENCE) == code
     assert len(read(pids)) == 2 and not any(alive(pid) for pid in read(pids))
 
 
 def test_a_child_that_kills_its_parent_does_not_outlive_it(group: str, pids: Path) -> None:
     script = ESCAPE.format(pids=pids) + "setsid sh -c 'kill -9 $PPID; exec sleep 600' & wait"
     shim = start(script, group)
-    assert shim.wait(20) == 137
+    assert shim.wait(20 * PATIENCE) == 137
     assert not any(alive(pid) for pid in read(pids))
 
 
@@ -126,7 +126,7 @@ def test_without_one_what_kept_its_marks_is_found_by_them_and_others_are_left_al
     assert not end_nodes([node], [f"MUSTER_GANG={gang}"])
     assert sorted(alive(pid) for pid in read(pids)) == [False, True] and alive(other.pid)
     assert not end_nodes([of_the_other], [f"MUSTER_GANG={gang}1"])
-    other.wait(20)
+    other.wait(20 * PATIENCE)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -136,7 +136,7 @@ def test_requests_reach_the_supervisor_also_where_a_job_stopped_it(number: int, 
     wait_for(lambda: read(pids), 20, "the supervisor")
     os.kill(read(pids)[0], signal.SIGSTOP)
     shim.send_signal(number)
-    assert shim.wait(20) == 75
+    assert shim.wait(20 * PATIENCE) == 75
 
 
 def test_a_shim_that_a_job_stopped_ends_all_the_same(group: str, pids: Path) -> None:
@@ -144,14 +144,14 @@ def test_a_shim_that_a_job_stopped_ends_all_the_same(group: str, pids: Path) -> 
     wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
     shim.send_signal(signal.SIGSTOP)
     assert not end_nodes([known(shim, group)], ["MUSTER_GANG=no-such-gang/1/1"])
-    assert shim.wait(20) == 137
+    assert shim.wait(20 * PATIENCE) == 137
     assert not any(alive(pid) for pid in read(pids))
 
 
 def test_a_killed_supervisor_s_temporary_directory_is_removed_and_no_other(pids: Path) -> None:
     other = Path(tempfile.mkdtemp(prefix=SCRATCH.format(pid=1)))
     script = f"mkdir {tempfile.gettempdir()}/{SCRATCH.format(pid='$$')}abc; echo $$ >{pids}; kill -9 $$"
-    assert start(script, "").wait(20) == 137
+    assert start(script, "").wait(20 * PATIENCE) == 137
     assert not list(Path(tempfile.gettempdir()).glob(SCRATCH.format(pid=read(pids)[0]) + "*"))
     assert other.exists()
     other.rmdir()
@@ -175,7 +175,7 @@ def test_what_can_not_be_killed_is_named_and_waited_for(pids: Path, monkeypatch:
         [left] = end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
         assert left.pid == stubborn and left.state == "D"
         wait_for(lambda: node.shim and node.shim.name == STUCK, 20, "the shim says that it is stuck")
-    assert shim.wait(20) == 137
+    assert shim.wait(20 * PATIENCE) == 137
     assert shim.stderr is not None
     said = shim.stderr.read()
     assert said.startswith(
@@ -201,7 +201,7 @@ def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pi
     shim = start(
         f"for i in 1 2 3 4; do {sys.executable} -I -S {tmp_path}/chain.py & done; sleep 0.5; kill -9 $$", group
     )
-    assert shim.wait(60) == 137
+    assert shim.wait(60 * PATIENCE) == 137
     left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if _holds(path, str(tmp_path).encode())]
     assert not left
 
@@ -235,5 +235,5 @@ def test_abandoned_groups_are_removed_and_neither_those_in_use_nor_new_ones(monk
     remove_abandoned_groups(directory)
     assert not os.path.exists(f"{directory}/muster-empty") and os.path.exists(f"{directory}/muster-busy")
     assert not end_nodes([node], ["MUSTER_GANG=no-such-gang/1/1"])
-    shim.wait(20)
+    shim.wait(20 * PATIENCE)
     assert not os.path.exists(directory)

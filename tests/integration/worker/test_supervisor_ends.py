@@ -15,7 +15,7 @@ import pytest
 from shared_store.contract import sealed
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import LONGEST_TEXT
-from tests.conftest import alive, wait_for
+from tests.conftest import PATIENCE, alive, wait_for
 from tests.support.worker.node import Nodes, gone
 
 # -- ends -------------------------------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
         "sys.exit(supervisor.supervise())\n"
     )
     n.start("sleep", "60", program=("-c", script))
-    assert n.wait(10) == 143
+    assert n.wait(10 * PATIENCE) == 143
 
 
 # -- the job's own environment ----------------------------------------------------------------------------------------
@@ -343,7 +343,7 @@ def test_a_newer_epoch_ends_everything_at_once_and_nothing_is_written(node: Node
     pids = [int(text) for text in n.output() if text.isdigit()]
     before = n.lines()
     raise_epoch(n.run, 2)
-    assert n.wait(5) == 3
+    assert n.wait(5 * PATIENCE) == 3
     gone(*pids)
     assert n.lines() == before
     assert n.outcome is None

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import alive, wait_for
+from tests.conftest import PATIENCE, alive, wait_for
 
 NODES = ("n1", "n2", "n3")
 CPUS, MEMORY, GPUS = 4, 8192, 2
@@ -159,7 +159,7 @@ class SlurmCluster:
                 daemon.terminate()
         for daemon in self.daemons.values():
             try:
-                daemon.wait(10)
+                daemon.wait(10 * PATIENCE)
             except subprocess.TimeoutExpired:
                 daemon.kill()
                 daemon.wait()

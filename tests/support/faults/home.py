@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.layout import Run, Store
-from tests.conftest import MUSTER, REPOSITORY
+from tests.conftest import MUSTER, PATIENCE, REPOSITORY
 
 _START_SECONDS = 60.0
 _FRESH_SECONDS = 0.25
@@ -96,7 +96,7 @@ class Home:
             assert self.process is not None
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
-            self.process.wait(20)
+            self.process.wait(20 * PATIENCE)
 
     # -- the command --------------------------------------------------------------------------------------------------
 

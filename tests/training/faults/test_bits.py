@@ -13,7 +13,7 @@ import pytest
 
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import MUSTER, REPOSITORY, Serving, run_muster, wait_for
+from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, run_muster, wait_for
 from tests.support.engines.training import same_bits
 
 CARTPOLE = ("job_specs/cartpole.yaml", "train.worlds=8", "checkpoint.every=4", "nodes=1")
@@ -41,7 +41,7 @@ def verify(home: Path, at: int, iterations: int, *spec: str) -> subprocess.Popen
 
 def proven(process: subprocess.Popen[str], iterations: int) -> tuple[str, str, int]:
     """Both runs, and the iteration at which the killed one went on, of a verification that found equal bits."""
-    output, errors = process.communicate(timeout=900)
+    output, errors = process.communicate(timeout=900 * PATIENCE)
     assert process.returncode == 0, output + errors
     tensors = re.search(rf"^equal: (\d+) tensors, {iterations} iterations$", output, re.MULTILINE)
     assert tensors and int(tensors[1]) > 30, output

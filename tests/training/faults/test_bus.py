@@ -17,7 +17,7 @@ import pytest
 from orchestrator.bus import Bus, BusError
 from shared_store.bus import LONGEST_ANSWER
 from shared_store.contract import NodeContract
-from tests.conftest import REPOSITORY, Serving, processes_of, wait_for
+from tests.conftest import PATIENCE, REPOSITORY, Serving, processes_of, wait_for
 from tests.training.e2e.test_training import submit, wait_for_iteration
 from worker.bus import NodeBus
 
@@ -80,7 +80,7 @@ def test_a_frozen_node_is_noticed_by_its_lease_and_welcomed_back(bus: Bus) -> No
 
 def test_a_node_whose_main_thread_fails_ends_at_once_with_its_own_exit_code(bus: Bus) -> None:
     node = start_node(bus, "time.sleep(0.5); raise SystemExit(7)")
-    assert node.wait(timeout=5) == 7, "an open session must not keep a failed process alive"
+    assert node.wait(5 * PATIENCE) == 7, "an open session must not keep a failed process alive"
 
 
 def test_commands_arrive_while_nobody_reads_the_telemetry(bus: Bus) -> None:

@@ -14,6 +14,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from tests.conftest import PATIENCE
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank
 from worker.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
 from worker.errors import GangError
@@ -104,7 +105,7 @@ def test_a_missing_rank_is_named_by_all() -> None:
     port = free_port()
     processes = [start_rank("test_distributed:report", rank, 3, port, env) for rank in (0, 1)]
     for process in processes:
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=60 * PATIENCE)
         assert process.returncode == 1
         assert "error: rank 2 (node 2) did not report within 2 s: 2 of 3 ranks are here" in errors
         assert "Traceback" not in errors

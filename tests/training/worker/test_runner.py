@@ -17,6 +17,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
+from tests.conftest import PATIENCE
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
 from worker.distributed import Gang, Placement
@@ -244,7 +245,7 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
         seen = next(line for line in ranks[0].stdout if line.startswith("iteration") and " 3/" in line)
         assert seen
         ranks[1].send_signal(signal.SIGTERM)
-        outputs = [rank.communicate(timeout=30) for rank in ranks]
+        outputs = [rank.communicate(timeout=30 * PATIENCE) for rank in ranks]
     finally:
         for rank in ranks:
             rank.kill()

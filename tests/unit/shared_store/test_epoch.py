@@ -21,7 +21,7 @@ from shared_store.epoch import (
     take_epoch,
 )
 from shared_store.layout import Run
-from tests.conftest import REPOSITORY
+from tests.conftest import PATIENCE, REPOSITORY
 from tests.support.shared_store.crashes import killed_at_every_step
 
 
@@ -121,7 +121,7 @@ def test_controllers_that_take_epochs_at_once_never_get_the_same(tmp_path: Path)
         assert taker.stdin is not None
         taker.stdin.write("go\n")
         taker.stdin.flush()
-    taken = [int(line) for taker in takers for line in taker.communicate(timeout=60)[0].split()]
+    taken = [int(line) for taker in takers for line in taker.communicate(timeout=60 * PATIENCE)[0].split()]
     assert len(taken) == len(set(taken)) == 90
     run = Run(tmp_path / "run")
     assert read_epoch(run) in taken
