@@ -202,7 +202,7 @@ class Connection(H11Protocol):
     def _refuse(self) -> None:
         message = "too many connections are open; close some, or try again later"
         body = json.dumps({"__type": "ServiceUnavailableException", "message": message}).encode()
-        head = "HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\ncontent-type: application/json\r\n"
+        head = "HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 1\r\ncontent-type: application/json\r\n"
         self.transport.write(f"{head}content-length: {len(body)}\r\n\r\n".encode() + body)
         self._close()
 

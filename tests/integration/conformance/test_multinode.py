@@ -79,7 +79,8 @@ def test_every_node_has_the_variables_of_aws_and_no_other(batch: Batch, tmp_path
     """Three nodes by an override of two; node 1 is the main node, and leaves when the others have said their part."""
     script = f"""
 env | grep -E '^AWS_(BATCH|EXECUTION)' | sort
-read -r _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ started _ < /proc/$PPID/stat; echo started $started $PPID
+read -r _ _ _ shim _ < /proc/$PPID/stat
+read -r _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ _ started _ < /proc/$shim/stat; echo started $started $shim
 touch "$GATE/{NODE}"
 [ {NODE} = 1 ] || exit 0
 {UNTIL.format(0)}; {UNTIL.format(2)}; exit 3

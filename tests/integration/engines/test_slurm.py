@@ -273,7 +273,8 @@ def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
     bench.ready(polite, 3)
     bench.engine.stop(polite, 30.0)
     assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75, 75]
-    assert bench.log().count("saved") == 3 and not bench.processes(b"worker.supervisor")
+    assert bench.log().count("saved") >= 3  # Slurm signals every process of a step, and the supervisor its rank
+    assert not bench.processes(b"worker.supervisor")
     stubborn = bench.launch(bench.gang(STUBBORN, suffix="2", grace=60.0))
     bench.ready(stubborn, suffix="2")
     asked = time.monotonic()

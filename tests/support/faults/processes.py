@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 _ROLES = {b"worker.supervisor": "supervisor", b"worker.saver": "writer", b"worker.train": "rank"}
@@ -58,7 +58,16 @@ def processes_below(home: Path) -> list[Process]:
         role = next((_ROLES[word] for word in command[:5] if word in _ROLES), "other")
         number = int(env.get(b"RANK") or env.get(b"AWS_BATCH_JOB_NODE_INDEX") or -1)
         found.append(Process(int(entry), start, role, env.get(b"MUSTER_GANG", b"").decode(), number))
-    return found
+    ranks = {process.pid for process in found if process.role == "rank"}
+    forked = {process.pid for process in found if process.pid in ranks and _parent(process.pid) in ranks}
+    return [replace(process, role="other") if process.pid in forked else process for process in found]  # writers to be
+
+
+def _parent(pid: int) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
 
 
 def end_all(home: Path) -> None:

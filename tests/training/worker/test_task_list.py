@@ -13,6 +13,8 @@ import pytest
 import torch
 import yaml
 
+from orchestrator.cli.tasks import _table
+from orchestrator.cli.terminal import Console
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
@@ -26,7 +28,8 @@ OWN = "job_specs.my_task:Pendulum"
 def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_path: Path) -> None:
     done = run_muster("tasks", "--json", home=tmp_path / "home")
     assert done.returncode == 0, done.stderr
-    listed = {task["name"]: task for task in json.loads(done.stdout)}
+    found = json.loads(done.stdout)
+    listed = {task["name"]: task for task in found}
     assert listed.keys() >= BUILT_IN.keys()
     for name, where in BUILT_IN.items():
         task, told = find_task(name), listed[name]
@@ -37,7 +40,10 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
         assert tuple(told["observations"]) == seen and tuple(told["actions"]) == task.action_names
         assert told["control_hz"] == task.config_type().control_hz
     assert not (tmp_path / "home").exists(), "a listing needs no controller"
-    table = run_muster("tasks", home=tmp_path).stdout
+    console = Console(width=200)
+    with console.capture() as captured:  # another process would import the simulation again
+        console.print(_table(found))
+    table = captured.get()
     assert re.search(r"^Ant +35 +8 +60 Hz +16 s +forward 1 +heading 0.5 +up 0.1 +alive 0.5 +action -0.005", table, re.M)
     assert re.search(r"^Quadruped +48 +12 +50 Hz +20 s +track_linear 2", table, re.M)
 
