@@ -27,7 +27,12 @@ def run_page(page: str, directory: Path) -> str:
         pytest.skip(f"PORT {PORT}, WHICH THE PAGE USES, IS TAKEN ON THIS MACHINE")
     clone = directory / "muster"
     shutil.copytree(REPOSITORY, clone, ignore=shutil.ignore_patterns(".*", "__pycache__"), symlinks=True)
-    (clone / ".venv").symlink_to(Path(sys.executable).parent.parent)
+    environment = clone / ".venv"
+    environment.mkdir()
+    for entry in Path(sys.executable).parent.parent.iterdir():
+        if entry.name != ".ready":
+            (environment / entry.name).symlink_to(entry)
+    (environment / ".ready").touch()  # newer than all: `make run` installs nothing, which would change this environment
     found = re.findall(r"^```sh\n(.*?)^```", (REPOSITORY / page).read_text(), re.MULTILINE | re.DOTALL)
     script = "\n".join(found).replace("make test ", ": make test ")
     hidden = ("MUSTER_HOME", "MUSTER_URL", "MUSTER_TOKEN", "VIRTUAL_ENV")
