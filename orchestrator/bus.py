@@ -142,7 +142,7 @@ class Bus:
             "listen/endpoints": [f"tcp/{address}:{port}" for address in ("127.0.0.1", *self._addresses)],
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
-            "scouting/delay": 0,  # half a second in which a router looks for others, which there are not
+            "scouting/delay": 0,  # else it looks for other routers for half a second; there are none
             "transport/shared_memory/enabled": False,
             "transport/link/rx/max_message_size": LARGEST_MESSAGE,
             "transport/auth/usrpwd/dictionary_file": str(users),

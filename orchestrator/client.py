@@ -28,7 +28,7 @@ DEFAULT_URL = "http://127.0.0.1:8080"
 _SUBMISSIONS = ("/submitjob", "/resume")
 """Paths of requests that must not be carried out twice."""
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
-"""Seconds after each refusal for too many requests or connections; the last one is told."""
+"""Seconds after each refusal for too many requests or connections; the last refusal is reported."""
 _BARREN = 4
 """Streams in a row that broke off without a line, after which those of a job that is over are given up."""
 _LONGEST_PAUSE = 5.0
@@ -162,7 +162,7 @@ class Client:
         def send() -> httpx.Response:
             for pause in _PAUSES:
                 answer = self._http.request(method, path, json=body, params=query, timeout=seconds, headers=headers)
-                if answer.status_code != 429 and "retry-after" not in answer.headers:
+                if answer.status_code != 429 and not (answer.status_code == 503 and "retry-after" in answer.headers):
                     break
                 time.sleep(pause)  # refused before anything was done
             return answer

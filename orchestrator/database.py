@@ -379,7 +379,7 @@ def _tune_sqlite(connection: Any, _record: object) -> None:
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one).
 
-    ``REFERENCE:3`` is the child with index 3 of the array that is found so.
+    ``REFERENCE:3`` is the child with index 3 of the array that REFERENCE names.
 
     ``queues``: only jobs of these are looked for by name or by the start of an id; None: all jobs.
     """

@@ -13,7 +13,7 @@ NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).
 """Revision of the tables of :mod:`orchestrator.tables`."""
 _VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
 _OLDEST = "0001"
-"""That of databases which were made before there were migrations."""
+"""The revision of databases from before migrations existed."""
 
 
 class NewerSchema(Exception):
@@ -30,6 +30,8 @@ def bring_up_to_date(connection: Connection) -> None:
     if present == NEWEST:
         return
     if present is None and "jobs" not in tables:
+        if connection.dialect.name == "sqlite":  # Python's driver begins no transaction for CREATE TABLE
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
         Base.metadata.create_all(connection)
         _VERSION.create(connection, checkfirst=True)
         connection.execute(insert(_VERSION).values(version_num=NEWEST))

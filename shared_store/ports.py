@@ -1,4 +1,4 @@
-"""The port at which a gang meets (``MASTER_PORT``): free on all addresses of the host, and not the one that another gang is about to take."""
+"""The port at which a gang meets (``MASTER_PORT``): free on all addresses of the host, in a range that few other gangs have."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ _FIRST, _SLOTS, _EACH = 20000, 600, 20
 """600 ranges of 20 ports, all below those that Linux hands out by itself (from 32768)."""
 
 
-def first_port(gang: str) -> int:
-    """The first port of a gang's own range: 20000 to 31980."""
-    return _FIRST + int.from_bytes(hashlib.sha256(gang.encode()).digest()[:4], "big") % _SLOTS * _EACH
+def first_port(gang: str | int) -> int:
+    """The first port of a gang's range, 20000 to 31980: by its name, or by a number, where gangs in a row shall have different ones."""
+    number = gang if isinstance(gang, int) else int.from_bytes(hashlib.sha256(gang.encode()).digest()[:4], "big")
+    return _FIRST + number % _SLOTS * _EACH
 
 
-def free_port(gang: str) -> int:
+def free_port(gang: str | int) -> int:
     """The first port of a gang's range that no process of this host listens on, at whatever address.
 
     A program that calls ``torch.distributed.init_process_group`` listens on all addresses at once, so a port at which another gang

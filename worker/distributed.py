@@ -157,19 +157,20 @@ class Gang:
             dist.destroy_process_group()
 
 
-def require_gpus(visible: str) -> None:
-    """Check that PyTorch can use the GPUs of this rank, which would train on the CPU otherwise.
+def require_gpus(visible: str, local_rank: int) -> None:
+    """Check that PyTorch can use the GPU of this rank, which would train on the CPU otherwise.
 
     Args:
-        visible: ``CUDA_VISIBLE_DEVICES``, in which engines name the GPUs of a rank; empty for none.
+        visible: ``CUDA_VISIBLE_DEVICES``, in which engines name the GPUs of a node; empty for none.
+        local_rank: The rank's number on its node, which is that of its GPU.
 
     Raises:
         ValueError: It can't.
     """
-    if visible.strip() not in ("", "-1") and not torch.cuda.is_available():
+    if visible.strip() not in ("", "-1", "NoDevFiles") and torch.cuda.device_count() <= local_rank:
         raise ValueError(
-            f"this rank has GPU {visible}, and PyTorch {torch.__version__} can't use it; install a PyTorch with CUDA and a driver "
-            "that fits it, or set resources.gpus to 0"
+            f"this node has GPU {visible}, and PyTorch {torch.__version__} can use {torch.cuda.device_count() or 'none'} of them; "
+            "install a PyTorch with CUDA and a driver that fits it, or set resources.gpus to 0"
         )
 
 

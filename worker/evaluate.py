@@ -18,7 +18,7 @@ def main() -> int:
     use_cpu_threads(os.environ)
     with user_errors():
         placement = Placement.from_env(os.environ)
-        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from worker.learning.evaluation import evaluate
     from worker.learning.ppo import PPO, Share

@@ -35,7 +35,7 @@ def meet() -> str:
     far = next((a for a in addresses if not ipaddress.ip_address(a).is_loopback), None)
     if far is not None and ipaddress.ip_address(addresses[0]).is_loopback:
         addresses[0] = address_towards(far)
-    return json.dumps({"nodes": names, "addresses": addresses, "port": free_port(os.environ["SLURM_JOB_ID"])})
+    return json.dumps({"nodes": names, "addresses": addresses, "port": free_port(int(os.environ["SLURM_JOB_ID"]))})
 
 
 def _lines(*command: str) -> list[str]:

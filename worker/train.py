@@ -17,7 +17,7 @@ def main() -> int:
     use_cpu_threads(os.environ)
     with user_errors():
         placement = Placement.from_env(os.environ)
-        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     if not isinstance(job.section.get("task"), str):
         raise UserError("train.task: the name of a task is missing")

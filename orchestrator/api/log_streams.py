@@ -87,9 +87,7 @@ def newest_streams(session: Session, store: Store, prefix: str = "", since: int 
 
 def _streams(store: Store, job: Job, attempt: Attempt) -> Iterator[Stream]:
     run, live = store.run(job.run), attempt.stopped_at is None
-    with contextlib.suppress(
-        LookupError, TypeError
-    ):  # a damaged row: its other nodes, and all other jobs, keep their streams
-        for node in attempt.nodes:
+    for node in attempt.nodes if isinstance(attempt.nodes, list) else ():
+        with contextlib.suppress(LookupError, TypeError):  # a damaged row: its other nodes keep their streams
             name = stream_name(job, attempt.number, node["index"])
             yield Stream(name, run.log(job.id, attempt.number, node["index"]), attempt.created_at, live)

@@ -112,11 +112,11 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
     controller = _controller(request)
     needs, definition = _gang_of(body), body.definition
+    for source in sources_of(needs):
+        permitted_run(controller, source, Operation.READ_RUN)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
-        for source in sources_of(needs):
-            permitted_run(controller, source, Operation.READ_RUN)
         found = fit_in_queue(session, controller.engine, queue, needs.shape, FRESH)
         if found.seat is None:
             raise ClientError(

@@ -23,7 +23,9 @@ class Entry(NamedTuple):
 _JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
 ENTRIES = (
     Entry(
-        *("run", "serving", _JOBS),
+        "run",
+        "serving",
+        _JOBS,
         "Run a job to its end, with a controller of its own where none is running; exit with its result.",
     ),
     Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
@@ -36,14 +38,18 @@ ENTRIES = (
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
     Entry(
-        *("verify-resume", "verify", _RUNS),
+        "verify-resume",
+        "verify",
+        _RUNS,
         "Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.",
     ),
     Entry(
         "serve", "serving", _SHARED, "Run the controller as a server. Running jobs outlive it; the next one finds them."
     ),
     Entry(
-        *("queues", "queues", _SHARED),
+        "queues",
+        "queues",
+        _SHARED,
         "List job queues; of one, the waiting jobs in the order in which they will start.",
     ),
     Entry("keys", "keys", _SHARED, "Access keys of this home directory's server: who may call it."),
@@ -51,12 +57,16 @@ ENTRIES = (
         "aws", "aws", _SHARED, "The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch)."
     ),
     Entry(
-        *("tasks", "tasks", _HERE),
+        "tasks",
+        "tasks",
+        _HERE,
         "List the tasks that are installed here; of one, the names of its observations and actions.",
     ),
     Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors."),
     Entry(
-        *("doctor", "doctor", _HERE),
+        "doctor",
+        "doctor",
+        _HERE,
         "Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing.",
     ),
 )
@@ -74,8 +84,8 @@ class Catalogue(TyperGroup):
     """The group that lists placeholders and runs the commands themselves."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, _, rest = super().resolve_command(ctx, args)  # an unknown name ends here, with the nearest known ones
-        return name, load(str(name)), rest
+        name, found, rest = super().resolve_command(ctx, args)  # an unknown name ends here, with the nearest known ones
+        return name, load(name) if found is not None and name else None, rest
 
 
 def add_placeholders(app: typer.Typer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from datetime import UTC, datetime, timedelta
@@ -54,15 +55,25 @@ def logs(
                 for line in lines
                 if not (oldest and line["time"] < oldest) and (not pattern or pattern.search(line["text"]))
             ]
-            if shown:
-                echo_raw("\n".join(shown))
-    if not came and not as_json:
+            if shown and not _printed("\n".join(shown)):
+                return
+    if not came:
         asked = {"node": node, "rank": rank, "attempt": attempt}
         of = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
         echo(
             f"job {job} has no log lines{f' of {of}' if of else ''}; muster show {job} has its attempts and nodes",
             err=True,
         )
+
+
+def _printed(text: str) -> bool:
+    """Print; False where the reader has had enough (``muster logs … | head``)."""
+    try:
+        echo_raw(text)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        return False
+    return True
 
 
 def _format(line: dict[str, Any], colour: bool, raw: bool) -> str:

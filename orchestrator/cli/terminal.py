@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 import sys
 from collections.abc import Iterable
@@ -52,17 +51,8 @@ def echo(text: str, err: bool = False) -> None:
 
 
 def echo_raw(text: str, err: bool = False) -> None:
-    """:func:`echo` for what is visible already, or is wanted as it is; one write, so that lines of others stay apart.
-
-    Where the reader has gone (``muster logs … | head``), the command ends with 0.
-    """
-    try:
-        print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)
-    except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # what is still buffered goes nowhere at the exit
-        raise SystemExit(0) from None
+    """:func:`echo` for what is visible already, or is wanted as it is; one write, so that lines of others stay apart."""
+    print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

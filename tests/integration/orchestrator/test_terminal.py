@@ -88,9 +88,7 @@ def test_commands_print_through_the_terminal_only() -> None:
         for line in path.read_text().splitlines()
         if ways.search(line)
     ]
-    assert found == [
-        r'terminal.py:         print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)'
-    ]
+    assert found == [r'terminal.py:     print(f"{text}\n", end="", file=sys.stderr if err else sys.stdout, flush=True)']
 
 
 def test_no_command_hands_a_jobs_escapes_to_the_terminal(shared_server: Serving) -> None:

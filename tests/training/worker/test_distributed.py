@@ -219,9 +219,9 @@ def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this PyTorch can use a GPU")
 def test_a_rank_whose_gpu_pytorch_cannot_use_does_not_train_on_the_cpu_in_silence() -> None:
-    require_gpus("")
-    require_gpus("-1")
+    for none in ("", "-1", "NoDevFiles"):
+        require_gpus(none, 0)
     with pytest.raises(
-        ValueError, match=r"this rank has GPU 0,1, and PyTorch .* can't use it; install a PyTorch with CUDA"
+        ValueError, match=r"this node has GPU 0,1, and PyTorch .* can use none of them; install a PyTorch"
     ):
-        require_gpus("0,1")
+        require_gpus("0,1", 1)
