@@ -216,7 +216,7 @@ def _used(attempt: dict[str, Any]) -> str:
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:
         return ""
-    return f", {used:.0f} {kind.upper()}-seconds" + (f" of which {lost:.0f} lost" if lost >= 1 else "")
+    return f", {used:.0f} {kind.upper()}-seconds" + (f", {lost:.0f} of them lost" if lost >= 1 else "")
 
 
 def _gpus(node: dict[str, Any]) -> str:
