@@ -54,8 +54,8 @@ import os, time
 for i in range(150): print(os.environ["AWS_BATCH_JOB_NODE_INDEX"], i, sep=":"); time.sleep(0.02)
 """
     tails = [
-        CliTail(shared_server.url, startTime=int(time.time() * 1000) - 1000, **query)
-        for query in ({"logStreamNamePrefix": "tailed/"}, {"filterPattern": '":"', "limit": 7})
+        CliTail(shared_server.url, startTime=int(time.time() * 1000) - 1000, logStreamNamePrefix="tailed/", **query)
+        for query in ({}, {"filterPattern": '":"', "limit": 7})
     ]
     for tail in tails:
         tail.start()
