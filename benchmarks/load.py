@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,11 @@ class Watch:
                 "measure with --loaded-anyway"
             )
         return {"others": share, "load_average": self.average}
+
+
+def machine() -> str:
+    """This machine in a few words, for the table of a benchmark that uses no GPU."""
+    return f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
 
 
 def told(rows: list[dict[str, Any]]) -> str:

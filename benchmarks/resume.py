@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import re
 import signal
 import statistics
@@ -22,7 +21,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, machine, told
 from benchmarks.spine import MUSTER, REPOSITORY, Bench, seconds
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
@@ -199,7 +198,6 @@ def main() -> None:
     watch = Watch(parser.parse_args().loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
         rows, restarts = measure(Path(directory))
-    machine = f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
     parts = {
         "detection: SIGKILL → the controller has decided": "detection",
         "stop: → no process of the gang is left": "stop",
@@ -214,7 +212,7 @@ def main() -> None:
     gang = [f"| Ant, 2 nodes × 64 worlds, warm kernels | {head} |", "|---|" + "--:|" * len(restarts)]
     for name, part in parts.items():
         gang.append(f"| {name} | " + " | ".join(f"{getattr(each, part):.2f} s" for each in restarts) + " |")
-    intro = f"`make bench-resume` on {machine}. Before it: {told([watch.start])}"
+    intro = f"`make bench-resume` on {machine()}. Before it: {told([watch.start])}"
     text = "\n".join(["# Saving and resuming", "", intro, "", *table, "", "SIGKILL of rank 1:", "", *gang, ""])
     (REPOSITORY / "benchmarks" / "resume.md").write_text(text)
     print(text)

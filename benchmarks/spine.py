@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, machine, told
 from orchestrator.client import Client
 
 REPOSITORY = Path(__file__).parent.parent
@@ -134,10 +133,9 @@ def main() -> None:
     watch = Watch(parser.parse_args().loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
         rows = measure(Path(directory))
-    machine = f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
     table = ["| what | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     text = "\n".join(
-        ["# The spine", "", f"`make bench` on {machine}; one run. Before it: {told([watch.start])}", "", *table, ""]
+        ["# The spine", "", f"`make bench` on {machine()}; one run. Before it: {told([watch.start])}", "", *table, ""]
     )
     (REPOSITORY / "benchmarks" / "spine.md").write_text(text)
     print(text)

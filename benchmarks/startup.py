@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -17,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, machine, told
 
 REPOSITORY = Path(__file__).parent.parent
 MUSTER = str(Path(sys.executable).parent / "muster")
@@ -53,21 +52,19 @@ def measure(home: Path) -> list[tuple[str, str, str]]:
     """Name, goal and measurement of each row."""
     env = {**os.environ, "MUSTER_HOME": str(home)}
 
-    def new_home() -> float:
-        with tempfile.TemporaryDirectory() as directory:
-            server, ready = serving({**os.environ, "MUSTER_HOME": directory})
-            stop(server)
-            return ready
-
-    def known_home() -> float:
-        server, ready = serving(env)
+    def ready(home: str) -> float:
+        server, seconds = serving({**os.environ, "MUSTER_HOME": home})
         stop(server)
-        return ready
+        return seconds
+
+    def ready_in_new_home() -> float:
+        with tempfile.TemporaryDirectory() as directory:
+            return ready(directory)
 
     rows = [("`muster --help`, CPU", "< 0.4 s", median(lambda: cpu_of([MUSTER, "--help"], env)[0]))]
-    rows.append(("`muster serve`, new home: ready after", "< 2 s", median(new_home)))
-    known_home()
-    rows.append(("`muster serve`, again: ready after", "< 2 s", median(known_home)))
+    rows.append(("`muster serve`, new home: ready after", "< 2 s", median(ready_in_new_home)))
+    ready(str(home))
+    rows.append(("`muster serve`, again: ready after", "< 2 s", median(lambda: ready(str(home)))))
     server, _ = serving(env)
     rows.append(("`muster list`, CPU", "< 0.8 s", median(lambda: cpu_of([MUSTER, "list"], env)[0])))
     stop(server)
@@ -85,11 +82,8 @@ def main() -> None:
     watch = Watch(parser.parse_args().loaded_anyway)
     with tempfile.TemporaryDirectory() as directory:
         rows = measure(Path(directory))
-    machine = f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
     table = ["| what | goal | median |", "|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]
-    intro = (
-        f"`make bench-startup` on {machine}; {REPEATS} times each, `make run` 3 times. Before it: {told([watch.start])}"
-    )
+    intro = f"`make bench-startup` on {machine()}; {REPEATS} times each, `make run` 3 times. Before it: {told([watch.start])}"
     text = "\n".join(["# Start-up", "", intro, "", *table, ""])
     (REPOSITORY / "benchmarks" / "startup.md").write_text(text)
     print(text)

@@ -122,20 +122,13 @@ def frozen(pid: int) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test with its tier."""
-
-    def tier(item: pytest.Item) -> int:
-        folder = (
-            item.path.relative_to(REPOSITORY / "tests").parts[0]
-            if item.path.is_relative_to(REPOSITORY / "tests")
-            else ""
-        )
-        return TIERS.index(folder) if folder in TIERS else len(TIERS)
-
-    for item in items:
-        if (number := tier(item)) < len(TIERS):
-            item.add_marker(TIERS[number])
-    items.sort(key=tier)
+    """Mark each test with its tier, and put the tiers in their order."""
+    tests = REPOSITORY / "tests"
+    tiers = {item: next((n for n in TIERS if item.path.is_relative_to(tests / n)), None) for item in items}
+    for item, tier in tiers.items():
+        if tier is not None:
+            item.add_marker(tier)
+    items.sort(key=lambda item: TIERS.index(tier) if (tier := tiers[item]) else len(TIERS))
 
 
 class Serving:

@@ -20,24 +20,25 @@ PAGES = sorted(
         check=True,
     ).stdout.split()
 )
-LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+"""Of a page or a picture."""
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as GitHub makes them."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
-    headings = re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
+    headings = re.findall(r"^#+ +(.+?) *$", prose(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-def prose(page: Path) -> str:
-    return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
     for match in LINK.finditer(prose(page)):
-        target = match[1] or match[2]
+        target = match[1]
         if target.startswith(("http://", "https://")):
             continue
         path, _, anchor = target.partition("#")
@@ -54,7 +55,7 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
         if page in reached:
             continue
         reached.add(page)
-        targets = (match[1].partition("#")[0] for match in LINK.finditer(prose(page)) if match[1])
+        targets = (match[1].partition("#")[0] for match in LINK.finditer(prose(page)))
         found += [
             (page.parent / target).resolve() for target in targets if target.endswith(".md") and "://" not in target
         ]
