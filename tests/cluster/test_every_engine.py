@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.conftest import wait_for
 from tests.integration.engines import test_every_engine as on_others
 from tests.integration.engines.test_every_engine import WAIT_FOR_ALL, gone
 from tests.support.engines.fixtures import sites
@@ -22,6 +23,8 @@ def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(any_sit
         "echo ready; [ $AWS_BATCH_JOB_ATTEMPT = 2 ] || exec sleep 600" + WAIT_FOR_ALL, nodes=2, attempts=2
     )
     site.ready(job, 1, 2)
+    # a node that was never on the bus is not missed there: it may be in a network that the bus does not reach
+    wait_for(lambda: site.serving.detail(job)["attempts"][0]["nodes"][1].get("met"), 60, "node 1 on the bus")
     freeze(job, 1)
     detail = site.serving.wait(job, timeout=60)
     assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
