@@ -10,6 +10,9 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
+# where it is set, every process would compile all that it imports anew: twice the time of a start
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: run test unit integration training engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
