@@ -67,6 +67,8 @@ _REMEMBERED = 256
 _PORT = 29500
 _TRIES = 64
 """Subnets that are tried before a gang can't be started: others on this machine may hold some."""
+_LOOK = 1.0
+"""Seconds for which a look at a node waits for the rest of its log."""
 
 
 class DockerEngine:
@@ -141,6 +143,10 @@ class DockerEngine:
             if found:
                 with ThreadPoolExecutor(len(found)) as pool:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
+                with self._copying:
+                    copies = [self._copies[key] for key in self._copies if key.startswith(f"{facts['gang']}/")]
+                for copy in copies:  # what is not copied yet would go with the container
+                    copy.wait()
             self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
             for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
                 self._ended.pop(gang, None)
@@ -299,7 +305,8 @@ class DockerEngine:
         if state.get("OOMKilled"):
             detail = "OutOfMemoryError: Container killed due to memory usage"
         if container.labels.get("muster.plain"):
-            self._settle(facts, index, state, detail)
+            if not self._settle(facts, index, state, detail):
+                return NodeStatus(True, address, waiting="its container has ended, its log is still being copied")
         elif code and not detail:
             try:
                 detail = container.logs(tail=1).decode(errors="replace").strip()
@@ -307,22 +314,27 @@ class DockerEngine:
                 detail = ""
         return NodeStatus(False, address, code, detail)
 
-    def _settle(self, facts: Mapping[str, Any], index: int, state: Mapping[str, Any], detail: str) -> None:
-        """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written."""
+    def _settle(self, facts: Mapping[str, Any], index: int, state: Mapping[str, Any], detail: str) -> bool:
+        """What a supervisor does at the end of its node, for one without: the log is whole, then the outcome is written.
+
+        False while the log is not whole yet.
+        """
         copy = self._copies.get(f"{facts['gang']}/{index}")
         if copy is not None:
-            copy.wait(10.0)
+            if not copy.wait(_LOOK):
+                return False
             if copy.trouble is not None and not isinstance(copy.trouble, APIError | DamagedFile):  # these will stay
                 raise copy.trouble
         run = Store(facts["store"]).run(facts["run"])
         if read_outcome(run, facts["job"], facts["attempt"], index) is not None or not run.path.exists():
-            return
+            return True
         code = int(state["ExitCode"])
         reason = detail or ("done" if code == 0 else f"container exited with code {code}")
         ended = time.time()
         outcome = Outcome(index, facts["epoch"], code, None, reason, None, ended, ended)
         with contextlib.suppress(DamagedFile):  # a link in its place: what Docker says of the container counts then
             write_outcome(run, facts["job"], facts["attempt"], outcome)
+        return True
 
     def _follow(self, container: Container, facts: Mapping[str, Any], index: int) -> None:
         """Copy the log of a container without a supervisor into the run's, from where it was copied to before."""

@@ -49,8 +49,10 @@ class LogCopy:
         """It failed, and may be made anew: what it could not copy is still there."""
         return self.trouble is not None and time.monotonic() - self._ended > _AGAIN
 
-    def wait(self, seconds: float) -> None:
+    def wait(self, seconds: float | None = None) -> bool:
+        """Whether it has ended, by itself or in trouble, within that time."""
         self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         try:

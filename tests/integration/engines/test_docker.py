@@ -233,7 +233,10 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: Bench, monkeypatch
     bench.ended(handle)
 
 
-def test_a_long_log_keeps_its_head_and_its_tail(bench: Bench) -> None:
+def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orchestrator.engines.docker._LOOK", 0.0)  # it goes on at the next look
     handle = bench.launch(bench.gang("seq 100000 160000; echo the error; exit 1", 1, log_limit=1 << 20))
     bench.ended(handle)
     log = bench.log()
@@ -257,6 +260,15 @@ def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> No
     log.rmdir()
     [node] = wait_for(lambda: not refused() and bench.ended(handle), 20, "the end")
     assert node.exit_code == 3 and bench.log() == [long, "done"]
+
+
+def test_the_log_of_a_gang_that_is_stopped_is_whole(bench: Bench) -> None:
+    handle = bench.launch(
+        bench.gang("echo ready; trap 'seq 100000 160000; exit 75' TERM; while :; do sleep 0.05; done", 1)
+    )
+    wait_for(lambda: "ready" in bench.log(), 20, "it is ready")
+    bench.engine.stop(handle, 30.0)
+    assert bench.log() == ["ready", *map(str, range(100_000, 160_001))]
 
 
 def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
