@@ -21,9 +21,9 @@ import httpx
 from orchestrator.errors import ApiError as ApiError
 from orchestrator.errors import NotServing, NoUrl
 from orchestrator.errors import Unreachable as Unreachable
-from orchestrator.home import local_url
+from orchestrator.home import local_url, muster_home
 
-DEFAULT_URL = "http://127.0.0.1:8080"
+EXAMPLE_URL = "http://127.0.0.1:8080"
 
 _SUBMISSIONS = ("/submitjob", "/resume")
 """Paths of requests that must not be carried out twice."""
@@ -60,7 +60,7 @@ class Client:
     def __init__(self, url: str, token: str | None = None) -> None:
         """Raises NoUrl where ``url`` is none."""
         if not _is_url(url):
-            raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {DEFAULT_URL}")
+            raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
         self.url = url
         self._found = False
         self.successor: Callable[[], Client] | None = None
@@ -72,12 +72,18 @@ class Client:
 
     @classmethod
     def connect(cls, url: str | None = None) -> Client:
-        """The controller at ``url``, else at ``$MUSTER_URL``, else that of ``$MUSTER_HOME``, else on port 8080.
+        """The controller at ``url``, else at ``$MUSTER_URL``, else that of ``$MUSTER_HOME``.
 
+        Another home directory's controller is never taken in its place: names of jobs and runs are the same everywhere.
         Raises Unreachable where none answers, ApiError where the token is refused.
         """
         found = not (url or os.environ.get("MUSTER_URL"))
-        url = url or os.environ.get("MUSTER_URL") or local_url() or DEFAULT_URL
+        url = url or os.environ.get("MUSTER_URL") or local_url()
+        if url is None:
+            raise Unreachable(
+                f"no controller of {muster_home()} runs; start one with `muster serve`, or set MUSTER_URL to that of another one, "
+                f"such as {EXAMPLE_URL}"
+            )
         client = cls(url, os.environ.get("MUSTER_TOKEN"))
         client._found = found
         client.get("/healthz")

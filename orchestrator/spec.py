@@ -304,7 +304,7 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
     Args:
         value: What the YAML or a request holds.
         source: What to call it in an error (a file name).
-        lines: Line of each key path in the file, for errors.
+        lines: Line of each key path in the file, for errors; 0 of one that ``--set`` gave.
 
     Raises:
         SpecError: One line naming the file, line and key, what was expected, and the nearest valid name.
@@ -320,7 +320,7 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
         path = tuple(part for part in first["loc"] if isinstance(part, str | int))
         line = _line_of(path, lines or {})
-        where = f"{source}:{line}" if line else source
+        where = "--set" if line == 0 else f"{source}:{line}" if line else source
         key = ".".join(str(part) for part in path)
         raise SpecError(f"{where}: {f'{key}: ' if key else ''}{_explain(first, path)}{more}") from None
 

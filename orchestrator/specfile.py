@@ -20,6 +20,10 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
     document, lines = read(path)
     if assignments and isinstance(document, dict):
         document = override(document, assignments)
+        changed = [tuple(assignment.partition("=")[0].split(".")) for assignment in assignments]
+        # what --set changed stands on no line of the file
+        lines = {key: line for key, line in lines.items() if not any(key[: len(each)] == each for each in changed)}
+        lines |= dict.fromkeys(changed, 0)
     return validate(document, path, lines)
 
 

@@ -92,6 +92,11 @@ def find_run(controller: Controller, name: str) -> Run:
                 over = Status(job.status).is_terminal
                 what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
                 raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
+            named = session.scalars(
+                select(Job).where(Job.name == name).order_by(Job.created_at.desc()).limit(1)
+            ).first()
+            if named is not None and is_visible(named):
+                raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
             runs = [each.name for each in visible_runs(session, controller.store, most=_COMPARED)]
         nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
         others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"

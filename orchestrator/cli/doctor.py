@@ -7,7 +7,6 @@ import json
 import os
 import platform
 import shutil
-import socket
 import sys
 import tempfile
 import time
@@ -139,7 +138,7 @@ def _shared_memory() -> Finding:
 def _controller() -> Finding:
     url = os.environ.get("MUSTER_URL") or local_url()
     if url is None:
-        return Finding("controller", "absent", f"none of {socket.gethostname()} runs; muster serve starts one")
+        return Finding("controller", "absent", f"none of {muster_home()} runs; muster serve starts one")
     try:
         with Client.connect(url) as client:
             engines = client.get("/api/capacity")["engines"]

@@ -181,8 +181,20 @@ def list_jobs(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
             escape(one_line(reason)),  # a compiler's message has lines, and brackets that are no markup
         )
-    # one line a job: cut to the terminal's width, whole for another program
-    (Console() if sys.stdout.isatty() else Console(width=_WHOLE)).print(table)
+    _print_cut(table)
+
+
+def _print_cut(table: Table) -> None:
+    """One line a row: on a terminal the last column is cut to what the others leave of its width, for another program all is whole."""
+    if not sys.stdout.isatty():
+        Console(width=_WHOLE).print(table)
+        return
+    console, wide = Console(), Console(width=_WHOLE)
+    for column in table.columns[:-1]:  # rich would shrink all of them alike
+        column.min_width = max(wide.measure(cell).maximum for cell in (column.header, *column.cells))
+    taken = sum(2 + (column.min_width or 0) for column in table.columns[:-1])
+    table.columns[-1].max_width = max(len("REASON"), console.width - taken)
+    Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
 
 
 def _list_queue(client: Client, queue: str, all_: bool) -> list[dict[str, Any]]:
@@ -210,13 +222,13 @@ def _counted(summary: dict[str, int]) -> str:
     return ", ".join(f"{count} {status}" for status, count in summary.items() if count)
 
 
-def _used(attempt: dict[str, Any]) -> str:
-    """GPU time of an attempt (CPU time where it has no GPUs), and how much of it was lost."""
+def _used(attempt: dict[str, Any], saves: bool) -> str:
+    """GPU time that an attempt held (CPU time where it has no GPUs), and how much of it was lost where that is known: of what ``saves``."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:
         return ""
-    return f", {used:.0f} {kind.upper()}-seconds" + (f", {lost:.0f} of them lost" if lost >= 1 else "")
+    return f", {used:.0f} {kind.upper()}-seconds" + (f", {lost:.0f} of them lost" if saves and lost >= 1 else "")
 
 
 def _gpus(node: dict[str, Any]) -> str:
@@ -241,9 +253,9 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     colour = _COLOURS.get(detail["status"], "white")
     console.print(f"[bold]{detail['name']}[/]  {detail['id']}  [{colour}]{detail['status']}[/]")
     facts = {
-        "why": one_line(detail["statusReason"] or ""),
+        "why": "" if detail["status"] == "SUCCEEDED" else one_line(detail["statusReason"] or ""),
         "created": _when(detail["createdAt"]),
-        "took": _took(detail["startedAt"], detail["stoppedAt"]),
+        "took": _took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"],
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
@@ -258,25 +270,29 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
-    facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "store": results.get("path")}
+    facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "directory": results.get("path")}
     for name, value in facts.items():
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)
+    spent = 0
     for attempt in detail["attempts"]:
-        ended = attempt["ending"] or "running"
+        started = attempt["startedAt"] is not None
+        ended = attempt["ending"] or ("running" if started else "is being started")
         counted = "" if attempt["spent"] else ", not counted"
-        reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] else ""
+        spent += bool(attempt["spent"])
+        number = f"{attempt['number']} of {detail['attemptsAllowed']}"
+        if spent < attempt["number"]:  # of those that are allowed, attempts that left on request are none
+            number = f"{attempt['number']} ({spent} of {detail['attemptsAllowed']} spent)"
+        reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] and ended != "succeeded" else ""
         took = _took(attempt["startedAt"], attempt["stoppedAt"])
         console.print(
-            f"  attempt {attempt['number']} of {detail['attemptsAllowed']} (epoch {attempt['epoch']}, {took}{_used(attempt)}) {ended}{counted}{reason}",
+            f"  attempt {number} (epoch {attempt['epoch']}, {took}{_used(attempt, detail['kind'] == 'train')}) {ended}{counted}{reason}",
             markup=False,
         )
         for node in attempt["nodes"]:
-            state = (
-                "running"
-                if node["running"]
-                else f"exit {node.get('exitCode', '?')}: {one_line(node.get('reason', ''))}"
-            )
+            state = "running" if started else "not started yet"
+            if not node["running"]:
+                state = f"exit {node.get('exitCode', '?')}: {one_line(node.get('reason', ''))}"
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
@@ -305,7 +321,7 @@ def stop(
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
-    if (detail["results"] or {}).get("checkpoint"):
+    if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.client import DEFAULT_URL
+from orchestrator.client import EXAMPLE_URL
 from orchestrator.home import local_url, muster_home
 from orchestrator.keys import Key, KeyStore
 
@@ -41,7 +41,7 @@ def create(
     if as_json:
         echo_json({**_describe(key), "secretAccessKey": key.secret})
         return
-    url = local_url() or DEFAULT_URL
+    url = local_url() or EXAMPLE_URL
     echo(
         f"""created key {key.name} ({_may(key)}); its secret is shown only this once
 

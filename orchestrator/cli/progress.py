@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -53,6 +55,14 @@ def follow(client: Client, job_id: str) -> int:
     return summary(client, job_id)
 
 
+def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The node that the attempt's reason names, else the first with an error of its own."""
+    nodes: list[dict[str, Any]] = attempt["nodes"]
+    if named := re.match(r"node (\d+): ", attempt["statusReason"] or ""):
+        return next((node for node in nodes if node["index"] == int(named[1])), None)
+    return next((node for node in nodes if node.get("error")), None)
+
+
 def summary(client: Client, job_id: str) -> int:
     """Print how a job ended and where its results lie; returns the command's exit code."""
     detail = client.get(f"/api/jobs/{job_id}")
@@ -64,15 +74,13 @@ def summary(client: Client, job_id: str) -> int:
     console.print(reason, markup=False)
     results = detail["results"] or {}
     attempt = detail["attempts"][-1] if detail["attempts"] else None
-    if attempt and not succeeded:
-        for node in attempt["nodes"]:
-            if node.get("error"):
-                console.print(f"  first error: node {node['index']}: {one_line(node['error'])}", markup=False)
-                break
+    first = _cause(attempt) if attempt and not succeeded else None
+    if first and first.get("error") and one_line(first["error"]) not in one_line(detail["statusReason"]):
+        console.print(f"  first error: node {first['index']}: {one_line(first['error'])}", markup=False)
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
         console.print(f"  evaluation:  {evaluated(evaluation)}")
-    log = attempt["nodes"][0]["log"] if attempt else None
+    log = (first or attempt["nodes"][0])["log"] if attempt else None
     for name, value in {"checkpoint": results.get("checkpoint"), "log": log, "plot": results.get("plot")}.items():
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)

@@ -69,17 +69,20 @@ def checkpoints(
         echo(f"run {run} has no checkpoint yet")
     else:
         table = Table(box=None, pad_edge=False)
-        for column in ("CHECKPOINT", "ITERATION", "REWARD", "WORLDS", "SIZE", "CREATED", "STATE"):
+        for column in ("CHECKPOINT", "ITERATION", "REWARD", "SCORE", "WORLDS", "SIZE", "CREATED", "STATE"):
             table.add_column(column, no_wrap=column != "STATE")
+        best = max((each["score"] for each in found if each.get("score") is not None), default=None)
         for each in found:
-            reward = "-" if each.get("reward") is None else f"{each['reward']:.2f}"
+            reward, score = ("-" if each.get(key) is None else f"{each[key]:.2f}" for key in ("reward", "score"))
             size = f"{each['size'] / 2**20:.1f} MiB" if "size" in each else "-"
             created = (
                 time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each["created"])) if each.get("created") else "-"
             )
             state = each.get("problem") or ("verified" if each.get("verified") else "committed")
+            if best is not None and each.get("score") == best:
+                state += ", the best"
             table.add_row(
-                each["name"], str(each["iteration"]), reward, str(each.get("worlds", "-")), size, created, state
+                each["name"], str(each["iteration"]), reward, score, str(each.get("worlds", "-")), size, created, state
             )
         Console(soft_wrap=True).print(table)
     if damaged:

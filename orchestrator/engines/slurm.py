@@ -98,7 +98,9 @@ class SlurmEngine:
             self._begin(gang, facts, script)
         pending = self._pending[gang.name]
         if not wait([pending], patience).done:
-            raise NotYet("Slurm: slurmctld has not answered yet; see `scontrol ping`", unknown=True)
+            raise NotYet(
+                "Slurm: the gang is being handed to slurmctld; if this lasts, see `scontrol ping`", unknown=True
+            )
         del self._pending[gang.name]
         try:
             return json.dumps({**facts, "slurm": pending.result()})

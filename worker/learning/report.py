@@ -86,12 +86,15 @@ class Report:
 
 
 def _slow(record: dict[str, float | int | None]) -> str:
-    """The rank for which the others wait, where it takes a tenth longer than usual."""
+    """The rank for which the others wait, where that costs a tenth of the time, and a time that a person would notice."""
     excess = record.get("slowest_excess") or 0.0
-    return f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)" if excess > _SLOW else ""
+    is_slow = excess > _SLOW and excess * (record["collect_seconds"] or 0.0) > _NOTICED
+    return f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)" if is_slow else ""
 
 
 _SLOW = 0.1
+_NOTICED = 0.1
+"""Seconds of an iteration."""
 _TAGS = {
     "reward": "episode/reward",
     "episode_length": "episode/length",

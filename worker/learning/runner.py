@@ -321,6 +321,7 @@ class Runner:
                 "training is done, but its last checkpoint could not be saved; free space in the store and start again"
             )
         self.beacon.tell(done=True)
+        self._say(f"evaluating checkpoint {name}")
         result = evaluate(self.held_out_worlds(), self.ppo, self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:

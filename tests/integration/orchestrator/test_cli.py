@@ -10,13 +10,15 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from rich.table import Table
 
-from orchestrator.cli.jobs import _gpus
+from orchestrator.cli.jobs import _gpus, _print_cut
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, run_muster, wait_for
 
 REQUIREMENTS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
@@ -140,6 +142,12 @@ def test_commands_without_a_controller_say_how_to_start_one(tmp_path: Path) -> N
         refused(["list"], tmp_path, 1, f"no controller answers at {url}", "muster serve", MUSTER_URL=url)
 
 
+def test_a_home_without_a_controller_does_not_take_anothers(tmp_path: Path) -> None:
+    empty = tmp_path / "another-home"
+    for command in (["list"], ["show", "x"], ["resume", "x"], ["submit", "job_specs/cartpole.yaml"]):
+        refused(command, empty, 1, f"no controller of {empty} runs", "muster serve", "MUSTER_URL")
+
+
 @pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://", "ftp://x"])
 def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> None:
     refused(["list"], tmp_path, 2, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
@@ -236,8 +244,33 @@ def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server
     assert "hello from 0" in only and "hello from 1" not in only
     stopped = shared_server.muster("stop", "greeter")
     assert stopped.returncode == 0 and "ended: stopped by the user" in stopped.stdout
+    run = shared_server.detail(submitted["jobId"])["run"]
+    assert f"go on with: muster resume {run}\n" in stopped.stdout
+    refused(["resume", "greeter"], shared_server.home, 2, f"greeter is a job, not a run; its run is {run}")
     assert json.loads(shared_server.muster("show", "greeter", "--json").stdout)["status"] == "FAILED"
     assert "FAILED already" in shared_server.muster("stop", "greeter").stdout
+
+
+def test_a_narrow_terminal_cuts_the_reasons_and_nothing_else(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("NO_COLOR", "1")
+    table = Table(box=None, pad_edge=False)
+    for column in ("JOB", "NAME", "STATUS", "REASON"):
+        table.add_column(column, no_wrap=True, overflow="ellipsis" if column == "REASON" else "fold")
+    table.add_row("0123abcd", "a-job-of-that-name", "[red]FAILED[/]", "node 2: " + "a long story " * 20)
+    table.add_row("4567abcd", "another", "RUNNABLE", "waits")
+    _print_cut(table)
+    _, first, second = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert first[:3] == ["0123abcd", "a-job-of-that-name", "FAILED"] and first[-1].endswith("…")
+    assert second == ["4567abcd", "another", "RUNNABLE", "waits"]
+
+
+def test_what_set_gave_is_not_blamed_on_a_line_of_the_file(tmp_path: Path) -> None:
+    wrong = ["submit", "job_specs/cartpole.yaml", "--dry-run", "--set", "train.task=Cartpol"]
+    refused(wrong, tmp_path, 2, "muster: --set: train.task: no task is called 'Cartpol'")
 
 
 def test_a_log_that_holds_nothing_of_what_was_asked_for_says_so(shared_server: Serving) -> None:

@@ -278,13 +278,13 @@ def test_overriding_leaves_the_document_as_it_was() -> None:
         ),
         (
             "train.config={a: .inf}",
-            "job.yaml:2: train.config: expected finite numbers, found inf",
+            "--set: train.config: expected finite numbers, found inf",
         ),
         (
             f"{'a.' * 60}a=1",
             f"--set {('a.' * 60)[:76]} … (47 more characters): the key has 61 levels; at most 50",
         ),
-        ("train.ppo.clp=0.3", "job.yaml:2: train.ppo.clp: unknown key; did you mean clip?"),
+        ("train.ppo.clp=0.3", "--set: train.ppo.clp: unknown key; did you mean clip?"),
     ],
 )
 def test_a_wrong_override_is_told(tmp_path: Path, assignment: str, said: str) -> None:
