@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import sys
 import time
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -15,7 +14,7 @@ from rich.table import Table
 
 from orchestrator import specfile
 from orchestrator.cli.progress import evaluated, follow
-from orchestrator.cli.terminal import Console, echo, echo_json, one_line
+from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line, print_cut
 from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
@@ -37,8 +36,6 @@ JobArgument = Annotated[
 
 _PATIENCE = 3.0
 """Seconds after which a stop that takes its time says why."""
-_WHOLE = 1000
-"""Columns of a table for another program."""
 _COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
@@ -142,7 +139,7 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
             *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
         )
     echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    whole = Console(width=_WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
+    whole = Console(width=WHOLE, color_system=None)  # to be read once, and in full: a narrow terminal breaks the lines
     with whole.capture() as printed:
         whole.print(table)
     echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
@@ -181,20 +178,7 @@ def list_jobs(
             *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
             escape(one_line(reason)),  # a compiler's message has lines, and brackets that are no markup
         )
-    _print_cut(table)
-
-
-def _print_cut(table: Table) -> None:
-    """One line a row: on a terminal the last column is cut to what the others leave of its width, for another program all is whole."""
-    if not sys.stdout.isatty():
-        Console(width=_WHOLE).print(table)
-        return
-    console, wide = Console(), Console(width=_WHOLE)
-    for column in table.columns[:-1]:  # rich would shrink all of them alike
-        column.min_width = max(wide.measure(cell).maximum for cell in (column.header, *column.cells))
-    taken = sum(2 + (column.min_width or 0) for column in table.columns[:-1])
-    table.columns[-1].max_width = max(len("REASON"), console.width - taken)
-    Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
+    print_cut(table)
 
 
 def _list_queue(client: Client, queue: str, all_: bool) -> list[dict[str, Any]]:

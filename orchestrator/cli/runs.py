@@ -11,7 +11,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
 from orchestrator.cli.progress import follow
-from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 
 RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
@@ -70,7 +70,7 @@ def checkpoints(
     else:
         table = Table(box=None, pad_edge=False)
         for column in ("CHECKPOINT", "ITERATION", "REWARD", "SCORE", "WORLDS", "SIZE", "CREATED", "STATE"):
-            table.add_column(column, no_wrap=column != "STATE")
+            table.add_column(column, no_wrap=True)
         best = max((each["score"] for each in found if each.get("score") is not None), default=None)
         for each in found:
             reward, score = ("-" if each.get(key) is None else f"{each[key]:.2f}" for key in ("reward", "score"))
@@ -84,6 +84,6 @@ def checkpoints(
             table.add_row(
                 each["name"], str(each["iteration"]), reward, score, str(each.get("worlds", "-")), size, created, state
             )
-        Console(soft_wrap=True).print(table)
+        print_cut(table)
     if damaged:
         raise typer.Exit(1)

@@ -15,6 +15,7 @@ from typing import Any
 
 import rich.console
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 _UNSAFE = re.compile(
@@ -24,6 +25,8 @@ _UNSAFE = re.compile(
     "\ud800-\udfff\U000e0000-\U000e007f]"  # halves of characters, tags
 )
 _NO_COLOUR = "\x1b[0m"
+WHOLE = 1000
+"""Width for another program, and for what is to be read in full: nothing is cut."""
 
 
 def visible(text: str, colours: bool = False) -> str:
@@ -74,6 +77,19 @@ class Console(rich.console.Console):
     def render(self, renderable: Any, options: rich.console.ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+
+def print_cut(table: Table) -> None:
+    """One line a row: on a terminal the last column is cut to what the others leave of its width, for another program all is whole."""
+    if not sys.stdout.isatty():
+        Console(width=WHOLE).print(table)
+        return
+    console, wide = Console(), Console(width=WHOLE)
+    for column in table.columns[:-1]:  # rich would shrink all of them alike
+        column.min_width = max(wide.measure(cell).maximum for cell in (column.header, *column.cells))
+    taken = sum(2 + (column.min_width or 0) for column in table.columns[:-1])
+    table.columns[-1].max_width = max(len("REASON"), console.width - taken)
+    Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
 
 
 class _Formatter(logging.Formatter):

@@ -18,7 +18,8 @@ import httpx
 import pytest
 from rich.table import Table
 
-from orchestrator.cli.jobs import _gpus, _print_cut
+from orchestrator.cli.jobs import _gpus
+from orchestrator.cli.terminal import print_cut
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, run_muster, wait_for
 
 REQUIREMENTS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "16"}]
@@ -262,7 +263,7 @@ def test_a_narrow_terminal_cuts_the_reasons_and_nothing_else(
         table.add_column(column, no_wrap=True, overflow="ellipsis" if column == "REASON" else "fold")
     table.add_row("0123abcd", "a-job-of-that-name", "[red]FAILED[/]", "node 2: " + "a long story " * 20)
     table.add_row("4567abcd", "another", "RUNNABLE", "waits")
-    _print_cut(table)
+    print_cut(table)
     _, first, second = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert first[:3] == ["0123abcd", "a-job-of-that-name", "FAILED"] and first[-1].endswith("…")
     assert second == ["4567abcd", "another", "RUNNABLE", "waits"]
