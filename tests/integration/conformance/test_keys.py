@@ -26,7 +26,7 @@ from orchestrator.keys import KeyStore
 from orchestrator.server import Server
 from orchestrator.tables import JobQueue
 from tests.conftest import Serving, run_muster
-from tests.integration.conformance.test_security import client, refused
+from tests.support.conformance.keys import client, refused
 
 
 def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -> None:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import datetime
 import itertools
-import json
 import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import boto3
 import botocore.auth
 import httpx
 import pytest
 from botocore.awsrequest import AWSRequest, AWSResponse
-from botocore.config import Config
 from botocore.credentials import Credentials
 from botocore.exceptions import ClientError
 from botocore.httpsession import URLLib3Session
@@ -24,6 +21,7 @@ from botocore.httpsession import URLLib3Session
 from orchestrator.client import Client
 from orchestrator.keys import Key, KeyStore
 from tests.conftest import Serving, run_muster, wait_for
+from tests.support.conformance.keys import client, refused
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job/6c4a7d0e-0000-4000-8000-000000000000"
 SIGNATURE_ERRORS = {
@@ -54,17 +52,6 @@ def served(home: Path, key: Key) -> Iterator[Serving]:
     server.close()
 
 
-def client(url: str, access: str, secret: str, service: str = "batch", **config: Any) -> Any:
-    return boto3.client(
-        service,
-        endpoint_url=url,
-        region_name="eu-north-1",
-        aws_access_key_id=access,
-        aws_secret_access_key=secret,
-        config=Config(**{"retries": {"max_attempts": 0}, **config}),
-    )
-
-
 def signed(key: Key, method: str, url: str, body: bytes = b"", service: str = "batch", **headers: str) -> AWSRequest:
     """A request as boto3 would sign it. ``headers``: with _ for -."""
     named = {name.replace("_", "-"): value for name, value in headers.items()}
@@ -77,13 +64,6 @@ def signed(key: Key, method: str, url: str, body: bytes = b"", service: str = "b
 def send(request: AWSRequest) -> AWSResponse:
     """By the transport of boto3, which sends the path as it stands."""
     return URLLib3Session().send(request.prepare())
-
-
-def refused(answer: Any, kind: str, part: str = "", status: int = 403) -> None:
-    """The error is AWS's, in its header and in its body, and one line."""
-    body = json.loads(answer.content)
-    assert (answer.status_code, answer.headers["x-amzn-errortype"], body["__type"]) == (status, kind, kind), body
-    assert part in body["message"] and "\n" not in body["message"], body
 
 
 def code(error: pytest.ExceptionInfo[ClientError]) -> tuple[str, int]:

@@ -17,7 +17,7 @@ from shared_store.checkpoints import FORMAT, Checkpoint, DamagedCheckpoint, list
 from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.support.worker.ranks import training
-from tests.training.worker.test_runner import runner, train
+from tests.support.worker.runs import runner, train
 from worker.errors import UserError
 from worker.learning.runner import Runner
 from worker.learning.trained import load_learner

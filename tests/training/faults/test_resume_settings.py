@@ -17,7 +17,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
-from tests.training.worker.test_runner import assert_same_bits, runner, train
+from tests.support.worker.runs import assert_same_bits, runner, train
 from worker.errors import UserError
 from worker.learning import state
 from worker.learning.job import configure

@@ -10,7 +10,7 @@ import torch
 
 from shared_store.epoch import raise_epoch
 from tests.support.worker.ranks import training
-from tests.training.worker.test_tasks import observe, put
+from tests.support.worker.tasks import observe, put
 from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure

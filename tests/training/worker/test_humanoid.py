@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.worker.test_tasks import observe, play, put, statistics
+from tests.support.worker.tasks import observe, play, put, statistics
 from worker.tasks import find_task
 from worker.tasks.humanoid import JOINT_NAMES, Humanoid, HumanoidConfig
 

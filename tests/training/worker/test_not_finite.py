@@ -15,7 +15,7 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.broken_task import Rooted
 from tests.support.worker.ranks import ROOT, training
-from tests.training.worker.test_tasks import put, statistics
+from tests.support.worker.tasks import put, statistics
 from worker.distributed import Gang, Placement
 from worker.errors import TrainingError
 from worker.learning.job import Job, StopRequest

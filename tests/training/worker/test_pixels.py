@@ -15,8 +15,8 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.ranks import training
-from tests.training.worker.test_runner import assert_same_bits, last
-from tests.training.worker.test_tasks import put
+from tests.support.worker.runs import assert_same_bits, last
+from tests.support.worker.tasks import put
 from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.export import export

@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.training.worker.test_tasks import observe, play, put, same
+from tests.support.worker.tasks import observe, play, put, same
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks.ant import Ant, AntConfig

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.training.worker.test_tasks import play, same
+from tests.support.worker.tasks import play, same
 from worker.tasks import BUILT_IN, find_task
 from worker.tasks.task import Task
 

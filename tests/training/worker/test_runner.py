@@ -14,56 +14,16 @@ import pytest
 import torch
 
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import StaleEpoch, raise_epoch, read_epoch
+from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import PATIENCE
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
-from worker.distributed import Gang, Placement
+from tests.support.worker.runs import assert_same_bits, last, runner, train
+from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
-from worker.learning.job import Job, StopRequest, configure
-from worker.learning.runner import Runner
-
-
-def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Runner:
-    """One attempt, to which the run is given first, as a controller does."""
-    job = Job.from_env(env, "train")
-    if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
-        raise_epoch(job.run, job.epoch)
-    return Runner(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
-
-
-def train(env: dict[str, str], gang: Gang | None = None) -> Runner:
-    """Train to the end, as one attempt."""
-    started = runner(env, gang)
-    assert started.train() == 0
-    return started
-
-
-def tensors(value: Any, path: str = "") -> dict[str, Any]:
-    """Every tensor and number in a loaded file, by path."""
-    if isinstance(value, dict):
-        return {k: v for key, item in value.items() for k, v in tensors(item, f"{path}/{key}").items()}
-    if isinstance(value, list | tuple):
-        return {k: v for i, item in enumerate(value) for k, v in tensors(item, f"{path}/{i}").items()}
-    return {path: value}
-
-
-def assert_same_bits(first: Path, second: Path) -> None:
-    """Two checkpoints hold the same files with the same content; how long training took may differ."""
-    names = sorted(path.name for path in first.glob("*.pt"))
-    assert names == sorted(path.name for path in second.glob("*.pt")) and names
-    for name in names:
-        one, two = (tensors(torch.load(folder / name, weights_only=True)) for folder in (first, second))
-        assert one.keys() == two.keys()
-        for key in one.keys() - {"/progress/seconds"}:
-            same = torch.equal(one[key], two[key]) if isinstance(one[key], torch.Tensor) else one[key] == two[key]
-            assert same, f"{name}{key}"
-
-
-def last(store: Path, run: str) -> Path:
-    return list_checkpoints(Store(store).run(run))[-1].path
+from worker.learning.job import configure
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:

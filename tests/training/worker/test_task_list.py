@@ -18,7 +18,7 @@ from orchestrator.cli.terminal import Console
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
-from tests.training.worker.test_tasks import observe, put, statistics
+from tests.support.worker.tasks import observe, put, statistics
 from worker.learning.job import configure
 from worker.tasks import BUILT_IN, find_task
 

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 import worker.tasks.cartpole as cartpole_module
+from tests.support.worker.tasks import observe, play, put, same, statistics
 from worker.simulation.episodes import STEP
 from worker.tasks import find_task
 from worker.tasks.ant import Ant, AntConfig
@@ -32,41 +33,6 @@ def cartpole() -> Cartpole:
 @pytest.fixture(scope="module")
 def ant() -> Ant:
     return Ant(AntConfig(episode_seconds=0.5), 8, seed=1)
-
-
-def put(task: Task, **rows: list) -> None:
-    """Overwrite parts of a task's state; what is not named is as after a reset from seed 1."""
-    task.seed(1)
-    task.reset()
-    task.clear_statistics()
-    state = task.state_dict()
-    for name, values in rows.items():
-        state[name][: len(values)] = torch.tensor(values, dtype=state[name].dtype)
-    task.load_state_dict(state)
-
-
-def observe(task: Task) -> None:
-    """Judge the state as it stands, as after a physics step."""
-    task._launch_observe(STEP)
-
-
-def statistics(task: Task) -> dict[str, float]:
-    return dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
-
-
-def play(task: Task, steps: int, seed: int) -> list[tuple[torch.Tensor, ...]]:
-    """Act at random, the same in every world of the same global index; clones of all that a step gives."""
-    generator = torch.Generator().manual_seed(seed)
-    history = []
-    for _ in range(steps):
-        actions = torch.randn(64, task.action_size, generator=generator)[task.first_world :][: task.world_count]
-        task.step(actions)
-        history.append((task.observations.clone(), task.rewards.clone(), task.dones.clone(), task.time_outs.clone()))
-    return history
-
-
-def same(left: list[tuple[torch.Tensor, ...]], right: list[tuple[torch.Tensor, ...]]) -> bool:
-    return all(torch.equal(a, b) for x, y in zip(left, right, strict=True) for a, b in zip(x, y, strict=True))
 
 
 def test_sizes_names_and_types(cartpole: Cartpole, ant: Ant) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from orchestrator.engines.base import Host, Placement
 from orchestrator.scheduling import NodeShape, Shape, decide, fit, never_fits, place
-from tests.unit.orchestrator.test_scheduling import gang, host, job, node, pool, queue, reason, snapshot
+from tests.support.orchestrator.scheduling import gang, host, job, node, pool, queue, reason, snapshot
 
 
 def where(shape: Shape, *hosts: Host) -> str | None:

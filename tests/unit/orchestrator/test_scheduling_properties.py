@@ -27,7 +27,7 @@ from orchestrator.scheduling import (
     place,
 )
 from orchestrator.scheduling.placement import less
-from tests.unit.orchestrator.test_scheduling import NOW, gang, host, node, pool, queue
+from tests.support.orchestrator.scheduling import NOW, gang, host, node, pool, queue
 
 nodes = st.builds(node, st.sampled_from([0.5, 1, 2, 3]), st.integers(0, 2), st.sampled_from([100, 500, 2000]))
 equal = st.builds(lambda each, count: gang(*[each] * count), nodes, st.integers(1, 4))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from orchestrator.scheduling import Pool, Queue, decide
-from tests.unit.orchestrator.test_scheduling import (
+from tests.support.orchestrator.scheduling import (
     gang,
     host,
     job,

@@ -26,7 +26,7 @@ from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.files import sync_file
 from shared_store.layout import Run, Store
 from tests.support.shared_store.crashes import killed_at_every_step
-from tests.unit.shared_store.test_files import durable_operations
+from tests.support.shared_store.operations import durable_operations
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 
 from shared_store.files import DamagedFile, read_json, remove_tree, sync_directory, sync_file, write_atomic, write_json
 from tests.support.shared_store.crashes import killed_at_every_step
+from tests.support.shared_store.operations import durable_operations
 
 OLD, NEW = b"old content\n", b"new content, which is longer\n" * 5000
 
@@ -21,21 +22,6 @@ def replace(root: Path) -> None:
 
 def remove(root: Path) -> None:
     remove_tree(root / "tree")
-
-
-def durable_operations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
-    """Every fsync and rename from now on, in order, as (operation, path); they are carried out as ever."""
-    seen: list[tuple[str, str]] = []
-    fsync, replace, rename = os.fsync, os.replace, os.rename
-
-    def record_fsync(descriptor: int) -> None:
-        seen.append(("fsync", os.readlink(f"/proc/self/fd/{descriptor}")))
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", record_fsync)
-    monkeypatch.setattr(os, "replace", lambda old, new: (seen.append(("rename", str(new))), replace(old, new)))
-    monkeypatch.setattr(os, "rename", lambda old, new: (seen.append(("rename", str(new))), rename(old, new)))
-    return seen
 
 
 def test_a_process_killed_at_any_step_leaves_the_old_content_or_the_new_one(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tests.training.worker.test_tasks import observe, play, put, statistics
+from tests.support.worker.tasks import observe, play, put, statistics
 from worker.tasks.ant import Ant, AntConfig
 
 

@@ -16,7 +16,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics
 from tests.support.worker.ranks import training
-from tests.training.worker.test_runner import train
+from tests.support.worker.runs import train
 from worker import compare
 from worker.errors import UserError
 from worker.learning.shards import Shards

@@ -12,7 +12,7 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from tests.support.worker.ranks import training
-from tests.training.worker.test_runner import train
+from tests.support.worker.runs import train
 from worker.distributed import Gang, Placement
 from worker.learning.evaluation import evaluate
 from worker.learning.job import Job, StopRequest

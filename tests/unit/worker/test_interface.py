@@ -10,7 +10,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.training.worker.test_tasks import observe, put
+from tests.support.worker.tasks import observe, put
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.runner import describe

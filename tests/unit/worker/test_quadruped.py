@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.training.worker.test_tasks import observe, play, put, statistics
+from tests.support.worker.tasks import observe, play, put, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks import find_task

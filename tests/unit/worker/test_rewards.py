@@ -8,7 +8,7 @@ import gymnasium
 import pytest
 import torch
 
-from tests.training.worker.test_tasks import observe, put, statistics
+from tests.support.worker.tasks import observe, put, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks.ant import Ant, AntConfig

@@ -14,7 +14,7 @@ import torch
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Run, Store
-from tests.unit.shared_store.test_files import durable_operations
+from tests.support.shared_store.operations import durable_operations
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.saving import Saver
