@@ -17,8 +17,9 @@ from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import wait_for
 from tests.support.engines.fixtures import sites
-from tests.support.engines.sites import SITES, Site, kill_rank, kill_supervisor, processes
+from tests.support.engines.sites import SITES, Site
 from tests.support.engines.training import submit
+from tests.support.processes import kill_rank, kill_supervisor, processes_of_job
 
 TRIES = 3
 site = sites(*SITES)
@@ -62,7 +63,7 @@ def test_measure(site: Site) -> None:
         begun = time.monotonic()
         site.serving.client.batch("TerminateJob", jobId=job, reason="measured")
         times["stop"].append(
-            seconds(begun, lambda job=job: not processes(job) and site.serving.detail(job)["status"] == "FAILED")
+            seconds(begun, lambda job=job: not processes_of_job(job) and site.serving.detail(job)["status"] == "FAILED")
         )
     row = {name: f"{statistics.median(found):.2f}" for name, found in times.items()}
     ROWS[site.engine] = {**row, **memory, "speed": _speed(site)}

@@ -8,8 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import pytest
 
 from orchestrator.cli import main
 from orchestrator.client import Client
+from tests.support.processes import end_all
+from tests.support.waiting import PATIENCE, wait_for
 
 REPOSITORY = Path(__file__).parent.parent
 TIERS = ("training", "integration", "unit", "cluster")
@@ -27,9 +28,6 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
 os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
-
-PATIENCE = 6
-"""Every limit of a wait is this many times what an idle machine could need: a limit is there to end a test that hangs."""
 
 
 def run_muster(*arguments: str, home: Path, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
@@ -62,63 +60,6 @@ def call_muster(*arguments: str, home: Path, **env: str) -> subprocess.Completed
         except SystemExit as ended:
             code = ended.code
     return subprocess.CompletedProcess(arguments, int(code or 0), said.getvalue(), errors.getvalue())
-
-
-def processes_of(home: Path) -> list[int]:
-    """Pids of the nodes and ranks whose store is below ``home``."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        try:
-            mine = entry.name.isdigit() and f"MUSTER_STORE={home}".encode() in (entry / "environ").read_bytes()
-            if mine and alive(int(entry.name)):
-                found.append(int(entry.name))
-        except OSError:
-            continue
-    return found
-
-
-def alive(pid: int) -> bool:
-    """Whether the process is there, and no zombie."""
-    try:
-        return _stat(pid)[0] not in "ZX"
-    except OSError:
-        return False
-
-
-def parent(pid: int) -> int:
-    return int(_stat(pid)[1])
-
-
-def _stat(pid: int) -> list[str]:
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-
-
-def wait_for(condition: Callable[[], Any], timeout: float = 60, what: str = "condition") -> Any:
-    """Poll until ``condition`` gives something true; that is returned."""
-    deadline = time.monotonic() + timeout * PATIENCE
-    while time.monotonic() < deadline:
-        if value := condition():
-            return value
-        time.sleep(0.05)
-    raise AssertionError(f"{what}: not within {timeout * PATIENCE} s")
-
-
-@contextlib.contextmanager
-def frozen(pid: int) -> Iterator[None]:
-    """A process in state D that SIGKILL does not end until this is left: what version 1 of the freezer does."""
-    directory = Path("/sys/fs/cgroup/freezer") / f"muster-test-{os.getpid()}"
-    try:
-        directory.mkdir()
-        (directory / "cgroup.procs").write_text(str(pid))
-    except OSError:
-        pytest.skip("this process can't freeze others (cgroup v1 freezer)")
-    try:
-        (directory / "freezer.state").write_text("FROZEN")
-        yield
-    finally:
-        (directory / "freezer.state").write_text("THAWED")
-        wait_for(lambda: not (directory / "cgroup.procs").read_text(), 20, "an empty freezer")
-        directory.rmdir()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -188,11 +129,7 @@ class Serving:
             self.process.send_signal(signal.SIGTERM)
             self.process.wait(10 * PATIENCE)
         self.client.close()
-        for pid in processes_of(self.home):
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                pass
+        end_all(self.home)
 
 
 MAIN_LAST = """

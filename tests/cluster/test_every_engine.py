@@ -5,14 +5,17 @@ from __future__ import annotations
 import pytest
 
 from tests.conftest import wait_for
-from tests.integration.engines import test_every_engine as on_others
-from tests.integration.engines.test_every_engine import WAIT_FOR_ALL, gone
+from tests.support.engines.every_engine import WAIT_FOR_ALL, EveryEngine, await_job_end
 from tests.support.engines.fixtures import sites
-from tests.support.engines.sites import SITES, Site, freeze
+from tests.support.engines.sites import SITES, Site
+from tests.support.processes import freeze
 
 site = sites("ray")
 any_site = sites(*SITES)
-globals().update({name: test for name, test in vars(on_others).items() if name.startswith("test_")})
+
+
+class TestEveryEngine(EveryEngine):
+    pass
 
 
 def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(any_site: Site) -> None:
@@ -29,4 +32,4 @@ def test_a_frozen_node_is_noticed_by_its_silence_and_its_gang_runs_again(any_sit
     detail = site.serving.wait(job, timeout=60)
     assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
     assert "node 1 gives no sign of life for" in detail["attempts"][0]["statusReason"], detail["attempts"]
-    gone(job)
+    await_job_end(job)

@@ -10,8 +10,9 @@ import pytest
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import Serving, wait_for
-from tests.support.engines.sites import SITES, kill_supervisor, processes
+from tests.support.engines.sites import SITES
 from tests.support.engines.training import same_bits, submit
+from tests.support.processes import kill_supervisor, processes_of_job
 
 STAGE = 16
 """Iterations on each engine."""
@@ -35,7 +36,7 @@ def test_a_run_that_goes_from_engine_to_engine_ends_with_the_bits_of_one_that_st
             assert done["status"] == "SUCCEEDED", (engine, done["statusReason"], serving.log(job)[-20:])
             assert [attempt["number"] for attempt in done["attempts"]] == [1, 2], engine
             assert any("resumed from checkpoint" in line for line in serving.log(job, attempt=2)), engine
-            wait_for(lambda job=job: not processes(job), 30, f"nothing is left on {engine}")
+            wait_for(lambda job=job: not processes_of_job(job), 30, f"nothing is left on {engine}")
         straight = submit(serving, "straight", "local", STAGE * len(engines))
         assert serving.wait(straight, timeout=180)["status"] == "SUCCEEDED"
     finally:

@@ -12,14 +12,16 @@ import pytest
 
 from orchestrator import specfile
 from orchestrator.definition import compile_definition, gang_needs
-from orchestrator.engines.base import Gang, Placement, node_plans
+from orchestrator.engines.base import Placement, node_plans
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome
-from tests.conftest import PATIENCE, REPOSITORY, processes_of, wait_for
+from tests.conftest import PATIENCE, REPOSITORY, wait_for
+from tests.support.engines.bench import make_gang
 from tests.support.faults.link import ADDRESSES, Link
+from tests.support.processes import processes_of
 
 SMALL = (
     *("nodes=2", "train.worlds=16", "train.iterations=100000", "checkpoint.every=100000", "stall_timeout=8s"),
@@ -44,21 +46,12 @@ def test_loss_and_delay_cost_time_and_a_cut_is_found_and_named(link: Link, tmp_p
     raise_epoch(run, 1)
     request = compile_definition(specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), SMALL), str(REPOSITORY))
     needs = gang_needs(request["nodeProperties"])
-    gang = Gang(
-        job="job",
-        attempt=1,
-        epoch=1,
-        job_epoch=1,
+    gang = make_gang(
+        store.path,
         run="r",
-        store=str(store.path),
-        queue="default",
-        pool="local",
-        main=0,
         commands=[node.command for node in needs.nodes],
         environments=[node.environment for node in needs.nodes],
         placements=[Placement("localhost", (), 1.0, 512)] * 2,
-        grace=5.0,
-        directory=None,
         stall_timeout=8.0,
     )
     nodes = []

@@ -2,133 +2,45 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from orchestrator.engines.base import EngineError, Gang, NodeStatus, Placement
+from orchestrator.engines.base import EngineError
 from orchestrator.engines.ray import RayEngine
 from shared_store import __version__
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
-from tests.conftest import alive, parent, processes_of, wait_for
+from tests.conftest import wait_for
+from tests.support.engines.ray_bench import RayBench
 from tests.support.engines.ray_cluster import RAY, RayCluster
 from tests.support.engines.sites import POLITE, STUBBORN, WAIT
-
-
-class Bench:
-    """An engine with a home and a store of its own, and the gangs that it started."""
-
-    def __init__(self, cluster: RayCluster, home: Path) -> None:
-        self.cluster, self.home = cluster, home
-        self.store = Store(home / "store").open()
-        self.run = self.store.run("run")
-        self.run.create({"run": "run"})
-        raise_epoch(self.run, 1)
-        self.engine = RayEngine(home / "home")
-        self.handles: list[str] = []
-
-    def gang(self, script: str = WAIT, hosts: tuple[str, ...] = ("n1", "n2", "n3"), **changes: Any) -> Gang:
-        count, gpus = len(hosts), changes.pop("gpus", ())
-        job, cpus = changes.pop("job", "job"), changes.pop("cpus", 1.0)
-        facts: dict[str, Any] = {
-            "job": job,
-            "attempt": 1,
-            "main": 0,
-            "directory": None,
-            "placements": [Placement(f"ray/{host}", gpus, cpus, 256) for host in hosts],
-            **changes,
-        }
-        return Gang(
-            epoch=1,
-            job_epoch=1,
-            run="run",
-            store=str(self.store.path),
-            queue="default",
-            pool="ray",
-            commands=[["sh", "-c", script]] * count,
-            environments=[{"GREETING": "hello"}] * count,
-            grace=5.0,
-            **facts,
-        )
-
-    def launch(self, gang: Gang) -> str:
-        handle = self.engine.launch(self.engine.plan(gang))
-        self.handles.append(handle)
-        return handle
-
-    def ready(self, gang: Gang) -> str:
-        """Launched, and every node has said so."""
-        handle = self.launch(gang)
-        wait_for(
-            lambda: self.log(gang.job, gang.attempt).count("ready") == len(gang.placements),
-            60,
-            f"all are ready: {self.engine.observe(handle)}",
-        )
-        return handle
-
-    def ended(self, handle: str) -> list[NodeStatus]:
-        def over() -> list[NodeStatus] | None:
-            status = list(self.engine.observe(handle))
-            return status if not any(node.running for node in status) else None
-
-        found: list[NodeStatus] = wait_for(over, 60, "the gang's end")
-        return found
-
-    def stopped(self, handle: str, grace: float = 5.0) -> list[int | None]:
-        self.engine.stop(handle, grace)
-        self.nothing_is_left()
-        return [node.exit_code for node in self.engine.observe(handle)]
-
-    def stopped_there(self, handle: str) -> list[int | None]:
-        """Of a gang that lost its third node, where that may go on until it ends itself."""
-        self.engine.stop(handle, 5.0)
-        return [node.exit_code for node in self.engine.observe(handle)][:2]
-
-    def nothing_is_left(self) -> None:
-        assert processes_of(self.store.path) == [], "a process of the gang lives"
-
-    def log(self, job: str = "job", attempt: int = 1) -> list[str]:
-        return [line.text for line in LogFollower(self.run, job).drain() if line.attempt == attempt]
-
-    def driver(self) -> int:
-        [pid] = processes_of(self.home / "home")
-        return pid
+from tests.support.processes import await_end, parent, processes_of
 
 
 @pytest.fixture
-def bench(ray_cluster: RayCluster, tmp_path: Path) -> Iterator[Bench]:
-    found = Bench(ray_cluster, tmp_path)
+def bench(ray_cluster: RayCluster, tmp_path: Path) -> Iterator[RayBench]:
+    found = RayBench(ray_cluster, tmp_path)
     yield found
-    for handle in found.handles:
-        found.engine.stop(handle, 0.0)
-    found.nothing_is_left()
-    found.engine._let_go("")
-    found.engine.close()
-    wait_for(lambda: not processes_of(tmp_path), 30, "the drivers leave")
+    found.close()
 
 
-def addresses(bench: Bench) -> dict[str, str]:
+def addresses(bench: RayBench) -> dict[str, str]:
     return {node["name"]: node["address"] for node in bench.engine._watch.seen["nodes"]}
 
 
-def test_hosts_are_the_nodes_that_have_cpus(bench: Bench) -> None:
+def test_hosts_are_the_nodes_that_have_cpus(bench: RayBench) -> None:
     hosts = {host.name: host for host in bench.engine.capacity()}
     assert sorted(hosts) == ["ray/n1", "ray/n2", "ray/n3"]
     assert (hosts["ray/n1"].cpus, hosts["ray/n1"].gpus, hosts["ray/n1"].memory) == (2.0, ("0", "1"), 1907)
     assert hosts["ray/n1"].single and bench.engine.address is None
 
 
-def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_are_told(bench: Bench) -> None:
+def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_are_told(bench: RayBench) -> None:
     script = (
         "env > $MUSTER_STORE/env-$AWS_BATCH_JOB_NODE_INDEX; pwd; "
         "shim=$(sed 's/.*) //' /proc/$PPID/stat | cut -d' ' -f2); "  # the supervisor's parent: what the engine started
@@ -152,47 +64,46 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
         assert found["MASTER_ADDR"] == at["n2"] and found["GREETING"] == "hello"
         assert not [name for name in found if name.startswith("RAY_")], "the cluster's token is not for jobs"
         assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1") and status[index].gpus == (found["CUDA_VISIBLE_DEVICES"],)
-    outcomes = [read_outcome(bench.run, "job", 1, index) for index in range(3)]
-    assert [outcome.exit_code for outcome in outcomes if outcome] == [1, 0, 2]
+    assert [bench.outcome(index).exit_code for index in range(3)] == [1, 0, 2]
     started = [int((bench.store.path / f"start-{rank}").read_text()) for rank in range(3)]
     assert started[0] == min(started), "the main node is started first"
     assert bench.stopped(handle) == [1, 0, 2]
 
 
-def test_a_gang_of_one_without_gpus_sees_none(bench: Bench) -> None:
+def test_a_gang_of_one_without_gpus_sees_none(bench: RayBench) -> None:
     script = 'echo "[$CUDA_VISIBLE_DEVICES] $AWS_BATCH_JOB_ID $AWS_BATCH_JOB_NUM_NODES"'
-    handle = bench.launch(bench.gang(script, ("n2",), is_gang=False))
+    handle = bench.launch(bench.gang(script, hosts=("n2",), is_gang=False))
     assert [node.exit_code for node in bench.ended(handle)] == [0]
-    assert "[] job " in bench.log()
+    assert f"[] {bench.job} " in bench.log()
 
 
-def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(bench: Bench) -> None:
+def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(bench: RayBench) -> None:
     first = bench.ready(bench.gang(POLITE))
     driver = bench.driver()
     assert bench.stopped(first) == [75, 75, 75]
     assert bench.log().count("saved") == 3
     # meanwhile the place is kept: the driver and its placement group are those of the next attempt
-    second = bench.ready(bench.gang(STUBBORN, ("n1", "n2"), attempt=2))
+    second = bench.ready(bench.gang(STUBBORN, 2, attempt=2))
     assert bench.driver() == driver
     assert bench.stopped(second, 0.5) == [137, 137]
 
 
-def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(bench: Bench) -> None:
-    other = bench.ready(bench.gang(hosts=("n2",), job="other", cpus=2.0))
-    handle = bench.launch(bench.gang(hosts=("n1", "n2")))
+def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(bench: RayBench) -> None:
+    other = bench.ready(bench.gang(hosts=("n2",), suffix="-other", cpus=2.0))
+    handle = bench.launch(bench.gang(nodes=2))
     reason = "waits for room on ray/n2: other work of the Ray cluster holds it"
     wait_for(lambda: [node.waiting for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
     bench.engine.stop(other, 1.0)
     wait_for(lambda: bench.engine.observe(handle) and bench.log().count("ready") == 2, 60, "it starts")
     assert not any(node.waiting for node in bench.engine.observe(handle))
-    waiting = bench.launch(bench.gang(hosts=("n1", "n2"), job="third", cpus=2.0))
+    waiting = bench.launch(bench.gang(nodes=2, suffix="-third", cpus=2.0))
     wait_for(lambda: "holds it" in bench.engine.observe(waiting)[0].waiting, 30, "a third one waits")
     bench.engine.stop(waiting, 1.0)
     assert not any(node.running for node in bench.engine.observe(waiting)), "one that waits can be stopped"
 
 
-def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(hosts=("n1",), directory="/nowhere/at/all"))
+def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: RayBench) -> None:
+    handle = bench.launch(bench.gang(nodes=1, directory="/nowhere/at/all"))
     [node] = bench.ended(handle)
     assert node.detail == (
         "node 0 on ray/n1: working directory /nowhere/at/all is not there: it has to be on a volume that all nodes share"
@@ -207,44 +118,43 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ben
             f"node 1 on ray/n3 has Muster 0.0.1, the controller {__version__}: install the same on both"
         )
         (fake / "__init__.py").write_text("raise ImportError('nothing of it')\n")
-        [node] = bench.ended(bench.launch(bench.gang(hosts=("n3",), attempt=3, job="third")))
+        [node] = bench.ended(bench.launch(bench.gang(hosts=("n3",), attempt=3, suffix="-third")))
         assert "Muster is not installed there for " in node.detail
-        assert bench.log(attempt=2) == []
+        assert bench.lines(attempt=2) == []
     finally:
         shutil.rmtree(fake)
 
 
-def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_runs(bench: Bench) -> None:
+def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_runs(bench: RayBench) -> None:
     # what such a node finds: not the epoch that the controller has written
-    handle = bench.launch(dataclasses.replace(bench.gang(hosts=("n2",)), epoch=2))
+    handle = bench.start(bench.gang(hosts=("n2",), epoch=2))
     [node] = bench.ended(handle)
     assert node.detail.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
     assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.detail
-    assert bench.log() == [] and read_outcome(bench.run, "job", 1, 0) is None
+    assert bench.lines() == [] and read_outcome(bench.run, bench.job, 1, 0) is None
 
 
-def test_a_rank_and_a_supervisor_that_are_killed(bench: Bench) -> None:
+def test_a_rank_and_a_supervisor_that_are_killed(bench: RayBench) -> None:
     handle = bench.ready(bench.gang(f"echo $$ > $MUSTER_STORE/rank-$NODE_RANK; {WAIT}"))
     os.kill(int((bench.store.path / "rank-1").read_text()), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "the rank's end")
     assert bench.engine.observe(handle)[1].exit_code == 137
-    outcome = read_outcome(bench.run, "job", 1, 1)
-    assert outcome is not None and outcome.reason == "rank 1 was killed by SIGKILL"
+    assert bench.outcome(1).reason == "rank 1 was killed by SIGKILL"
     rank = int((bench.store.path / "rank-2").read_text())
     os.kill(parent(rank), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[2].running, 20, "the supervisor's end")
-    wait_for(lambda: not alive(rank), 5, "its rank dies with it")
+    await_end(rank)  # it dies with it
     status = bench.engine.observe(handle)
     assert (status[2].exit_code, status[0].running) == (137, True)
-    assert read_outcome(bench.run, "job", 1, 2) is None
+    assert read_outcome(bench.run, bench.job, 1, 2) is None
 
 
-def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
+def test_a_controller_that_starts_again_finds_the_gang(bench: RayBench) -> None:
     gang = bench.gang()
     handle = bench.ready(gang)
     driver, seen = bench.driver(), bench.engine.observe(handle)
     bench.engine.close()
-    bench.engine = RayEngine(bench.home / "home")
+    bench.engine = bench.new_engine()
     assert bench.engine.observe(handle) == seen
     assert bench.engine.launch(bench.engine.plan(gang)) == handle and bench.driver() == driver
     assert bench.log().count("ready") == 3, "found, not started twice"
@@ -252,21 +162,21 @@ def test_a_controller_that_starts_again_finds_the_gang(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("killed", ["actor", "shim"])
-def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(bench: Bench, killed: str) -> None:
+def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(bench: RayBench, killed: str) -> None:
     script = f"[ $NODE_RANK = 0 ] || {{ setsid sleep 577 & echo $! > $MUSTER_STORE/apart; }}; echo $PPID > $MUSTER_STORE/supervisor-$NODE_RANK; {WAIT}"
-    handle = bench.ready(bench.gang(script, ("n1", "n2")))
+    handle = bench.ready(bench.gang(script, 2))
     apart = int((bench.store.path / "apart").read_text())
     supervisor = int((bench.store.path / "supervisor-1").read_text())
     wait_for(lambda: os.getsid(apart) == apart, 5, "a session of its own")
     shim = parent(supervisor)
     os.kill(shim if killed == "shim" else parent(shim), signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 30, "the node's end is seen")
-    wait_for(lambda: not alive(apart), 10, "nothing of the node is left")
+    await_end(apart)  # nothing of the node is left
     assert bench.engine.observe(handle)[0].running, "the other node goes on"
     bench.engine.stop(handle, 5.0)
 
 
-def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:
+def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: RayBench) -> None:
     handle = bench.ready(bench.gang())
     os.kill(bench.driver(), signal.SIGKILL)
     assert [node.exit_code for node in bench.ended(handle)] == [None] * 3
@@ -276,7 +186,7 @@ def test_a_driver_that_is_killed_takes_its_gang_with_it(bench: Bench) -> None:
     assert bench.stopped(again) == [143, 143, 143]
 
 
-def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: Bench) -> None:
+def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench) -> None:
     handle = bench.ready(bench.gang())
     bench.cluster.kill("n3")
     wait_for(lambda: not bench.engine.observe(handle)[2].running, 60, "its end is seen")
@@ -287,9 +197,9 @@ def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: Bench) ->
     wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "it is back")
 
 
-def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: Bench) -> None:
+def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBench) -> None:
     [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
-    handle = bench.ready(bench.gang(POLITE, ("n1", "n2")))
+    handle = bench.ready(bench.gang(POLITE, 2))
     notice = ["--reason=DRAIN_NODE_REASON_PREEMPTION", "--reason-message=spot", "--deadline-remaining-seconds=60"]
     command = [RAY, "drain-node", f"--address={bench.cluster.address}", f"--node-id={node}", *notice]
     subprocess.run(command, check=True, capture_output=True)
@@ -301,14 +211,14 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: Bench) 
     wait_for(lambda: len(bench.engine.capacity()) == 3, 20, "its successor is one")
 
 
-def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: Bench) -> None:
+def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> None:
     bench.cluster.add("controller", cpus=0, gpus=0)  # a driver on the head's own node would go with it
     wait_for(lambda: bench.engine._watch.seen["join"] == addresses(bench).get("controller"), 20, "it is seen")
     handle = bench.ready(bench.gang(POLITE))
     driver = bench.driver()
     bench.cluster.kill("head")
     wait_for(bench.engine._watch.problem, 30, "it is missed")
-    late = bench.gang(job="late")
+    late = bench.gang(suffix="-late")
     with pytest.raises(EngineError, match=r"^the Ray head at .* does not answer; waiting for it$"):
         bench.engine.launch(bench.engine.plan(late))
     assert all(node.running for node in bench.engine.observe(handle))
@@ -370,7 +280,7 @@ def test_other_versions_and_no_ray_at_all_are_one_line_each(
         RayEngine(tmp_path)
 
 
-def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: Bench) -> None:
+def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: RayBench) -> None:
     handle = bench.ready(bench.gang())
     raylet = bench.cluster.raylet("n3")
     os.kill(raylet, signal.SIGSTOP)

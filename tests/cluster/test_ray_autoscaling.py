@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cluster.test_ray import Bench
 from tests.conftest import REPOSITORY, wait_for
+from tests.support.engines.ray_bench import RayBench
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.worker.ranks import free_port
 
@@ -83,7 +83,7 @@ def growing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RayClus
 
 
 def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path) -> None:
-    bench = Bench(growing, tmp_path)
+    bench = RayBench(growing, tmp_path)
 
     def names() -> list[str]:
         return [host.name for host in bench.engine.capacity()]
@@ -102,8 +102,5 @@ def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path)
         wait_for(lambda: not [n for n in bench.engine._watch.seen["nodes"] if n["cpus"]], 90, "idle machines go")
         assert names() == ["ray/+1", "ray/+2"]
     finally:
-        for handle in bench.handles:
-            bench.engine.stop(handle, 0.0)
-        bench.engine._let_go("")
-        bench.engine.close()
+        bench.close()
     assert os.environ["RAY_ADDRESS"] == growing.address

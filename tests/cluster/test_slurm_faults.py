@@ -16,38 +16,34 @@ from orchestrator.engines.base import EngineError, NotYet
 from orchestrator.engines.slurm import SlurmEngine
 from orchestrator.engines.slurm_commands import call
 from shared_store.checkpoints import list_checkpoints
-from shared_store.epoch import raise_epoch
 from shared_store.outcomes import read_outcome
-from tests.conftest import MUSTER, PATIENCE, Serving, parent, wait_for
+from tests.conftest import MUSTER, PATIENCE, Serving, wait_for
 from tests.support.engines.sites import POLITE
-from tests.support.engines.slurm_bench import Bench, slurm_bench
+from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
+from tests.support.processes import command, environment, parent, signal_all
 
 bench = slurm_bench
 
 
-def ranks(bench: Bench) -> list[int]:
-    return bench.processes(b"sleep\x00600")
+def ranks(bench: SlurmBench) -> list[int]:
+    return bench.processes("sleep\x00600")
 
 
-def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(nodes=3))
-    bench.ready(handle, 3)
+def test_a_rank_a_supervisor_and_slurm_s_own_process_are_killed(bench: SlurmBench) -> None:
+    handle = bench.ready(bench.gang(nodes=3))
     parents = {pid: parent(pid) for pid in ranks(bench)}
-    nodes = {
-        Path(f"/proc/{pid}/environ").read_bytes().partition(b"\0AWS_BATCH_JOB_NODE_INDEX=")[2][:1]: pid
-        for pid in parents
-    }
-    os.kill(nodes[b"0"], signal.SIGKILL)
+    nodes = {environment(pid)["AWS_BATCH_JOB_NODE_INDEX"]: pid for pid in parents}
+    os.kill(nodes["0"], signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[0].running, 20, "its end is seen")
-    outcome = read_outcome(bench.run, bench.job, 1, 0)
-    assert outcome and (outcome.exit_code, outcome.reason) == (137, "rank 0 was killed by SIGKILL")
+    outcome = bench.outcome(0)
+    assert (outcome.exit_code, outcome.reason) == (137, "rank 0 was killed by SIGKILL")
     assert [node.running for node in bench.engine.observe(handle)] == [False, True, True], "the others go on"
-    os.kill(parents[nodes[b"1"]], signal.SIGKILL)
+    os.kill(parents[nodes["1"]], signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 20, "its end is seen")
     assert bench.engine.observe(handle)[1].exit_code == 137 and read_outcome(bench.run, bench.job, 1, 1) is None
-    wait_for(lambda: ranks(bench) == [nodes[b"2"]], 5, "its rank went with it")
-    step = parent(parent(parents[nodes[b"2"]]))  # between them is the shim
-    assert b"slurmstepd" in Path(f"/proc/{step}/cmdline").read_bytes()
+    wait_for(lambda: ranks(bench) == [nodes["2"]], 5, "its rank went with it")
+    step = parent(parent(parents[nodes["2"]]))  # between them is the shim
+    assert "slurmstepd" in command(step)[0]
     os.kill(step, signal.SIGKILL)
     wait_for(lambda: not ranks(bench), 5, "supervisor and rank went with it")
 
@@ -70,31 +66,28 @@ for number in range(1, 100000):
 """
 
 
-def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_attempt_has_begun(bench: Bench) -> None:
+def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_attempt_has_begun(
+    bench: SlurmBench,
+) -> None:
     commands = [["python", "-c", LIVES_ON]] * 2
-    first = bench.launch(bench.gang(nodes=2, commands=commands))
-    bench.ready(first, 2)
+    first = bench.ready(bench.gang(nodes=2, commands=commands))
     bench.cluster.kill("n2")
     try:
         child = bench.ended(first)[1]
         assert bench.state(first) == "NODE_FAIL" and child.detail.startswith("Slurm lost a node of n[1-2] (job ")
         bench.engine.stop(first, 5.0)
-        alive = bench.processes(b"worker.supervisor")
+        alive = bench.processes()
         assert len(alive) == 2, "the shim and the supervisor on n2 live on: Slurm can't reach them"
         log = bench.run.log(bench.job, 1, 1)
         before = log.stat().st_size
         wait_for(lambda: log.stat().st_size > before, 10, "and it still writes")
         # its machine hangs while the next attempt begins
-        there = [*alive, *bench.processes(b"for number in range")]
-        for pid in there:
-            os.kill(pid, signal.SIGSTOP)
+        there = [*alive, *bench.processes("for number in range")]
+        signal_all(there, signal.SIGSTOP)
         time.sleep(1.1)
-        raise_epoch(bench.run, 2)
-        second = bench.launch(bench.gang(nodes=2, epoch=2, attempt=2, options={"exclude": "n2"}))
-        wait_for(lambda: sum(line.attempt == 2 and line.text == "ready" for line in bench.lines()) == 2, 30, "it runs")
+        second = bench.ready(bench.gang(nodes=2, attempt=2, options={"exclude": "n2"}))
         size, checkpoints = log.stat().st_size, [checkpoint.name for checkpoint in list_checkpoints(bench.run)]
-        for pid in reversed(there):
-            os.kill(pid, signal.SIGCONT)
+        signal_all(reversed(there), signal.SIGCONT)
         wait_for(lambda: not set(there) & set(bench.cluster.processes()), 20, "it has read the new epoch and left")
         assert log.stat().st_size == size, "not a line"
         assert [checkpoint.name for checkpoint in list_checkpoints(bench.run)] == checkpoints, "and no checkpoint"
@@ -104,7 +97,7 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         bench.cluster.start("n2")
 
 
-def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
 
     def slow(*command: str, text: str | None = None) -> str:
@@ -126,7 +119,7 @@ def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: Bench, monkeypatc
     assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
 
 
-def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: Bench, tmp_path: Path) -> None:
+def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: SlurmBench, tmp_path: Path) -> None:
     served = Serving(tmp_path / "home", "--engine", "slurm")
     daemon = bench.cluster.daemons["slurmctld"]
     try:
@@ -147,9 +140,8 @@ def test_a_stop_while_slurmctld_is_frozen_says_what_it_waits_for(bench: Bench, t
 
 
 @pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="half a minute: MUSTER_LONG=1, in make bits")
-def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(POLITE, 2))
-    bench.ready(handle, 2)
+def test_slurmctld_is_away_for_a_while(bench: SlurmBench) -> None:
+    handle = bench.ready(bench.gang(POLITE, 2))
     bench.saved(handle)
     bench.cluster.kill("slurmctld")
     with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
@@ -172,17 +164,17 @@ def test_slurmctld_is_away_for_a_while(bench: Bench) -> None:
     assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75] and bench.log().count("saved") == 2
 
 
-def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: Bench) -> None:
+def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: SlurmBench) -> None:
     # Slurm announces up to a minute early: with 90 s of notice, a limit of one minute is announced at once
     handle = bench.launch(bench.gang(POLITE, 2, options={"time": "1"}))
     assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
     assert bench.log().count("saved") == 2 and "TIMEOUT" not in bench.state(handle)
 
 
-def test_a_partition_with_priority_preempts_and_the_nodes_save_and_leave(bench: Bench) -> None:
-    low = bench.launch(bench.gang(POLITE, 3, cpus=4))
-    bench.ready(low, 3)
-    high = bench.launch(bench.gang(nodes=3, cpus=4, suffix="2", options={"partition": "urgent"}))
+def test_a_partition_with_priority_preempts_and_the_nodes_save_and_leave(bench: SlurmBench) -> None:
+    low = bench.ready(bench.gang(POLITE, 3, cpus=4))
+    high = bench.gang(nodes=3, cpus=4, suffix="2", options={"partition": "urgent"})
+    bench.launch(high)
     assert [node.exit_code for node in bench.ended(low)] == [75, 75, 75]
     assert bench.log().count("saved") == 3
-    bench.ready(high, 3, "2")
+    bench.ready(high)

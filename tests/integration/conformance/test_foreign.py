@@ -19,9 +19,10 @@ from botocore import UNSIGNED
 from botocore.config import Config
 from botocore.exceptions import ClientError
 
-from tests.conftest import Serving, alive, parent, processes_of, wait_for
+from tests.conftest import Serving, wait_for
 from tests.support.conformance.aws import Batch, container, refused
 from tests.support.conformance.streams import client_of
+from tests.support.processes import await_end, parent, processes_of
 
 SECRET = "hunter2 is secret"
 
@@ -174,7 +175,7 @@ def test_a_job_runs_as_the_user_that_it_names(batch: Batch) -> None:
     assert numbers[:2] == [str(nobody.pw_uid), str(nobody.pw_gid)]
     [rank] = [pid for pid in processes_of(batch.server.home) if Path(f"/proc/{pid}").stat().st_uid == nobody.pw_uid]
     os.kill(parent(rank), signal.SIGKILL)
-    wait_for(lambda: not alive(rank), what="the end of the program, whose supervisor is gone")
+    await_end(rank)  # its supervisor is gone
     assert batch.wait(job)["status"] == "FAILED"
     ours = {"MUSTER_ON_CHILD_FAILURE": "restart"}  # a job of our own kind, which has no directory of its own
     job = batch.submit(batch.single("iso-ours", "id -u; echo $HOME", env=ours, container={"user": "nobody"}))

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from tests.conftest import MUSTER
-from tests.integration.conformance.test_fuzz import TOKEN, Fuzzed
+from tests.support.conformance.fuzzed import TOKEN, Fuzzed
 from tests.support.conformance.hostile_clients import CLASSES, Target
 
 COUNT = int(os.environ.get("MUSTER_FUZZ", "0")) // 10 or 60

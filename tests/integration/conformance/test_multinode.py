@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, processes_of, wait_for
+from tests.conftest import Serving, wait_for
 from tests.support.conformance.aws import EXITED, UNTIL, Batch, aws, gate, pairs, refused
+from tests.support.processes import processes_of_job
 
 NODE = "$AWS_BATCH_JOB_NODE_INDEX"
 ADDRESS = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
@@ -58,18 +59,6 @@ def children(batch: Batch, job: str, **query: Any) -> dict[int, dict[str, Any]]:
     """The nodes of a job as ListJobs shows them, by index."""
     listed = batch.api.list_jobs(multiNodeJobId=job, **query)["jobSummaryList"]
     return {each["nodeProperties"]["nodeIndex"]: each for each in listed}
-
-
-def processes(batch: Batch, job: str) -> list[int]:
-    """Those of a job, on this machine."""
-    found = []
-    for pid in processes_of(batch.server.home):
-        try:
-            if f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{pid}/environ").read_bytes():
-                found.append(pid)
-        except OSError:
-            continue
-    return found
 
 
 # -- the environment --------------------------------------------------------------------------------------------------
@@ -191,7 +180,7 @@ trap 'echo asked to stop; exit 0' TERM; touch "$GATE/child"; {STAY}
     detail = batch.wait(job)
     assert (detail["status"], detail["statusReason"]) == ("SUCCEEDED", EXITED)
     assert detail["attempts"][0]["container"]["exitCode"] == 0
-    assert "asked to stop" in batch.lines(f"{job}#1") and not processes(batch, job)
+    assert "asked to stop" in batch.lines(f"{job}#1") and not processes_of_job(job)
 
 
 def test_a_childs_death_changes_nothing(batch: Batch, tmp_path: Path) -> None:
@@ -246,7 +235,7 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
         attempts = batch.describe(f"{job}#{node}")["attempts"]
         said = [batch.stream(attempt["container"]["logStreamName"])[0] for attempt in attempts]
         assert said == ["attempt 1", "attempt 2"]
-    assert not processes(batch, job)
+    assert not processes_of_job(job)
 
 
 @pytest.mark.parametrize("code", [1, 75])
@@ -278,7 +267,7 @@ def test_terminate_ends_a_running_job_for_good(batch: Batch) -> None:
     assert (detail["status"], detail["statusReason"]) == ("FAILED", "enough of it")
     assert (detail["isTerminated"], detail["isCancelled"]) == (True, False)
     assert len(detail["attempts"]) == 1, "no retry"
-    assert all("asked to stop" in batch.lines(f"{job}#{node}") for node in range(2)) and not processes(batch, job)
+    assert all("asked to stop" in batch.lines(f"{job}#{node}") for node in range(2)) and not processes_of_job(job)
     batch.api.terminate_job(jobId=arn, reason="again")  # over is over
     assert batch.describe(job)["statusReason"] == "enough of it"
 
@@ -362,4 +351,4 @@ def test_a_timeout_is_sigterm_then_thirty_seconds_then_sigkill_and_no_retry(batc
     [asked] = [event["timestamp"] for event in events if event["message"] == "asked to leave"]
     assert attempt["stoppedAt"] - asked >= 29_000, "it had 30 s to leave"
     assert batch.describe(f"{overdue}#1")["container"]["exitCode"] == 143, "the child left when it was asked"
-    assert not processes(batch, overdue)
+    assert not processes_of_job(overdue)

@@ -20,13 +20,13 @@ from orchestrator.engines.aws_config import is_mounted_from
 from orchestrator.engines.base import EngineError, NotYet, Placement
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
-from shared_store.logs import LogFollower
-from tests.conftest import Serving, processes_of, run_muster, wait_for
-from tests.support.engines.aws_bench import JOB, Bench, close
+from tests.conftest import Serving, run_muster, wait_for
+from tests.support.engines.aws_bench import AwsBench
 from tests.support.engines.sites import POLITE, WAIT
+from tests.support.processes import command, processes_of
 
 LAST = (
-    f'[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/{JOB}/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
+    '[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/$MUSTER_JOB_ID/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
     "do sleep 0.05; done"
 )
 """Shell: the main node, whose end ends the others wherever they are, waits until they have ended by themselves."""
@@ -44,28 +44,28 @@ def aws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
 
 
 @pytest.fixture
-def bench(aws: Serving, tmp_path: Path) -> Iterator[Bench]:
-    found = Bench(aws, tmp_path)
+def bench(aws: Serving, tmp_path: Path) -> Iterator[AwsBench]:
+    found = AwsBench(aws, tmp_path)
     yield found
-    close(found)
+    found.close()
 
 
 @pytest.fixture
-def workstation(aws: Serving, tmp_path: Path) -> Iterator[Bench]:
+def workstation(aws: Serving, tmp_path: Path) -> Iterator[AwsBench]:
     """A controller whose store is the volume itself."""
-    found = Bench(aws, tmp_path, store_is_shared=True)
+    found = AwsBench(aws, tmp_path, store_is_shared=True)
     yield found
-    close(found)
+    found.close()
 
 
 PRINT = "env | grep -E '^(AWS_|MASTER_|MUSTER_|NODE_RANK|NNODES|RANK|WORLD_SIZE|GREETING)' | sort"
 
 
-def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_home(bench: Bench) -> None:
+def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_home(bench: AwsBench) -> None:
     handle = bench.launch(bench.gang(f"{PRINT}; {LAST}", 3, main=1))
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], bench.log()
     facts = json.loads(handle)
-    lines = [line for line in LogFollower(bench.run, JOB).drain() if line.rank is not None]
+    lines = [line for line in bench.lines() if line.rank is not None]
     told = [dict(line.text.split("=", 1) for line in lines if line.node == index) for index in range(3)]
     main = told[1]["MUSTER_ADDRESS"]
     for index, env in enumerate(told):
@@ -75,8 +75,8 @@ def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_ho
         assert env["AWS_BATCH_JOB_ID"] == f"{facts['aws']}#{index}", "AWS's own"
         assert (env["AWS_BATCH_JOB_NODE_INDEX"], env["AWS_BATCH_JOB_MAIN_NODE_INDEX"]) == (str(index), "1")
         assert env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") == (None if index == 1 else main)
-        assert (env["MUSTER_JOB_ID"], env["MUSTER_RUN"], env["MUSTER_EPOCH"]) == (JOB, "run", "1")
-        assert env["MUSTER_STORE"] == str(bench.volume.path) and env["MUSTER_GANG"] == f"{JOB}/1/1"
+        assert (env["MUSTER_JOB_ID"], env["MUSTER_RUN"], env["MUSTER_EPOCH"]) == (bench.job, "run", "1")
+        assert env["MUSTER_STORE"] == str(bench.volume.path) and env["MUSTER_GANG"] == f"{bench.job}/1/1"
         assert not {"MUSTER_NODE", "MUSTER_ENVIRONMENT", "MUSTER_BUS", "MUSTER_BUS_TOKEN"} & set(env)
     assert len({env["MUSTER_ADDRESS"] for env in told}) == 3
     assert [bench.outcome(index).reason for index in range(3)] == ["done"] * 3
@@ -84,7 +84,7 @@ def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_ho
     assert read_epoch(volume) == 1 and volume.description() is not None, "the nodes made the run on their volume"
 
 
-def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: Bench) -> None:
+def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: AwsBench) -> None:
     script = (
         "import json, os, time\n"
         "error = {'message': {'message': 'RuntimeError: no', 'extraInfo': {'py_callstack': 'trace', 'timestamp': '1'}}}\n"
@@ -98,7 +98,7 @@ def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: Bench) 
 
 
 def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tmp_path: Path) -> None:
-    bench = Bench(aws, tmp_path, image="1.dkr.ecr/muster:2", file_system="fs-1", access_point="fsap-1", efa=True)
+    bench = AwsBench(aws, tmp_path, image="1.dkr.ecr/muster:2", file_system="fs-1", access_point="fsap-1", efa=True)
     gang = bench.gang(nodes=3, timeout=100, placements=[Placement("h", ("0", "1"), 3.5, 4096)] * 3)
     plan = bench.engine.plan(gang)
     document = json.loads(plan.document)
@@ -132,7 +132,7 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     )
 
 
-def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: Bench) -> None:
+def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: AwsBench) -> None:
     kinds = [["sh", "-c", f"echo kind {kind}"] for kind in (0, 0, 1)]
     handle = bench.launch(bench.gang(nodes=3, commands=kinds, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 3))
     bench.ended(handle)
@@ -142,12 +142,12 @@ def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: Bench) -> None:
         bench.engine.plan(bench.gang(nodes=6, commands=many))
 
 
-def test_what_was_submitted_by_a_controller_that_died_is_found(bench: Bench) -> None:
+def test_what_was_submitted_by_a_controller_that_died_is_found(bench: AwsBench) -> None:
     gang = bench.gang()
     handle = bench.launch(gang)
     successor = AwsBatchEngine(bench.home)
     assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
-    bench.ready(2)
+    bench.ready(gang)
     assert len(bench.processes()) == len({*bench.processes()}) and len(processes_of(bench.volume.path)) == 2
     bench.engine.stop(handle, 1.0)
     second = bench.gang("exit 0", attempt=2)
@@ -156,11 +156,9 @@ def test_what_was_submitted_by_a_controller_that_died_is_found(bench: Bench) -> 
     assert len(definitions["jobDefinitions"]) == 2, "another command is another revision"
 
 
-def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(POLITE, 2))
-    bench.ready(2)
-    bench.engine.stop(handle, 10.0)
-    assert bench.processes() == []
+def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: AwsBench) -> None:
+    handle = bench.ready(bench.gang(POLITE, 2))
+    bench.stopped(handle, 10.0)
     assert bench.outcome(0).exit_code == 75 and bench.log().count("saved") == 2, bench.log()
     assert [node.running for node in bench.engine.observe(handle)] == [False, False]
 
@@ -169,8 +167,7 @@ def test_a_gang_is_asked_to_leave_and_saves_within_the_grace(bench: Bench) -> No
 def test_a_child_whose_supervisor_is_killed_ends_the_gang(request: pytest.FixtureRequest, store: str) -> None:
     """AWS itself would let it run for ever; no controller looks meanwhile."""
     bench = request.getfixturevalue(store)
-    handle = bench.launch(bench.gang(nodes=3))
-    bench.ready(3)
+    handle = bench.ready(bench.gang(nodes=3))
     os.kill(_supervisor(bench, 2), signal.SIGKILL)
     wait_for(lambda: bench.processes() == [], 30, "the end of all nodes without a controller")
     status = bench.ended(handle)
@@ -179,21 +176,21 @@ def test_a_child_whose_supervisor_is_killed_ends_the_gang(request: pytest.Fixtur
     assert bench.outcome(0).exit_code == 143 and bench.log().count("ready") == 3
 
 
-def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_does_not(bench: Bench) -> None:
+def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_does_not(bench: AwsBench) -> None:
     failing = "echo ready; case $NODE_RANK in 0) exec sleep 600;; 1) exit 0;; 2) sleep 1; exit 3;; esac"
     bench.ended(bench.launch(bench.gang(failing, 3)))
     assert bench.outcome(0).reason == "node 2: rank 2 exited with code 3"
     assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
 
 
-def test_where_a_child_s_death_is_ignored_it_is(bench: Bench) -> None:
+def test_where_a_child_s_death_is_ignored_it_is(bench: AwsBench) -> None:
     script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
     handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
     assert bench.ended(handle)[0].exit_code == 0
     assert bench.log() == ["done without it"] and bench.outcome(1).exit_code == 3
 
 
-def test_an_image_without_muster_runs_as_it_is(bench: Bench) -> None:
+def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:
     handle = bench.launch(bench.gang("echo plain $GREETING $AWS_BATCH_JOB_NODE_INDEX; exit 4", 1, native=False))
     [node] = bench.ended(handle)
     assert node.exit_code == 4
@@ -202,7 +199,7 @@ def test_an_image_without_muster_runs_as_it_is(bench: Bench) -> None:
 
 
 def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: AwsBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aws_batch, "_REMEMBERED", 1)
     script = "for i in $(seq 100); do echo tick $i; sleep 0.1; done"
@@ -220,7 +217,7 @@ def test_gangs_that_come_and_go_do_not_double_the_lines_of_one_that_runs(
     assert bench.log().count("tick 100") == 1
 
 
-def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workstation: Bench) -> None:
+def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workstation: AwsBench) -> None:
     handle = workstation.launch(workstation.gang(f"echo rank $RANK; {LAST}; exit $RANK", 2))
     assert [node.exit_code for node in workstation.ended(handle)][1] == 1
     assert sorted(workstation.log())[:2] == ["rank 0", "rank 1"] and len(workstation.log()) == 2
@@ -231,38 +228,38 @@ def test_on_the_volume_itself_the_supervisors_write_and_nothing_is_copied(workst
     os.geteuid() != 0, reason="NOT TESTED: the EFS volume of a definition is a mount, and mounting needs root"
 )
 def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path: Path) -> None:
-    bench = Bench(aws, tmp_path, file_system="fs-1", store=str(tmp_path / "mount"))
+    bench = AwsBench(aws, tmp_path, file_system="fs-1", store=str(tmp_path / "mount"))
     handle = bench.launch(bench.gang("touch $MUSTER_STORE/models", 1, run="mounted"))
     assert [node.exit_code for node in bench.ended(handle)] == [0]
     volume = Store(aws.home / "store")  # what lies on the file system of whatever plays AWS
     assert read_epoch(volume.run("mounted")) == 1 and (volume.path / "models").exists()
     assert list((tmp_path / "mount").iterdir()) == [], "nobody else sees it there"
-    close(bench)
+    bench.close()
 
 
-def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: Bench) -> None:
+def test_a_run_that_belongs_to_a_later_attempt_refuses_the_earlier_one(bench: AwsBench) -> None:
     volume = bench.volume.run("run")
     volume.create({"run": "run"})
     raise_epoch(volume, 9)
     [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
     assert node.exit_code == 3 and read_epoch(volume) == 9
-    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    lines = [line.text for line in bench.lines()]
     assert not any("wrote" in line for line in lines)
     assert any("the run now belongs to epoch 9" in line for line in lines), lines
 
 
-def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(bench: Bench) -> None:
+def test_an_epoch_that_another_controllers_attempt_has_on_the_volume_is_refused(bench: AwsBench) -> None:
     volume = bench.volume.run("run")
     volume.create({"run": "run"})
     raise_epoch(volume, 1, Claim("", "another-job", 2))
     [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
     assert node.exit_code == 3
-    lines = [line.text for line in LogFollower(bench.run, JOB).drain()]
+    lines = [line.text for line in bench.lines()]
     assert not any("wrote" in line for line in lines)
     assert any("attempt 2 of job another-job has epoch 1 already; leaving" in line for line in lines), lines
 
 
-def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -> None:
+def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench) -> None:
     handle = bench.launch(bench.gang(nodes=1, placements=[Placement("aws-batch/default", (), 500, 64)]))
 
     def reason() -> str:
@@ -274,7 +271,7 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: Bench) -
     assert said.startswith("AWS Batch: ") and "CPUs" in said
     host = bench.engine.capacity()[0]
     assert (host.name, host.single) == ("aws-batch/default", False) and host.cpus > 0
-    away = Bench(bench.aws, bench.home)
+    away = AwsBench(bench.aws, bench.home)
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
     [node] = away.engine.observe(handle)
@@ -319,19 +316,19 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
 
 def test_what_is_wrong_from_the_start_is_said_at_the_start(aws: Serving, tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"127\.0\.0\.1:9\) does not answer: .*endpoint_url in aws\.json"):
-        Bench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
+        AwsBench(aws, tmp_path / "away", endpoint_url="http://127.0.0.1:9")
     with pytest.raises(EngineError, match="has no job queue robots; see `muster aws status`"):
-        Bench(aws, tmp_path / "queue", job_queue="robots")
+        AwsBench(aws, tmp_path / "queue", job_queue="robots")
     assert run_muster("keys", "create", "alice", home=tmp_path / "keyed").returncode == 0
     keyed = Serving(tmp_path / "keyed")
     try:
         with pytest.raises(EngineError, match=r"refuses: .*; see `aws configure`"):
-            Bench(keyed, tmp_path / "credentials")
+            AwsBench(keyed, tmp_path / "credentials")
     finally:
         keyed.close()
 
 
-def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: Bench) -> None:
+def test_the_doctor_looks_at_the_configuration_that_the_controller_has(bench: AwsBench) -> None:
     examined = run_muster("doctor", "--engine", "aws-batch", home=bench.home)
     assert examined.returncode == 0 and "ok  engine aws-batch 1 host" in examined.stdout, examined.stdout
 
@@ -345,7 +342,7 @@ command: [sh, -c, 'echo ready $AWS_BATCH_JOB_ATTEMPT; while [ ! -e {gate}/$AWS_B
 """
 
 
-def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench: Bench) -> None:
+def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench: AwsBench) -> None:
     (bench.home / "job.yaml").write_text(YAML.format(gate=bench.home))
     controller = Serving(bench.home, "--engine", "aws-batch", "--store", str(bench.home / "store"))
     try:
@@ -368,20 +365,10 @@ def test_a_controller_drives_aws_through_a_killed_child_and_its_own_death(bench:
         controller.close()
 
 
-def _supervisor(bench: Bench, node: int) -> int:
-    return next(
-        pid for pid in processes_of(bench.aws.home) if _is(pid, node) and b"worker.aws_node" in _words(pid)[4:5]
-    )
+def _supervisor(bench: AwsBench, node: int) -> int:
+    found = processes_of(bench.aws.home, AWS_BATCH_JOB_NODE_INDEX=str(node))
+    return next(pid for pid in found if "worker.aws_node" in command(pid)[:5])
 
 
-def _rank(bench: Bench, node: int) -> int:
-    return next(pid for pid in processes_of(bench.volume.path) if _is(pid, node))
-
-
-def _words(pid: int) -> list[bytes]:
-    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-    return [b"", *words] if b"worker.aws_node" in words[:4] else words
-
-
-def _is(pid: int, node: int) -> bool:
-    return f"AWS_BATCH_JOB_NODE_INDEX={node}".encode() in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+def _rank(bench: AwsBench, node: int) -> int:
+    return processes_of(bench.volume.path, AWS_BATCH_JOB_NODE_INDEX=str(node))[0]

@@ -23,8 +23,9 @@ from orchestrator.aws_stack import Event, first_failure
 from orchestrator.cli import main
 from orchestrator.engines.aws_batch import AwsBatchEngine
 from orchestrator.engines.aws_config import load_config
-from orchestrator.engines.base import Gang, Placement
+from orchestrator.engines.base import Placement
 from tests.conftest import REPOSITORY, run_muster
+from tests.support.engines.bench import make_gang
 from tests.support.engines.moto_aws import moto_server
 
 # both are in the template, and moto says that it can't make them
@@ -223,13 +224,13 @@ def test_the_engine_works_on_what_up_has_written(
     engine = AwsBatchEngine(account.home)
     [host] = engine.capacity()
     assert (host.name, host.cpus, len(host.gpus)) == ("aws-batch/muster", 256.0, 64)
-    gang = Gang(
-        *("11111111-2222-4333-8444-555555555555", 1, 1, 1, "run", str(tmp_path), "default", "aws", 0),
+    gang = make_gang(
+        tmp_path,
+        job="11111111-2222-4333-8444-555555555555",
         commands=[["true"]] * 2,
         environments=[{"MUSTER_ON_CHILD_FAILURE": "restart"}] * 2,
         placements=[Placement("aws-batch/muster", ("0",), 4, 4096)] * 2,
         grace=30.0,
-        directory=None,
         containers=[{"image": "muster"}] * 2,
         title="ant",
     )

@@ -13,114 +13,36 @@ from typing import Any
 import pytest
 
 from orchestrator.engines import docker as docker_engine
-from orchestrator.engines.base import EngineError, Gang, NodeStatus, NotYet, Placement
+from orchestrator.engines.base import EngineError, NotYet
 from shared_store import __version__
-from shared_store.epoch import raise_epoch
-from shared_store.layout import Store
-from shared_store.logs import LogFollower
-from shared_store.outcomes import read_outcome
 from tests.conftest import REPOSITORY, wait_for
-from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files
-from tests.support.engines.sites import POLITE, STUBBORN, WAIT
-
-JOB = "docker-engine-job"
-
-
-class Bench:
-    """An engine with a home and a store of its own, and the gangs that it started."""
-
-    def __init__(self, client: Any, home: Path) -> None:
-        self.client, self.home = client, home
-        self.store = Store(home / "store").open()
-        self.engine = self.another()
-        self.handles: list[str] = []
-        run = self.store.run("run")
-        run.create({"run": "run"})
-        raise_epoch(run, 1)
-
-    def another(self) -> Any:
-        """As a controller that was started again has it."""
-        from orchestrator.engines.docker import DockerEngine
-
-        return DockerEngine(self.home / "home", gpus=[])
-
-    def gang(self, script: str = WAIT, nodes: int = 2, image: str = PLAIN, **container: Any) -> Gang:
-        changes = {
-            name: container.pop(name)
-            for name in ("attempt", "is_gang", "memory", "main", "log_limit", "bus", "bus_token")
-            if name in container
-        }
-        memory = changes.pop("memory", 256)
-        return Gang(
-            job=JOB,
-            attempt=changes.pop("attempt", 1),
-            epoch=1,
-            job_epoch=1,
-            run="run",
-            store=str(self.store.path),
-            queue="default",
-            pool="docker",
-            main=changes.pop("main", 0),
-            commands=[["sh", "-c", script]] * nodes,
-            environments=[{"PATH": PATH, "GREETING": "hello"}] * nodes,
-            placements=[Placement("here", (), 0.5, memory)] * nodes,
-            grace=5.0,
-            directory=None,
-            containers=[{"image": image, **host_files(), **container}] * nodes,
-            **changes,
-        )
-
-    def launch(self, gang: Gang) -> str:
-        handle: str = self.engine.launch(self.engine.plan(gang))
-        self.handles.append(handle)
-        return handle
-
-    def ended(self, handle: str, engine: Any = None) -> list[NodeStatus]:
-        def over() -> list[NodeStatus] | None:
-            status = (engine or self.engine).observe(handle)
-            return status if not any(node.running for node in status) else None
-
-        return wait_for(over, 30, "the gang's end")  # type: ignore[no-any-return]
-
-    def log(self, attempt: int = 1) -> list[str]:
-        lines = LogFollower(self.store.run("run"), JOB).drain()
-        return [line.text for line in lines if line.attempt == attempt]
-
-    def left(self) -> tuple[int, int]:
-        """Containers and networks of the gangs of these tests."""
-        mine = {"label": "muster.gang"}
-        containers = [c for c in self.client.containers.list(all=True, filters=mine) if JOB in c.labels["muster.gang"]]
-        networks = [n for n in self.client.networks.list(filters=mine) if JOB in n.name]
-        return len(containers), len(networks)
+from tests.support.engines.docker_bench import DockerBench
+from tests.support.engines.images import PLAIN, SUPERVISED, host_files
+from tests.support.engines.sites import POLITE, STUBBORN
 
 
 @pytest.fixture
-def bench(docker_client: Any, tmp_path: Path) -> Iterator[Bench]:
-    found = Bench(docker_client, tmp_path)
+def bench(docker_client: Any, tmp_path: Path) -> Iterator[DockerBench]:
+    found = DockerBench(docker_client, tmp_path)
     yield found
-    for handle in found.handles:
-        found.engine.stop(handle, 0.0)
-    assert found.left() == (0, 0)
+    found.close()
 
 
-def test_a_plain_image_runs_plainly_and_its_log_and_outcome_are_in_the_store(bench: Bench) -> None:
+def test_a_plain_image_runs_plainly_and_its_log_and_outcome_are_in_the_store(bench: DockerBench) -> None:
     script = 'echo "$GREETING from $AWS_BATCH_JOB_NODE_INDEX of $NNODES$MUSTER_BUS$MUSTER_BUS_TOKEN"; exit $NODE_RANK'
     handle = bench.launch(bench.gang(script, 3, bus="tcp/1", bus_token="no supervisor needs it"))
     status = bench.ended(handle)
     assert [node.exit_code for node in status] == [0, 1, 2]
     assert sorted(bench.log()) == [f"hello from {index} of 3" for index in range(3)]
-    outcomes = [read_outcome(bench.store.run("run"), JOB, 1, index) for index in range(3)]
-    assert [(o.exit_code, o.reason) for o in outcomes if o] == [
+    assert [(outcome.exit_code, outcome.reason) for outcome in map(bench.outcome, range(3))] == [
         (0, "done"),
         (1, "container exited with code 1"),
         (2, "container exited with code 2"),
     ]
-    bench.engine.stop(handle, 1.0)
-    assert bench.left() == (0, 0)
-    assert [node.exit_code for node in bench.engine.observe(handle)] == [0, 1, 2], "told to the end"
+    assert bench.stopped(handle) == [0, 1, 2], "told to the end"
 
 
-def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_told(bench: Bench) -> None:
+def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_told(bench: DockerBench) -> None:
     script = (
         "import os, socket, sys, time\n"
         "here, main = os.environ['MUSTER_ADDRESS'], os.environ['MASTER_ADDR']\n"
@@ -143,7 +65,7 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
     assert not set(json.loads(other)["addresses"]) & set(addresses)
 
 
-def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> None:
+def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: DockerBench) -> None:
     (bench.home / "data").mkdir()
     (bench.home / "data" / "file").write_text("found")
     files = host_files()
@@ -159,18 +81,20 @@ def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> Non
         bench.gang(
             script,
             1,
-            user="1234",
-            ulimits=[{"name": "nofile", "softLimit": 321, "hardLimit": 321}],
-            linuxParameters={
-                "sharedMemorySize": 96,
-                "maxSwap": 64,
-                "devices": [{"hostPath": "/dev/zero", "containerPath": "/dev/nothing", "permissions": ["READ"]}],
+            container={
+                "user": "1234",
+                "ulimits": [{"name": "nofile", "softLimit": 321, "hardLimit": 321}],
+                "linuxParameters": {
+                    "sharedMemorySize": 96,
+                    "maxSwap": 64,
+                    "devices": [{"hostPath": "/dev/zero", "containerPath": "/dev/nothing", "permissions": ["READ"]}],
+                },
+                "readonlyRootFilesystem": True,
+                **files,
             },
-            readonlyRootFilesystem=True,
-            **files,
         )
     )
-    [container] = bench.engine._containers(f"{JOB}/1/1").values()
+    [container] = bench.engine._containers(f"{bench.job}/1/1").values()
     host = container.attrs["HostConfig"]
     assert (host["NanoCpus"], host["Memory"]) == (500_000_000, 256 * 2**20)
     assert host["MemorySwap"] in (320 * 2**20, -1), "a kernel that counts no swap has no limit of it"
@@ -180,7 +104,7 @@ def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: Bench) -> Non
     assert bench.log() == ["found", "runs", "store.json", "1234", "321", str(96 * 1024), "read-only"]
 
 
-def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: Bench) -> None:
+def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: DockerBench) -> None:
     handle = bench.launch(bench.gang("exec python3 -c 'x = bytearray(300 << 20); print(len(x))'", 1, memory=64))
     [node] = bench.ended(handle)
     if node.exit_code == 0:
@@ -188,30 +112,30 @@ def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: Bench) -> None:
     assert (node.exit_code, node.detail) == (137, "OutOfMemoryError: Container killed due to memory usage")
 
 
-def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: Bench) -> None:
+def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: DockerBench) -> None:
     gang = bench.gang("for i in 1 2 3 4 5 6; do echo line $i; sleep 0.3; done", 2)
     handle = bench.launch(gang)
     wait_for(lambda: bench.log(), 10, "the first line")
     shared = {container.attrs["HostConfig"]["ShmSize"] for container in bench.engine._containers(gang.name).values()}
     assert shared == {128 * 2**20}, "half of the memory"
-    successor = bench.another()
+    successor = bench.new_engine()
     assert successor.launch(successor.plan(gang)) == handle, "found, not started twice"
     assert bench.left() == (2, 1)
     assert [node.exit_code for node in bench.ended(handle, successor)] == [0, 0]
 
 
-def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_printed(bench: Bench) -> None:
+def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_printed(bench: DockerBench) -> None:
     handle = bench.launch(bench.gang("echo early; sleep 2; echo late", 1))
-    log = bench.store.run("run").log(JOB, 1, 0)
+    log = bench.run.log(bench.job, 1, 0)
     early = wait_for(lambda: log.exists() and log.read_text(), 10, "the first line")
     log.unlink()  # what the first controller still writes is lost with it
     log.write_text("half a li")  # as a disk that is full leaves it
-    bench.ended(handle, bench.another())
+    bench.ended(handle, bench.new_engine())
     lines = log.read_text()
     assert lines.startswith(early) and bench.log() == ["early", "late"], lines
 
 
-def test_two_threads_that_look_at_once_copy_a_log_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_threads_that_look_at_once_copy_a_log_once(bench: DockerBench, monkeypatch: pytest.MonkeyPatch) -> None:
     genuine = docker_engine.read_outcome
 
     def slow(*arguments: Any) -> Any:
@@ -219,7 +143,7 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: Bench, monkeypatch
         return genuine(*arguments)
 
     handle = bench.launch(bench.gang("for i in 1 2 3; do echo line $i; sleep 0.5; done", 1))
-    successor = bench.another()  # as after a restart: the controller's thread and that of a stop look first
+    successor = bench.new_engine()  # as after a restart: the controller's thread and that of a stop look first
     monkeypatch.setattr(docker_engine, "read_outcome", slow)
     before = threading.active_count()
     looks = [threading.Thread(target=successor.observe, args=(handle,)) for _ in range(2)]
@@ -234,18 +158,18 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: Bench, monkeypatch
 
 
 def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: DockerBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("orchestrator.engines.docker._LOOK", 0.0)  # it goes on at the next look
     handle = bench.launch(bench.gang("seq 100000 160000; echo the error; exit 1", 1, log_limit=1 << 20))
     bench.ended(handle)
     log = bench.log()
     assert log[0] == "100000" and log[-2:] == ["160000", "the error"]
-    assert len(log) < 40_000 and sum("left out" in line for line in log) == 1
+    assert len(log) < 40_000 and sum("left out" in line.text for line in bench.lines()) == 1
 
 
-def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> None:
-    log = bench.store.run("run").log(JOB, 1, 0)
+def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: DockerBench) -> None:
+    log = bench.run.log(bench.job, 1, 0)
     log.mkdir(parents=True)
     long = "x" * 40_000  # Docker keeps it in pieces of 16 KiB
     handle = bench.launch(bench.gang(f"echo {long}; echo done; exit 3", 1))
@@ -262,39 +186,34 @@ def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: Bench) -> No
     assert node.exit_code == 3 and bench.log() == [long, "done"]
 
 
-def test_the_log_of_a_gang_that_is_stopped_is_whole(bench: Bench) -> None:
-    handle = bench.launch(
-        bench.gang("echo ready; trap 'seq 100000 160000; exit 75' TERM; while :; do sleep 0.05; done", 1)
-    )
-    wait_for(lambda: "ready" in bench.log(), 20, "it is ready")
-    bench.engine.stop(handle, 30.0)
+def test_the_log_of_a_gang_that_is_stopped_is_whole(bench: DockerBench) -> None:
+    script = "echo ready; trap 'seq 100000 160000; exit 75' TERM; while :; do sleep 0.05; done"
+    bench.stopped(bench.ready(bench.gang(script, 1)), 30.0)
     assert bench.log() == ["ready", *map(str, range(100_000, 160_001))]
 
 
-def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
-    polite = bench.launch(bench.gang(POLITE, 2))
-    wait_for(lambda: bench.log().count("ready") == 2, 20, "both are ready")
-    bench.engine.stop(polite, 10.0)
-    assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75]
+def test_a_gang_is_asked_to_leave_and_then_made_to(bench: DockerBench) -> None:
+    polite = bench.ready(bench.gang(POLITE, 2))
+    assert bench.stopped(polite, 10.0) == [75, 75]
     assert bench.log().count("saved") == 2
-    stubborn = bench.launch(bench.gang(STUBBORN, 1, attempt=2))
-    wait_for(lambda: "ready" in bench.log(2), 20, "it is ready")
+    stubborn = bench.ready(bench.gang(STUBBORN, 1, attempt=2))
     started = time.monotonic()
-    bench.engine.stop(stubborn, 1.0)
+    assert bench.stopped(stubborn, 1.0) == [137]
     assert time.monotonic() - started > 0.9
-    assert [node.exit_code for node in bench.engine.observe(stubborn)] == [137] and bench.left() == (0, 0)
 
 
 @pytest.mark.parametrize("blow", [lambda c: c.kill(), lambda c: c.remove(force=True)])
-def test_a_container_that_is_killed_or_removed_is_a_node_that_ended(bench: Bench, blow: Callable[[Any], None]) -> None:
+def test_a_container_that_is_killed_or_removed_is_a_node_that_ended(
+    bench: DockerBench, blow: Callable[[Any], None]
+) -> None:
     handle = bench.launch(bench.gang(nodes=2))
-    blow(bench.engine._containers(f"{JOB}/1/1")[1])
+    blow(bench.engine._containers(f"{bench.job}/1/1")[1])
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 10, "its end is seen")
     assert bench.engine.observe(handle)[0].running
     assert bench.engine.observe(handle)[1].exit_code in (137, None)
 
 
-def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(bench: Bench) -> None:
+def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(bench: DockerBench) -> None:
     gang = bench.gang(image="muster-test-missing:1")
 
     def refused() -> str | None:
@@ -313,9 +232,8 @@ def test_an_image_that_is_nowhere_fails_in_docker_s_words_and_leaves_nothing(ben
     assert bench.left() == (0, 0)
 
 
-def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_starts(bench: Bench) -> None:
-    gang = bench.gang()
-    train = Gang(**{**gang.__dict__, "commands": [["python", "-P", "-m", "worker.train"]] * 2})
+def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_starts(bench: DockerBench) -> None:
+    train = bench.gang(commands=[["python", "-P", "-m", "worker.train"]] * 2)
     with pytest.raises(EngineError) as refused:
         bench.engine.launch(bench.engine.plan(train))
     assert str(refused.value) == (
@@ -358,19 +276,18 @@ def test_a_docker_engine_of_this_machine_is_known_as_such(url: str, name: str, h
     assert _is_here(url, name) is here
 
 
-def test_a_command_that_is_not_in_the_image_fails_and_leaves_nothing(bench: Bench) -> None:
-    gang = bench.gang()
-    gang = Gang(**{**gang.__dict__, "commands": [["no-such-program"]] * 2})
+def test_a_command_that_is_not_in_the_image_fails_and_leaves_nothing(bench: DockerBench) -> None:
+    gang = bench.gang(commands=[["no-such-program"]] * 2)
     with pytest.raises(EngineError, match=r"CannotStartContainerError: Error response from daemon: .*no-such-program"):
         bench.engine.launch(bench.engine.plan(gang))
     assert bench.left() == (0, 0)
 
 
-def test_with_muster_in_the_image_the_supervisor_writes_log_and_outcome(bench: Bench) -> None:
+def test_with_muster_in_the_image_the_supervisor_writes_log_and_outcome(bench: DockerBench) -> None:
     script = "echo rank $RANK of $WORLD_SIZE in $MUSTER_STORE; exit 3"
     handle = bench.launch(bench.gang(script, 1, image=SUPERVISED))
     [node] = bench.ended(handle)
-    outcome = read_outcome(bench.store.run("run"), JOB, 1, 0)
-    assert node.exit_code == 3 and outcome is not None, (node, bench.log())
+    outcome = bench.outcome(0)
+    assert node.exit_code == 3, (node, bench.log())
     assert (outcome.exit_code, outcome.reason) == (3, "rank 0 exited with code 3")
     assert "rank 0 of 1 in /muster/store" in bench.log()

@@ -17,21 +17,9 @@ from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome
 from tests.conftest import Serving, wait_for
-from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files
+from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files, plain
 from tests.support.engines.sites import POLITE, WAIT
 from tests.support.engines.training import submit
-
-
-def plain(served: Serving, image: str, script: str, queue: str = "default", **container: Any) -> str:
-    """A gang of one in ``image``; returns the job id."""
-    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
-    container = {"image": image, "command": ["sh", "-c", script], "resourceRequirements": needs, **container}
-    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
-    arn = served.client.batch(
-        "RegisterJobDefinition", jobDefinitionName="plain", type="multinode", nodeProperties=properties
-    )["jobDefinitionArn"]
-    job: str = served.client.batch("SubmitJob", jobName="plain", jobQueue=queue, jobDefinition=arn)["jobId"]
-    return job
 
 
 @pytest.mark.usefixtures("docker_client")

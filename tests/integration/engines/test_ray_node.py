@@ -16,7 +16,8 @@ from shared_store.layout import Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import read_outcome
 from shared_store.processes import end_all, find_process
-from tests.conftest import alive, frozen, wait_for
+from tests.conftest import wait_for
+from tests.support.processes import alive, await_end, frozen
 
 ESCAPE = "echo $$; env -i setsid sh -c 'echo $$; exec sleep 600' & exec sleep 600"
 ACTOR = """
@@ -72,5 +73,5 @@ def test_a_node_leaves_nothing_when_its_actor_is_killed(contract: NodeContract) 
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as actor:
         found = pids(contract)
         actor.kill()
-    wait_for(lambda: not any(alive(pid) for pid in found), 20, "the end of the node")
+    await_end(*found)
     assert read_outcome(Store(contract.store).run("run"), "ray-node", 1, 0) is None

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import Serving, wait_for
-from tests.integration.engines.test_docker_faults import plain
-from tests.support.engines.images import PLAIN, host_files
+from tests.support.engines.images import PLAIN, host_files, plain
 from tests.support.engines.sites import POLITE
 
 SCRIPT = "echo on $(hostname)"

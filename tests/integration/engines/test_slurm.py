@@ -18,13 +18,13 @@ from orchestrator.engines.slurm_commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm_words import ending, waiting
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import POLITE, STUBBORN, WAIT
-from tests.support.engines.slurm_bench import Bench, slurm_bench
+from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
 from tests.support.engines.slurm_cluster import GPUS, NODES
 
 bench = slurm_bench
 
 
-def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: Bench) -> None:
+def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: SlurmBench) -> None:
     hosts = bench.engine.capacity()
     assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
         (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
@@ -40,7 +40,7 @@ def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: B
 
 
 def test_a_job_for_more_hosts_than_there_are_now_is_taken_and_says_what_it_waits_for(
-    bench: Bench, tmp_path: Path
+    bench: SlurmBench, tmp_path: Path
 ) -> None:
     spec = tmp_path / "job.yaml"
     spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
@@ -90,7 +90,7 @@ def test_a_node_that_slurm_would_boot_is_a_host_and_one_that_is_out_of_service_i
 
 
 def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hard = "a'b\"c\nd $HOME `date` \\ é\tMUSTER\n@nodes@ %j"
     monkeypatch.setenv("MUSTER_TOKEN", "secret")
@@ -125,20 +125,21 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
 
 
 def test_without_gpus_a_node_sees_none_and_two_jobs_on_one_host_have_two_ports(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
     script = f'echo "gpus[$CUDA_VISIBLE_DEVICES] port $MASTER_PORT"; {WAIT}'
     pin = {"nodelist": "n1"}
-    first = bench.launch(bench.gang(script, options=pin))
-    second = bench.launch(bench.gang(script, options=pin, suffix="2"))
-    bench.ready(first)
-    bench.ready(second, suffix="2")
-    lines = [bench.log()[0], bench.log("2")[0]]
+    gangs = [bench.gang(script, options=pin, suffix=suffix) for suffix in ("", "2")]
+    for gang in gangs:
+        bench.launch(gang)
+    for gang in gangs:
+        bench.ready(gang)
+    lines = [bench.log(job=gang.job)[0] for gang in gangs]
     assert all(line.startswith("gpus[] port ") for line in lines) and lines[0] != lines[1], lines
 
 
-def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: Bench) -> None:
+def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: SlurmBench) -> None:
     handle = bench.launch(
         bench.gang("env | grep ^AWS_BATCH | sort; exit 3", is_gang=False, array=(4, 9), environments=[{}])
     )
@@ -148,12 +149,12 @@ def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: Be
     assert "AWS_BATCH_JOB_ARRAY_INDEX=4" in bench.log() and not [name for name in names if "NODE" in name]
 
 
-def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitted(bench: Bench) -> None:
+def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitted(bench: SlurmBench) -> None:
     gang = bench.gang(nodes=2)
     handle = bench.launch(gang)
-    successor = SlurmEngine()
+    successor = bench.new_engine()
     assert successor.launch(successor.plan(gang)) == handle, "found, not submitted twice"
-    bench.ready(handle, 2)
+    bench.ready(gang)
     assert all(node.running for node in SlurmEngine().observe(handle)) or wait_for(
         lambda: all(node.running and not node.waiting for node in successor.observe(handle)), 10, "known by its handle"
     )
@@ -162,7 +163,7 @@ def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitt
     assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
 
 
-def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(bench: Bench) -> None:
+def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(bench: SlurmBench) -> None:
     handle = bench.launch(bench.gang("exit 0"))
     bench.ended(handle)
     facts = {**json.loads(handle), "slurm": "999999", "gang": "forgotten/1/1"}
@@ -181,9 +182,8 @@ def look(handle: str) -> list[NodeStatus]:
     )
 
 
-def test_a_gang_waits_for_room_with_slurm_s_reason(bench: Bench) -> None:
-    big = bench.launch(bench.gang(nodes=3, cpus=4))
-    bench.ready(big, 3)
+def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
+    big = bench.ready(bench.gang(nodes=3, cpus=4))
     small = bench.launch(bench.gang(cpus=4, suffix="2"))
 
     def waits(text: str, handle: str = small) -> bool:
@@ -233,14 +233,14 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: Bench) -> None:
         ),
     ],
 )
-def test_what_slurm_can_t_do_is_refused_in_one_line(bench: Bench, changes: dict[str, Any], why: str) -> None:
+def test_what_slurm_can_t_do_is_refused_in_one_line(bench: SlurmBench, changes: dict[str, Any], why: str) -> None:
     with pytest.raises(EngineError, match=why) as refused:
         bench.launch(bench.gang(**changes))
     assert "\n" not in str(refused.value) and not isinstance(refused.value, NotYet)
     assert not bench.cluster.run("squeue", "-h")
 
 
-def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: Bench) -> None:
+def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: SlurmBench) -> None:
     options = {"partition": "urgent", "qos": "high", "gpu": "a100", "nice": "100", "hosts": "x"}
     gang = bench.gang(
         nodes=2, gpus=2, options=options, timeout=3600, priority=30, title='my "job" é', bus="tcp/1", bus_token="secret"
@@ -268,33 +268,28 @@ def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: Bench) -> Non
     )
 
 
-def test_a_gang_is_asked_to_leave_and_then_made_to(bench: Bench) -> None:
-    polite = bench.launch(bench.gang(POLITE, 3))
-    bench.ready(polite, 3)
-    bench.engine.stop(polite, 30.0)
-    assert [node.exit_code for node in bench.engine.observe(polite)] == [75, 75, 75]
+def test_a_gang_is_asked_to_leave_and_then_made_to(bench: SlurmBench) -> None:
+    polite = bench.ready(bench.gang(POLITE, 3))
+    assert bench.stopped(polite, 30.0) == [75, 75, 75]
     assert bench.log().count("saved") >= 3  # Slurm signals every process of a step, and the supervisor its rank
-    assert not bench.processes(b"worker.supervisor")
-    stubborn = bench.launch(bench.gang(STUBBORN, suffix="2", grace=60.0))
-    bench.ready(stubborn, suffix="2")
+    stubborn = bench.ready(bench.gang(STUBBORN, suffix="2", grace=60.0))
     asked = time.monotonic()
-    bench.engine.stop(stubborn, 1.0)
+    assert bench.stopped(stubborn, 1.0) == [137]
     assert time.monotonic() - asked > 0.9
-    assert bench.engine.observe(stubborn)[0].exit_code == 137 and not bench.processes(b"worker.supervisor")
 
 
-def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: Bench) -> None:
+def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: SlurmBench) -> None:
     for number, pause in enumerate((0.0, 0.3, 0.6)):
         handle = bench.launch(bench.gang(nodes=2, suffix=str(number)))
         time.sleep(pause)
         bench.engine.stop(handle, 3.0)
-        assert not bench.processes(b"worker.supervisor") and not any(n.running for n in bench.engine.observe(handle))
+        assert not bench.processes() and not any(n.running for n in bench.engine.observe(handle))
 
 
-def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: Bench) -> None:
+def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: SlurmBench) -> None:
     nowhere = bench.launch(bench.gang(nodes=2, directory="/no/such/place"))
     # what a node with another disk at the store's path finds: no such epoch
-    other = bench.launch(bench.gang(nodes=1, epoch=2, suffix="2"))
+    other = bench.start(bench.gang(nodes=1, epoch=2, suffix="2"))
     for node, name in zip(bench.ended(nowhere), NODES, strict=False):
         assert node.exit_code == 2
         assert node.detail == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
@@ -304,7 +299,7 @@ def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: Bench) -> No
 
 
 def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: SlurmBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(sys, "executable", "/no/python")

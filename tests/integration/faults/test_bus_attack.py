@@ -16,7 +16,7 @@ import zenoh
 from orchestrator.bus import Bus, BusError
 from shared_store.bus import Credential, presence_key
 from tests.conftest import Serving, wait_for
-from tests.training.faults.test_bus import node_contract
+from tests.support.worker.node import node_contract
 from worker.bus import NodeBus
 
 KEY = "muster/victim/1/0"

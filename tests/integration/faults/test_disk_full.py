@@ -16,9 +16,10 @@ from orchestrator.database import Database, DatabaseFull
 from orchestrator.disk import DEFAULT, Disk, MinFree
 from orchestrator.errors import ApiError
 from orchestrator.tables import JobQueue
-from tests.conftest import PATIENCE, Serving, processes_of, run_muster, wait_for
+from tests.conftest import PATIENCE, Serving, run_muster, wait_for
 from tests.support.conformance.streams import client_of
-from tests.training.faults.test_store import fill
+from tests.support.faults.full_disk import fill, small_volume
+from tests.support.processes import processes_of
 
 SLEEP = "import time; print('begun', flush=True); time.sleep(3000)"
 FLOOD = "import os; os.execvp('timeout', ['timeout', '5', 'yes'])"
@@ -27,13 +28,8 @@ FLOOD = "import os; os.execvp('timeout', ['timeout', '5', 'yes'])"
 @pytest.fixture
 def volume(tmp_path: Path) -> Iterator[Path]:
     """A volume of its own of 40 MB, in memory."""
-    target = tmp_path / "volume"
-    target.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40m", "tmpfs", str(target)], capture_output=True)
-    if done.returncode:
-        pytest.skip(f"NOT TESTED: a full disk needs a small volume, which can't be mounted here: {done.stderr!r}")
-    yield target
-    subprocess.run(["umount", "-l", str(target)], check=False)
+    with small_volume(tmp_path / "volume", 40 << 20) as found:
+        yield found
 
 
 def free(volume: Path) -> int:

@@ -38,28 +38,17 @@ from orchestrator.engines.several import Several
 from orchestrator.engines.transience import is_final
 from orchestrator.server import Server
 from shared_store.layout import Store
-from tests.conftest import processes_of, submit_gang, wait_for
+from tests.conftest import submit_gang, wait_for
+from tests.support.engines.bench import make_gang
+from tests.support.orchestrator.jobs import await_status, detail
+from tests.support.processes import end_all, gang_members, processes_of
 
 HOST = "engine/host"
 
 
 def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "exec sleep 600", nodes: int = 1) -> Gang:
-    return Gang(
-        job=name,
-        attempt=1,
-        epoch=1,
-        job_epoch=1,
-        run="run",
-        store=str(directory / "store"),
-        queue="default",
-        pool="local",
-        main=0,
-        commands=[["sh", "-c", script]] * nodes,
-        environments=[{}] * nodes,
-        placements=[Placement(host, (), 0.1, 16)] * nodes,
-        grace=1.0,
-        directory=None,
-    )
+    placements = [Placement(host, (), 0.1, 16)] * nodes
+    return make_gang(directory / "store", script, nodes, job=name, placements=placements, grace=1.0)
 
 
 class Fake:
@@ -232,18 +221,13 @@ def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_start
         try:
             [node] = wait_for(lambda: (s := several.observe(handle)) and not s[0].waiting and s, 60, "that it is seen")
             assert node.running
-            names = {_gang_of(pid) for pid in processes_of(tmp_path)}
+            names = {member.gang for member in gang_members(tmp_path)}
             assert names <= {"running/1/1", f"half-{spare}/1/1"} and spare > 2, (names, spare)
         finally:
             several.stop(handle, 0)
             for name in range(spare + 1):
                 engine.stop(json.dumps({"gang": f"half-{name}/1/1", "nodes": []}), 0)
     assert processes_of(tmp_path) == []
-
-
-def _gang_of(pid: int) -> str:
-    environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    return next((item[12:].decode() for item in environment if item.startswith(b"MUSTER_GANG=")), "")
 
 
 def test_a_job_that_can_t_be_started_for_now_keeps_its_attempts_and_one_that_never_can_is_over(
@@ -365,23 +349,15 @@ def test_a_docker_daemon_that_hangs_delays_no_gang_of_another_engine(
     server.start()
     try:
         with Client(server.url) as client:
-
-            def detail(job: str) -> dict[str, Any]:
-                found: dict[str, Any] = client.get(f"/api/jobs/{job}")
-                return found
-
-            def status(job: str, wanted: str) -> None:
-                wait_for(lambda: detail(job)["status"] == wanted, 30, f"{job} {wanted}")
-
             running = submit_gang(client, "import time; time.sleep(600)")
-            status(running, "RUNNING")
+            await_status(client, running, "RUNNING")
             hung = submit_gang(client, "pass", queue="docker")
             wait_for(lambda: daemon.asked, 30, "a request that is not answered")
             said = "the docker engine has not answered since "
-            wait_for(lambda: detail(hung)["statusReason"].startswith(said), 30, "the reason")
+            wait_for(lambda: detail(client, hung)["statusReason"].startswith(said), 30, "the reason")
             # all of this while one call to Docker is in the air
-            status(submit_gang(client, "print('here')"), "SUCCEEDED")
-            status(submit_gang(client, "import time; time.sleep(600)", timeout=60), "RUNNING")
+            await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
+            await_status(client, submit_gang(client, "import time; time.sleep(600)", timeout=60), "RUNNING")
             assert [host["name"].partition("/")[0] for host in client.get("/api/capacity")["hosts"]] == [
                 "localhost",
                 "docker",
@@ -389,15 +365,13 @@ def test_a_docker_daemon_that_hangs_delays_no_gang_of_another_engine(
             plan = client.post("/api/plan", {"definition": DEFINITION, "queue": "docker"})
             assert (plan["engine"], len(plan["nodes"])) == ("docker", 1)
             client.batch("TerminateJob", jobId=running, reason="enough")
-            status(running, "FAILED")
-            assert detail(hung)["status"] == "STARTING" and len(daemon.asked) == 1
+            await_status(client, running, "FAILED")
+            assert detail(client, hung)["status"] == "STARTING" and len(daemon.asked) == 1
     finally:
         daemon.over.set()
         server.close()
         daemon.shutdown()
         daemon.server_close()
-        for pid in processes_of(tmp_path):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, 9)
+        end_all(tmp_path)
     assert sum(said in record.getMessage() for record in caplog.records) == 1
     assert [record for record in caplog.records if record.levelno >= logging.ERROR and record.exc_info] == []

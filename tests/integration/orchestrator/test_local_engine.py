@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
 import json
 import os
@@ -17,27 +16,18 @@ import pytest
 from orchestrator.engines.base import EngineError, Placement
 from orchestrator.engines.local import LocalEngine
 from shared_store.epoch import raise_epoch
-from shared_store.outcomes import read_outcome
 from shared_store.processes import end_all, find_process
-from tests.conftest import alive, frozen, wait_for
-from tests.support.orchestrator.local_bench import JOB, WAIT, Bench
-
-STAY = 'trap "" TERM; echo ready; while :; do sleep 0.05; done'
-
-
-def command_line(pid: int) -> str:
-    return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+from tests.conftest import wait_for
+from tests.support.engines.local_bench import LocalBench
+from tests.support.engines.sites import POLITE, STUBBORN, WAIT
+from tests.support.processes import alive, command, frozen
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
-    yield bench
-    while left := bench.processes():
-        for pid in left:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        time.sleep(0.05)
+def bench(tmp_path: Path) -> Iterator[LocalBench]:
+    found = LocalBench(tmp_path)
+    yield found
+    found.close()
 
 
 def pids(handle: str) -> list[int]:
@@ -61,13 +51,13 @@ def test_without_a_limit_the_machine_s_own_cpus_are_given(monkeypatch: pytest.Mo
     assert LocalEngine(Path("/nowhere")).capacity()[0].gpus == ()
 
 
-def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: Bench) -> None:
+def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: LocalBench) -> None:
     gang = bench.gang(nodes=3)
     assert bench.engine.plan(gang) == bench.engine.plan(gang)
     assert bench.processes() == []
 
 
-def test_every_node_has_a_loopback_address_of_its_own_and_all_know_the_main_node_s(bench: Bench) -> None:
+def test_every_node_has_a_loopback_address_of_its_own_and_all_know_the_main_node_s(bench: LocalBench) -> None:
     contracts = [node.contract for node in bench.engine.plan(bench.gang(nodes=4, main=2)).nodes]
     addresses = [contract.address for contract in contracts]
     assert len(set(addresses)) == 4
@@ -78,14 +68,14 @@ def test_every_node_has_a_loopback_address_of_its_own_and_all_know_the_main_node
             probe.bind((address, 0))
 
 
-def test_two_gangs_have_different_addresses(bench: Bench) -> None:
+def test_two_gangs_have_different_addresses(bench: LocalBench) -> None:
     first, second = (
         {node.contract.address for node in bench.engine.plan(bench.gang(attempt=attempt)).nodes} for attempt in (1, 2)
     )
     assert not first & second
 
 
-def test_the_addresses_of_the_largest_gang_are_addresses(bench: Bench) -> None:
+def test_the_addresses_of_the_largest_gang_are_addresses(bench: LocalBench) -> None:
     nodes = bench.engine.plan(bench.gang(nodes=1000)).nodes  # as many as the Batch API allows
     assert len({node.contract.address for node in nodes}) == 1000
     for node in nodes:
@@ -97,7 +87,9 @@ def test_the_addresses_of_the_largest_gang_are_addresses(bench: Bench) -> None:
 PRINT_ENVIRONMENT = "import json, os; print(json.dumps(dict(os.environ)))"
 
 
-def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_get_the_contract_their_environment_and_their_gpus(
+    bench: LocalBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own = (
         *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD"),
         *("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"),  # of the other engines
@@ -120,15 +112,15 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, m
         job_epoch=5,
         queue="gpu",
     )
-    bench.wait_for_end(bench.launch(gang))
+    bench.ended(bench.launch(gang))
     plan = bench.engine.plan(gang)
-    for index, found in enumerate(bench.environments(2)):
+    for index, found in enumerate(bench.environments(gang)):
         expected = plan.nodes[index].contract.to_env()
         del expected["MASTER_PORT"]
         assert {name: found.get(name) for name in expected} == expected
         assert not found.keys() & set(own)
         assert "WARP_CACHE_PATH" in found
-    first, second = bench.environments(2)
+    first, second = bench.environments(gang)
     assert (first["MINE"], second["MINE"]) == ("first", "second")
     assert (first["INHERITED"], second["INHERITED"]) == ("yes", "no")
     assert (first["AWS_ACCESS_KEY_ID"], second.get("AWS_ACCESS_KEY_ID")) == ("the job's", None)
@@ -140,56 +132,58 @@ def test_nodes_get_the_contract_their_environment_and_their_gpus(bench: Bench, m
     assert (first.get(main), second.get(main)) == (first["MASTER_ADDR"], None)
 
 
-def test_a_gang_that_can_not_be_started_whole_is_not_started_at_all(bench: Bench) -> None:
+def test_a_gang_that_can_not_be_started_whole_is_not_started_at_all(bench: LocalBench) -> None:
     with pytest.raises(ValueError, match="null"):
         bench.launch(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "a zero byte: \0"]]))
     assert bench.processes() == []
 
 
-def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: Bench) -> None:
+def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: LocalBench) -> None:
     gang = bench.gang("echo $RANK of $WORLD_SIZE", environments=[{"MUSTER_RANKS_PER_NODE": "2"}] * 2)
-    bench.wait_for_end(bench.launch(gang))
-    assert sorted(bench.lines()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
+    bench.ended(bench.launch(gang))
+    assert sorted(bench.printed()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
 
 
-def test_commands_run_in_the_job_s_directory_which_can_not_hide_our_own_packages(bench: Bench, tmp_path: Path) -> None:
+def test_commands_run_in_the_job_s_directory_which_can_not_hide_our_own_packages(
+    bench: LocalBench, tmp_path: Path
+) -> None:
     directory = tmp_path / "mine"
     (directory / "worker").mkdir(parents=True)
     (directory / "worker" / "__init__.py").write_text("raise SystemExit('the wrong worker')")
-    bench.wait_for_end(bench.launch(bench.gang("pwd", nodes=1, directory=str(directory))))
-    assert bench.lines() == [(0, str(directory))]
+    bench.ended(bench.launch(bench.gang("pwd", nodes=1, directory=str(directory))))
+    assert bench.printed() == [(0, str(directory))]
 
 
-def test_a_job_s_own_modules_do_not_hide_those_of_its_supervisor(bench: Bench, tmp_path: Path) -> None:
+def test_a_job_s_own_modules_do_not_hide_those_of_its_supervisor(bench: LocalBench, tmp_path: Path) -> None:
     (tmp_path / "queue.py").write_text("MINE = True")
     script = "python -c 'import queue; print(queue.MINE)'"
-    bench.wait_for_end(bench.launch(bench.gang(script, nodes=1, environments=[{"PYTHONPATH": str(tmp_path)}])))
-    assert bench.lines() == [(0, "True")]
+    bench.ended(bench.launch(bench.gang(script, nodes=1, environments=[{"PYTHONPATH": str(tmp_path)}])))
+    assert bench.printed() == [(0, "True")]
 
 
-def test_a_directory_that_is_not_there_is_refused_before_anything_starts(bench: Bench) -> None:
+def test_a_directory_that_is_not_there_is_refused_before_anything_starts(bench: LocalBench) -> None:
     with pytest.raises(EngineError, match=r"^working directory /no/such/place is not on this machine$"):
         bench.launch(bench.gang(directory="/no/such/place"))
     assert bench.processes() == []
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", ""])
-def test_a_port_that_is_in_use_at_any_address_is_not_given_to_the_gang(bench: Bench, address: str) -> None:
+def test_a_port_that_is_in_use_at_any_address_is_not_given_to_the_gang(bench: LocalBench, address: str) -> None:
     gang = bench.gang("echo $MASTER_PORT")
     first = bench.engine.plan(gang).nodes[0].contract.master_port
     with socket.socket() as taken:  # a program that calls init_process_group listens at all addresses
         taken.bind((address, first))
         taken.listen()
-        bench.wait_for_end(bench.launch(gang))
-    assert sorted(bench.lines()) == [(0, f"{first + 1}"), (1, f"{first + 1}")]
+        bench.ended(bench.launch(gang))
+    assert sorted(bench.printed()) == [(0, f"{first + 1}"), (1, f"{first + 1}")]
 
 
-def test_two_gangs_that_start_at_once_do_not_get_one_port(bench: Bench) -> None:
-    gangs = [bench.gang("echo $MASTER_PORT", job=f"job-{index}") for index in range(2)]
+def test_two_gangs_that_start_at_once_do_not_get_one_port(bench: LocalBench) -> None:
+    gangs = [bench.gang("echo $MASTER_PORT", suffix=f"-{index}") for index in range(2)]
     assert len({bench.engine.plan(gang).nodes[0].contract.master_port for gang in gangs}) == 2
 
 
-def test_the_main_node_is_started_first(bench: Bench) -> None:
+def test_the_main_node_is_started_first(bench: LocalBench) -> None:
     handle = bench.launch(bench.gang(nodes=3, main=2))
     starts = [int(node["start"]) for node in json.loads(handle)["nodes"]]
     first, second, main = pids(handle)
@@ -199,20 +193,18 @@ def test_the_main_node_is_started_first(bench: Bench) -> None:
 # -- launching and observing ------------------------------------------------------------------------------------------
 
 
-def test_launching_again_finds_what_runs_and_starts_nothing(bench: Bench) -> None:
+def test_launching_again_finds_what_runs_and_starts_nothing(bench: LocalBench) -> None:
     gang = bench.gang(nodes=3)
-    handle = bench.launch(gang)
-    bench.ready(3)
+    handle = bench.ready(gang)
     before = sorted(bench.processes())
     assert bench.launch(gang) == handle
-    assert bench.launch(gang, LocalEngine(bench.home / "home")) == handle, "nor does the controller that comes after"
+    assert bench.launch(gang, bench.new_engine()) == handle, "nor does the controller that comes after"
     assert sorted(bench.processes()) == before
 
 
-def test_launching_again_starts_only_the_node_that_is_missing(bench: Bench) -> None:
+def test_launching_again_starts_only_the_node_that_is_missing(bench: LocalBench) -> None:
     gang = bench.gang(nodes=2)
-    handle = bench.launch(gang)
-    bench.ready(2)
+    handle = bench.ready(gang)
     os.kill(pids(handle)[1], signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
     again = bench.launch(gang)
@@ -221,7 +213,7 @@ def test_launching_again_starts_only_the_node_that_is_missing(bench: Bench) -> N
     assert [node.running for node in bench.engine.observe(again)] == [True, True]
 
 
-def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: Bench) -> None:
+def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: LocalBench) -> None:
     listen = (
         "import os, socket, time; s = socket.socket(); s.bind((os.environ['MASTER_ADDR'], int(os.environ['MASTER_PORT'])))"
         " if os.environ['RANK'] == '0' else None; s.listen() if os.environ['RANK'] == '0' else None;"
@@ -229,53 +221,48 @@ def test_a_node_that_is_started_later_gets_the_port_of_those_that_run(bench: Ben
     )
     gang = bench.gang(commands=[["python", "-c", listen]] * 2)
     handle = bench.launch(gang)
-    wait_for(lambda: len(bench.lines()) == 2, 10, "two nodes")
+    wait_for(lambda: len(bench.printed()) == 2, 10, "two nodes")
     os.kill(pids(handle)[1], signal.SIGKILL)
     wait_for(lambda: not bench.engine.observe(handle)[1].running, 5, "the end of node 1")
     bench.launch(gang)
-    wait_for(lambda: len(bench.lines()) == 3, 10, "node 1 again")
-    assert len({text for _, text in bench.lines()}) == 1
+    wait_for(lambda: len(bench.printed()) == 3, 10, "node 1 again")
+    assert len({text for _, text in bench.printed()}) == 1
 
 
-def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: Bench) -> None:
+def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: LocalBench) -> None:
     gang = bench.gang(nodes=4, commands=[["sh", "-c", each] for each in ("exit 0", "exit 75", "exit 3", "kill -9 $$")])
-    status = bench.wait_for_end(bench.launch(gang))
+    status = bench.ended(bench.launch(gang))
     assert [node.exit_code for node in status] == [0, 75, 3, 137]
     contracts = [node.contract for node in bench.engine.plan(gang).nodes]
     assert [node.address for node in status] == [contract.address for contract in contracts]
 
 
-def test_a_supervisor_killed_by_a_signal_ends_with_128_and_its_number(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(nodes=1))
-    bench.ready(1)
+def test_a_supervisor_killed_by_a_signal_ends_with_128_and_its_number(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang(nodes=1))
     os.kill(pids(handle)[0], signal.SIGKILL)
-    assert bench.wait_for_end(handle)[0].exit_code == 137
+    assert bench.ended(handle)[0].exit_code == 137
 
 
-def test_a_new_engine_observes_from_the_handle_alone(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "echo ready; exit 4"]]))
-    bench.ready(2)
-    other = LocalEngine(bench.home / "home")
+def test_a_new_engine_observes_from_the_handle_alone(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang(commands=[["sh", "-c", WAIT], ["sh", "-c", "echo ready; exit 4"]]))
+    other = bench.new_engine()
     wait_for(lambda: not other.observe(handle)[1].running, 10, "the end of node 1")
     first, second = other.observe(handle)
     assert (first.running, first.exit_code) == (True, None)
     assert (second.running, second.exit_code) == (False, None), "nobody that it knows saw the end"
-    outcome = read_outcome(bench.store.run("run"), JOB, 1, 1)
-    assert outcome
-    assert outcome.exit_code == 4, "but the store knows"
+    assert bench.outcome(1).exit_code == 4, "but the store knows"
 
 
-def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(nodes=1))
-    bench.ready(1)
+def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang(nodes=1))
     state = json.loads(handle)
     state["nodes"][0]["start"] = "1"
-    assert not LocalEngine(bench.home / "home").observe(json.dumps(state))[0].running
+    assert not bench.new_engine().observe(json.dumps(state))[0].running
 
 
-def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: Bench) -> None:
-    raise_epoch(bench.store.run("run"), 5)
-    status = bench.wait_for_end(bench.launch(bench.gang(nodes=1, epoch=4)))
+def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: LocalBench) -> None:
+    raise_epoch(bench.run, 5)
+    status = bench.ended(bench.launch(bench.gang(nodes=1, epoch=4)))
     assert (status[0].exit_code, status[0].detail) == (
         3,
         "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving",
@@ -285,25 +272,20 @@ def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: Bench
 # -- stopping ---------------------------------------------------------------------------------------------------------
 
 
-def test_stopping_asks_first(bench: Bench) -> None:
-    leaves = 'trap "echo leaving; exit 75" TERM; echo ready; while :; do sleep 0.05; done'
-    handle = bench.launch(bench.gang(leaves))
-    bench.ready(2)
-    bench.engine.stop(handle, 10.0)
-    assert [node.exit_code for node in bench.engine.observe(handle)] == [75, 75]
-    assert [text for _, text in bench.lines()].count("leaving") == 2
-    assert bench.processes() == []
+def test_stopping_asks_first(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang(POLITE))
+    assert bench.stopped(handle, 10.0) == [75, 75]
+    assert bench.log().count("saved") == 2
 
 
-def make_new_engine(bench: Bench) -> LocalEngine:
-    return LocalEngine(bench.home / "home")
-
-
-@pytest.mark.parametrize("stopper", [lambda bench: bench.engine, make_new_engine], ids=["same engine", "new engine"])
-def test_stopping_leaves_no_process_whatever_they_do(bench: Bench, stopper: Callable[[Bench], LocalEngine]) -> None:
-    stubborn = f'setsid sh -c "trap \\"\\" TERM; sleep 600" & (setsid sleep 600 &); {STAY}'
-    handle = bench.launch(bench.gang(stubborn))
-    bench.ready(2)
+@pytest.mark.parametrize(
+    "stopper", [lambda bench: bench.engine, LocalBench.new_engine], ids=["same engine", "new engine"]
+)
+def test_stopping_leaves_no_process_whatever_they_do(
+    bench: LocalBench, stopper: Callable[[LocalBench], LocalEngine]
+) -> None:
+    stubborn = f'setsid sh -c "trap \\"\\" TERM; sleep 600" & (setsid sleep 600 &); {STUBBORN}'
+    handle = bench.ready(bench.gang(stubborn))
     assert len(bench.processes()) >= 8
     asked = time.monotonic()
     stopper(bench).stop(handle, 0.5)
@@ -311,35 +293,32 @@ def test_stopping_leaves_no_process_whatever_they_do(bench: Bench, stopper: Call
     assert time.monotonic() - asked < 5
 
 
-def test_stopping_ends_what_a_dead_supervisor_left_behind(bench: Bench) -> None:
-    handle = bench.launch(bench.gang(f"setsid sleep 600 & {WAIT}", nodes=1))
-    bench.ready(1)
+def test_stopping_ends_what_a_dead_supervisor_left_behind(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang(f"setsid sleep 600 & {WAIT}", nodes=1))
     os.kill(pids(handle)[0], signal.SIGKILL)
-    bench.wait_for_end(handle)
-    assert [pid for pid in bench.processes() if "sleep 600" in command_line(pid)], "there is something to end"
+    bench.ended(handle)
+    assert [pid for pid in bench.processes() if "600" in command(pid)], "there is something to end"
     bench.engine.stop(handle, 5.0)
     assert bench.processes() == []
 
 
-def test_stopping_ends_what_took_the_gang_s_name_out_of_its_environment(bench: Bench) -> None:
+def test_stopping_ends_what_took_the_gang_s_name_out_of_its_environment(bench: LocalBench) -> None:
     escape = "env -i setsid sh -c 'echo escaped $$; exec sleep 600' & (env -i setsid sh -c 'echo escaped $$; exec sleep 600' &) ; "
-    handle = bench.launch(bench.gang(f"{escape}{STAY}", nodes=1))
-    bench.ready(1)
+    handle = bench.ready(bench.gang(f"{escape}{STUBBORN}", nodes=1))
     wait_for(lambda: len(escaped(bench)) == 2, 10, "two processes that escaped")
     bench.engine.stop(handle, 0.5)
     assert bench.processes() == [] and not any(alive(pid) for pid in escaped(bench))
 
 
-def escaped(bench: Bench) -> list[int]:
-    return [int(text.split()[1]) for _, text in bench.lines() if text.startswith("escaped ")]
+def escaped(bench: LocalBench) -> list[int]:
+    return [int(text.split()[1]) for _, text in bench.printed() if text.startswith("escaped ")]
 
 
 def test_a_gang_with_a_process_that_can_not_be_killed_is_not_stopped_until_it_is_gone(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: LocalBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared_store.nodes.end_all", lambda find, strike: end_all(find, 0.5, strike))
-    handle = bench.launch(bench.gang(f"env -i setsid sh -c 'echo escaped $$; exec sleep 600' & {WAIT}", nodes=1))
-    bench.ready(1)
+    handle = bench.ready(bench.gang(f"env -i setsid sh -c 'echo escaped $$; exec sleep 600' & {WAIT}", nodes=1))
     wait_for(lambda: escaped(bench), 10, "the process")
     [stubborn] = escaped(bench)
     wait_for(lambda: (process := find_process(stubborn)) and process.name == "sleep", 10, "it sleeps")
@@ -351,15 +330,15 @@ def test_a_gang_with_a_process_that_can_not_be_killed_is_not_stopped_until_it_is
     assert not alive(stubborn) and bench.processes() == []
 
 
-def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: Bench) -> None:
-    raise_epoch(bench.store.run("run"), 5)
+def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: LocalBench) -> None:
+    raise_epoch(bench.run, 5)
     gangs = [
         bench.gang(nodes=2),
-        bench.gang(nodes=1, epoch=5, job="another"),
-        bench.gang(nodes=1, epoch=4, job="fenced"),
+        bench.gang(nodes=1, epoch=5, suffix="-another"),
+        bench.gang(nodes=1, epoch=4, suffix="-fenced"),
     ]
     handles = [bench.launch(gang) for gang in gangs]
-    bench.wait_for_end(handles[2])
+    bench.ended(handles[2])
     for handle in handles:
         bench.engine.stop(handle, 5.0)
     assert bench.engine.observe(handles[2])[0].detail.startswith("muster supervisor: run run: this attempt has epoch 4")
@@ -367,21 +346,19 @@ def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: Bench) -> None:
     assert not bench.engine._children
 
 
-def test_stopping_one_gang_leaves_the_others_alone(bench: Bench) -> None:
-    handle = bench.launch(bench.gang())
+def test_stopping_one_gang_leaves_the_others_alone(bench: LocalBench) -> None:
+    handle = bench.ready(bench.gang())
     # a name that the first one's begins with: job/1/1 and job/1/12
-    other = bench.launch(bench.gang(epoch=12, attempt=1, run="another"))
-    bench.ready()
-    bench.ready(run="another")
+    other = bench.ready(bench.gang(epoch=12, run="another"))
     bench.engine.stop(handle, 5.0)
     assert [node.running for node in bench.engine.observe(handle)] == [False, False]
     assert [node.running for node in bench.engine.observe(other)] == [True, True]
     bench.engine.stop(other, 5.0)
 
 
-def test_stopping_twice_and_stopping_what_has_ended_is_nothing(bench: Bench) -> None:
+def test_stopping_twice_and_stopping_what_has_ended_is_nothing(bench: LocalBench) -> None:
     handle = bench.launch(bench.gang("exit 0"))
-    bench.wait_for_end(handle)
+    bench.ended(handle)
     bench.engine.stop(handle, 5.0)
     bench.engine.stop(handle, 5.0)
     assert [node.exit_code for node in bench.engine.observe(handle)] == [0, 0]

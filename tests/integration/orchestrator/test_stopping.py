@@ -11,7 +11,8 @@ import pytest
 
 from orchestrator.client import Client
 from orchestrator.server import Server
-from tests.conftest import processes_of, submit_gang, wait_for
+from tests.conftest import submit_gang, wait_for
+from tests.support.processes import processes_of
 
 STUBBORN = (
     "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(600)"

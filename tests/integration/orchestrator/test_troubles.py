@@ -28,19 +28,17 @@ from orchestrator.errors import ApiError, ServerError
 from orchestrator.home import HomeLock
 from orchestrator.server import Server
 from orchestrator.tables import Job
-from tests.conftest import processes_of, submit_gang, wait_for
+from tests.conftest import submit_gang, wait_for
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail
 from tests.support.orchestrator.rows import job
-
-FOREVER = "import time; time.sleep(600)"
+from tests.support.processes import end_all, processes_of, processes_of_job
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Path]:
     """A home directory; whatever still runs for it at the end is killed."""
     yield tmp_path
-    for pid in processes_of(tmp_path):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    end_all(tmp_path)
 
 
 @contextlib.contextmanager
@@ -52,20 +50,6 @@ def serving(home: Path) -> Iterator[Client]:
             yield client
     finally:
         server.close()
-
-
-def detail(client: Client, job_id: str) -> dict[str, Any]:
-    found: dict[str, Any] = client.get(f"/api/jobs/{job_id}")
-    return found
-
-
-def await_status(client: Client, job_id: str, *wanted: str) -> dict[str, Any]:
-    def there() -> dict[str, Any] | None:
-        found = detail(client, job_id)
-        return found if found["status"] in wanted else None
-
-    found: dict[str, Any] = wait_for(there, 30, f"job {job_id} {wanted}")
-    return found
 
 
 def change(home: Path, statement: str, *values: str) -> list[Any]:
@@ -254,18 +238,11 @@ def test_gangs_of_a_database_that_was_deleted_are_named_at_the_next_start_with_h
         await_status(client, other, "RUNNING")
     for pid in line.partition("end it with: kill ")[2].split():
         os.kill(int(pid), signal.SIGTERM)
-    wait_for(lambda: not [pid for pid in processes_of(home) if known in environment(pid)], 30, "its end")
+    wait_for(lambda: not processes_of_job(known), 30, "its end")
     with serving(home) as client:
         client.batch("TerminateJob", jobId=other, reason="enough")
         await_status(client, other, "FAILED")
     assert sum("has no such job" in record.getMessage() for record in caplog.records) == 1
-
-
-def environment(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/environ").read_text()
-    except OSError:
-        return ""
 
 
 def test_what_was_committed_into_a_deleted_file_is_not_acknowledged(tmp_path: Path) -> None:

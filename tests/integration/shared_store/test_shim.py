@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -17,7 +16,8 @@ from shared_store.cgroups import own_group, remove_abandoned_groups, remove_grou
 from shared_store.nodes import NodeProcesses, end_nodes
 from shared_store.processes import end_all, find_process, marked
 from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
-from tests.conftest import PATIENCE, alive, frozen, wait_for
+from tests.conftest import PATIENCE, wait_for
+from tests.support.processes import alive, await_end, frozen, processes_running, signal_all
 
 ESCAPE = (
     "env -i setsid sh -c 'echo $$ >>{pids}; exec sleep 600' & "
@@ -46,9 +46,7 @@ def pids(tmp_path: Path) -> Iterator[Path]:
     """A file that a node writes pids into; they are ended after a test that failed."""
     path = tmp_path / "pids"
     yield path
-    for pid in read(path):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    signal_all(read(path), signal.SIGKILL)
 
 
 def read(path: Path) -> list[int]:
@@ -96,7 +94,7 @@ def test_the_node_ends_when_what_its_shim_is_tied_to_dies(group: str, pids: Path
         shim = int(process.stdout.readline())
         wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
         process.kill()
-    wait_for(lambda: not alive(shim), 20, "the shim's end")
+    await_end(shim)
     assert not any(alive(pid) for pid in read(pids))
 
 
@@ -202,15 +200,7 @@ def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pi
         f"for i in 1 2 3 4; do {sys.executable} -I -S {tmp_path}/chain.py & done; sleep 0.5; kill -9 $$", group
     )
     assert shim.wait(60 * PATIENCE) == 137
-    left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if _holds(path, str(tmp_path).encode())]
-    assert not left
-
-
-def _holds(path: Path, text: bytes) -> bool:
-    try:
-        return text in path.read_bytes() and path.parent.name != str(os.getpid())
-    except OSError:
-        return False
+    assert not processes_running(str(tmp_path))
 
 
 @pytest.mark.parametrize("marks", [[], ["MUSTER_GANG="], ["MUSTER_GANG"], ["MUSTER_GANG=job/1/1", ""]])

@@ -15,8 +15,9 @@ import pytest
 from shared_store.contract import sealed
 from shared_store.epoch import raise_epoch
 from shared_store.outcomes import LONGEST_TEXT
-from tests.conftest import PATIENCE, alive, wait_for
-from tests.support.worker.node import Nodes, gone
+from tests.conftest import PATIENCE, wait_for
+from tests.support.processes import alive, await_end
+from tests.support.worker.node import Nodes
 
 # -- ends -------------------------------------------------------------------------------------------------------------
 
@@ -332,7 +333,7 @@ def test_ranks_die_when_their_supervisor_is_killed(node: Nodes) -> None:
     pids = [int(text) for text in n.output()]
     n.process.kill()
     n.process.wait()
-    gone(*pids)
+    await_end(*pids)
     assert n.outcome is None
 
 
@@ -344,7 +345,7 @@ def test_a_newer_epoch_ends_everything_at_once_and_nothing_is_written(node: Node
     before = n.lines()
     raise_epoch(n.run, 2)
     assert n.wait(5 * PATIENCE) == 3
-    gone(*pids)
+    await_end(*pids)
     assert n.lines() == before
     assert n.outcome is None
     assert n.stderr.read_text() == (

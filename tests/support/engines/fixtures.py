@@ -14,6 +14,8 @@ from tests.support.engines.images import PLAIN, SUPERVISED
 from tests.support.engines.sites import SITES, Site
 from tests.support.engines.slurm_cluster import SlurmCluster, started
 
+pytest.register_assert_rewrite("tests.support.engines.every_engine")
+
 
 @pytest.fixture(scope="session")
 def docker_client() -> Iterator[Any]:

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, Serving
 
 PLAIN, SUPERVISED = "muster-test-plain:1", "muster-test:1"
 """An empty image, and one that says that Muster is in it."""
@@ -33,3 +33,15 @@ def host_files() -> dict[str, Any]:
             {"sourceVolume": f"v{number}", "containerPath": path, "readOnly": True} for number, path in enumerate(paths)
         ],
     }
+
+
+def plain(served: Serving, image: str, script: str, queue: str = "default", **container: Any) -> str:
+    """A gang of one in ``image``; returns the job id."""
+    needs = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
+    container = {"image": image, "command": ["sh", "-c", script], "resourceRequirements": needs, **container}
+    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
+    arn = served.client.batch(
+        "RegisterJobDefinition", jobDefinitionName="plain", type="multinode", nodeProperties=properties
+    )["jobDefinitionArn"]
+    job: str = served.client.batch("SubmitJob", jobName="plain", jobQueue=queue, jobDefinition=arn)["jobId"]
+    return job

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from tests.conftest import wait_for
+from tests.support.processes import command, find_processes, session_of, signal_all
 from tests.support.worker.ranks import free_port
 
 RAY = str(Path(sys.executable).parent / "ray")
@@ -82,23 +83,15 @@ class RayCluster:
     def kill(self, name: str) -> None:
         """SIGKILL to all that the node is, at once, as when its machine loses its power."""
         node = self.nodes.pop(name)
-        for pid in self.pids(node.pid):
-            os.kill(pid, signal.SIGKILL)
+        signal_all(self.pids(node.pid), signal.SIGKILL)
         node.wait()
 
     def raylet(self, name: str) -> int:
-        [pid] = [pid for pid in self.pids(self.nodes[name].pid) if b"raylet/raylet" in _command(pid)]
+        [pid] = [pid for pid in self.pids(self.nodes[name].pid) if "raylet/raylet" in command(pid)[0]]
         return pid
 
     def pids(self, session: int) -> list[int]:
-        found = []
-        for entry in os.listdir("/proc"):
-            try:
-                if entry.isdigit() and os.getsid(int(entry)) == session:
-                    found.append(int(entry))
-            except ProcessLookupError:
-                continue
-        return found
+        return find_processes(lambda pid: session_of(pid) == session)
 
     def close(self) -> None:
         for name in sorted(self.nodes, key=lambda name: name == "head"):
@@ -120,10 +113,3 @@ class RayCluster:
 
     def _log(self, name: str) -> Path:
         return self.home / f"{name}.log"
-
-
-def _command(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]
-    except OSError:
-        return b""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Serving, alive, parent, wait_for
+from tests.conftest import Serving, wait_for
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 
 WAIT = "echo ready; exec sleep 600"
@@ -67,42 +65,6 @@ class Site:
 
     def ready(self, job: str, attempt: int, nodes: int) -> None:
         wait_for(lambda: self.printed(job, attempt).count("ready") == nodes, 60, f"attempt {attempt} of {nodes} nodes")
-
-
-def processes(job: str, **variables: str) -> dict[int, list[bytes]]:
-    """Commands by pid of all that carries the job's id, and these variables, on this machine: in containers, too."""
-    wanted = {f"{name}={value}".encode() for name, value in {"MUSTER_JOB_ID": job, **variables}.items()}
-    found = {}
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        with contextlib.suppress(OSError):
-            there = set((entry / "environ").read_bytes().split(b"\0"))
-            if wanted <= there and alive(int(entry.name)):
-                found[int(entry.name)] = (entry / "cmdline").read_bytes().split(b"\0")
-    return found
-
-
-def kill_rank(job: str, rank: int) -> None:
-    """SIGKILL to one rank."""
-    for pid in processes(job, RANK=str(rank)):
-        os.kill(pid, signal.SIGKILL)
-
-
-def kill_supervisor(job: str, node: int) -> None:
-    """SIGKILL to the supervisor of one node: what started its rank, which has what is not of the job for a parent."""
-    ranks = processes(job, RANK=str(node))
-    for pid in ranks:
-        with contextlib.suppress(OSError):
-            if (supervisor := parent(pid)) not in ranks:
-                os.kill(supervisor, signal.SIGKILL)
-
-
-def freeze(job: str, node: int) -> None:
-    """SIGSTOP to the supervisor of one node and all of its rank, as when its machine stands still."""
-    ranks = processes(job, RANK=str(node))
-    for pid in {*map(parent, ranks), *ranks}:
-        os.kill(pid, signal.SIGSTOP)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import PATIENCE, alive, wait_for
+from tests.conftest import PATIENCE, wait_for
+from tests.support.processes import command, environment, processes_running, signal_all
 
 NODES = ("n1", "n2", "n3")
 CPUS, MEMORY, GPUS = 4, 8192, 2
@@ -163,11 +164,7 @@ class SlurmCluster:
             except subprocess.TimeoutExpired:
                 daemon.kill()
                 daemon.wait()
-        for pid in self.processes():
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                pass
+        signal_all(self.processes(), signal.SIGKILL)
 
     # -- looking ------------------------------------------------------------------------------------------------------
 
@@ -180,22 +177,14 @@ class SlurmCluster:
         assert done.returncode == 0 or not check, f"{command}: {done.stderr}"
         return done.stdout.strip()
 
-    def processes(self, what: bytes = b"") -> list[int]:
-        """Pids of all that belongs to this cluster: daemons, steps, and what runs in them; with ``what`` in their command."""
-        found = []
-        mark = f"SLURM_CONF={self.conf}".encode()
-        for entry in Path("/proc").iterdir():
-            if not entry.name.isdigit() or int(entry.name) == os.getpid():
-                continue
-            try:
-                command = (entry / "cmdline").read_bytes()
-                # slurmstepd has its node's name or its job's in its command, and no environment
-                mine = mark in (entry / "environ").read_bytes() or str(self.home).encode() in command
-            except OSError:
-                continue
-            if mine and what in command and alive(int(entry.name)):
-                found.append(int(entry.name))
-        return found
+    def processes(self, text: str = "") -> list[int]:
+        """Pids of all that belongs to this cluster: daemons, steps, and what runs in them; with ``text`` in their command."""
+
+        def is_mine(pid: int) -> bool:
+            # slurmstepd has its node's name or its job's in its command, and no environment
+            return environment(pid).get("SLURM_CONF") == str(self.conf) or str(self.home) in "\0".join(command(pid))
+
+        return [pid for pid in processes_running(text) if is_mine(pid)]
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from shared_store.files import read_json
 from shared_store.layout import Run
 from shared_store.metrics import read_metrics
 from tests.support.faults.home import Home
-from tests.support.faults.processes import processes_below
+from tests.support.processes import gang_members
 
 _TIMING = ("time", "_seconds", "_per_second", "slowest_rank", "slowest_excess")
 """How the names of fields end that no two runs share."""
@@ -92,7 +92,7 @@ def _check_accounts(home: Home, run: Run, controller_kills: int, verdict: Verdic
 
 
 def _check_processes(home: Home, verdict: Verdict) -> None:
-    if left := processes_below(home.path):
+    if left := gang_members(home.path):
         verdict.violations.append(f"processes left: {', '.join(map(str, left))}")
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from tests.support.faults.checks import Reference, Verdict, judge
 from tests.support.faults.home import Broken, Home, open_commit, reached
-from tests.support.faults.processes import Process, end_all, processes_below
 from tests.support.faults.schedule import Blow, Plan
+from tests.support.processes import Process, end_all, gang_members
 
 HANG_SECONDS = 240.0
 """How long nothing at all may change."""
@@ -199,7 +199,7 @@ class Fire:
 
     def _targets(self, blow: Blow) -> list[Process]:
         """Processes to choose from, without those that are dying of an earlier blow."""
-        found = processes_below(self.home.path)
+        found = gang_members(self.home.path)
         return [process for process in found if process.role == blow.target and process not in self._killed]
 
     def _await_commit(self, delay: float, targets: Callable[[], Any]) -> bool:
@@ -257,7 +257,7 @@ class Fire:
     def _thaw(self, now: float) -> None:
         for each in list(self._frozen):
             process, since, until, trained = each
-            if process not in processes_below(self.home.path):
+            if process not in gang_members(self.home.path):
                 self._frozen.remove(each)
             elif now >= until:
                 process.strike(signal.SIGCONT)
@@ -276,7 +276,7 @@ class Fire:
             for attempt in job["attempts"]
             if attempt["stopped_at"]
         }
-        if zombies := [process for process in processes_below(self.home.path) if process.gang in closed]:
+        if zombies := [process for process in gang_members(self.home.path) if process.gang in closed]:
             self.found.append(f"outlive their attempt: {', '.join(map(str, zombies))}")
             end_all(self.home.path)
         job = jobs[-1]
@@ -285,7 +285,7 @@ class Fire:
         if state != self._state:
             self._state, self._changed = state, now
         elif now - self._changed > HANG_SECONDS:
-            left = ", ".join(map(str, processes_below(self.home.path)))
+            left = ", ".join(map(str, gang_members(self.home.path)))
             raise Broken(f"nothing has changed for {HANG_SECONDS:g} s: {state}; processes: {left}")
         if job["status"] == "SUCCEEDED":
             self._over = True

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import shutil
 import sqlite3
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +17,7 @@ from orchestrator.client import Client
 from orchestrator.errors import ApiError
 from tests.conftest import submit_gang, wait_for
 from tests.support.faults.home import Home
-from tests.support.faults.processes import end_all
+from tests.support.processes import end_all, processes_of_job
 
 VOLUME = 48 << 20
 MOST_LOG = 1 << 20
@@ -42,6 +40,19 @@ def small_volume(directory: Path, size: int = VOLUME) -> Iterator[Path]:
         subprocess.run(["umount", "-l", directory], check=True)
 
 
+def fill(volume: Path) -> Path:
+    """Take all the space that is left."""
+    filler = volume / "filler"
+    with open(filler, "wb", buffering=0) as file:
+        for size in (1 << 20, 1 << 12, 1):
+            try:
+                while True:
+                    file.write(b"\0" * size)
+            except OSError:
+                continue
+    return filler
+
+
 def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]]:
     """Fill the volume, ask for everything, make room: a job can always be stopped, and what was taken on ends."""
     rng = random.Random(seed)
@@ -50,7 +61,6 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
         home = Home(volume / "home", "--min-free", "2MiB")
         try:
             home.serve()
-            ballast = volume / "ballast"
             with Client(home.url) as client:
                 steady = submit_gang(client, STEADY, name="steady")
                 wait_for(lambda: _status(client, steady) == "RUNNING", 60, "the steady job runs")
@@ -59,7 +69,7 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
                     taken.append(submit_gang(client, FLOOD, name="flood"))
                     done["floods"] += 1
                     wait_for(lambda: _status(client, taken[-1]) not in ("SUBMITTED", "RUNNABLE"), 60, "the flood")
-                _fill(ballast)
+                filler = fill(volume)
                 done["disks filled"] += 1
                 taken += _submit(client, rng.randrange(1, 5), done)
             if rng.random() < 0.4:
@@ -70,9 +80,9 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
             if home.up:
                 with Client(home.url) as client:
                     client.batch("TerminateJob", jobId=steady, reason="the disk is full")
-                    wait_for(lambda: not _processes(home, steady), 60, "the steady job has ended")
+                    wait_for(lambda: not processes_of_job(steady), 60, "the steady job has ended")
                     done["jobs stopped"] += 1
-            ballast.unlink()
+            filler.unlink()
             home.serve()
             with Client(home.url) as client:
                 if _status(client, steady) not in ("SUCCEEDED", "FAILED"):
@@ -96,17 +106,6 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
     return done, wrong
 
 
-def _fill(ballast: Path) -> None:
-    """Take every byte that is left; what others take in between, too."""
-    with contextlib.suppress(OSError), open(ballast, "ab", buffering=0) as file:
-        end = time.monotonic() + 20
-        while time.monotonic() < end:
-            file.write(bytes(1 << 16))
-    with contextlib.suppress(OSError), open(ballast, "ab", buffering=0) as file:
-        for _ in range(1 << 12):
-            file.write(bytes(256))
-
-
 def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
     """Jobs that were taken on though there is no room; a refusal has a reason and is no fault of the server."""
     taken = []
@@ -122,12 +121,3 @@ def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
 
 def _status(client: Client, job: str) -> str:
     return str(client.get(f"/api/jobs/{job}")["status"])
-
-
-def _processes(home: Home, job: str) -> list[str]:
-    found = []
-    for entry in os.listdir("/proc"):
-        with contextlib.suppress(OSError):
-            if entry.isdigit() and f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{entry}/environ").read_bytes():
-                found.append(entry)
-    return found

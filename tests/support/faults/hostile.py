@@ -7,7 +7,6 @@ neighbour must not have noticed. Whatever a job starts ends by itself after a mi
 
 from __future__ import annotations
 
-import os
 import random
 import re
 import signal
@@ -19,6 +18,7 @@ from typing import Any
 
 from shared_store.cgroups import own_group
 from tests.conftest import Serving, submit_gang, wait_for
+from tests.support.processes import processes_running, signal_all
 
 _NATIVE = {"MUSTER_ON_CHILD_FAILURE": "fail"}
 _PRELUDE = """
@@ -175,8 +175,7 @@ def hostile_round(home: Path, seed: int, *, slow: bool = True) -> tuple[Counter[
     finally:
         serving.close()
         for token in tokens.values():
-            for pid in _left(token):
-                os.kill(pid, signal.SIGKILL)
+            signal_all(_left(token), signal.SIGKILL)
     return Counter(cases), violations
 
 
@@ -194,11 +193,4 @@ def _judge(name: str, detail: dict[str, Any], token: str) -> list[str]:
 
 def _left(token: str) -> list[int]:
     """Pids of the processes with the token in their command line."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            if f"\0000.{token}".encode() in (entry / "cmdline").read_bytes():
-                found.append(int(entry.name))
-        except OSError:
-            continue
-    return found
+    return processes_running(f"\0000.{token}")

@@ -13,7 +13,7 @@ from orchestrator.client import Client
 from orchestrator.errors import ApiError
 from tests.conftest import wait_for
 from tests.support.faults.home import Home
-from tests.support.faults.processes import end_all
+from tests.support.processes import end_all
 
 RACES = 4
 SCRIPT = """

@@ -23,10 +23,10 @@ from tests.conftest import REPOSITORY
 from tests.support.faults.checks import Reference
 from tests.support.faults.fire import Fire, Result, run_straight
 from tests.support.faults.home import Home
-from tests.support.faults.processes import end_all
 from tests.support.faults.report import summary, table
 from tests.support.faults.rounds import ROUNDS, Class, class_table
 from tests.support.faults.schedule import JOB_NODES, draw_plan
+from tests.support.processes import end_all
 
 BLOWS = 12
 """At most so many in one run, besides those that hit a controller while it starts."""

@@ -15,7 +15,7 @@ import pytest
 from orchestrator.client import Client
 from tests.conftest import submit_gang, wait_for
 from tests.support.faults.home import Home
-from tests.support.faults.processes import end_all
+from tests.support.processes import end_all
 
 JUMPS = (7200.0, -86400.0, 30.0, -5.0, 90 * 86400.0)
 """Seconds, to choose from."""

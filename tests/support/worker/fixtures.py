@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.conftest import processes_of
+from tests.support.processes import end_all
 from tests.support.worker.node import Node
 
 
@@ -29,6 +26,4 @@ def node(tmp_path: Path) -> Iterator[Callable[..., Node]]:
         if hasattr(each, "process"):
             each.process.kill()
             each.process.wait()
-    for pid in processes_of(tmp_path):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    end_all(tmp_path)

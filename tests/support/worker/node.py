@@ -14,7 +14,7 @@ from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Run, Store
 from shared_store.logs import LogFollower
 from shared_store.outcomes import Outcome, read_outcome
-from tests.conftest import alive, wait_for
+from tests.conftest import wait_for
 
 ENVIRONMENT = {
     name: value
@@ -96,5 +96,5 @@ class Node:
 Nodes = Callable[..., Node]
 
 
-def gone(*pids: int) -> None:
-    wait_for(lambda: not any(alive(pid) for pid in pids), 5, f"end of {pids}")
+def node_contract(endpoint: str | None, token: str | None, index: int = 0, job: str = "j") -> NodeContract:
+    return NodeContract(job, 1, index, 2, 0, "127.0.0.1", 1, "r", "/", 1, 1, bus=endpoint, bus_token=token)

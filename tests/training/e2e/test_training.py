@@ -7,41 +7,16 @@ import os
 import re
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import Serving, processes_of, run_muster, wait_for
-
-SMALL = ["train.worlds=16", "nodes=2", "checkpoint.every=5"]
-
-
-def changes(*assignments: str) -> list[str]:
-    return [part for assignment in (*SMALL, *assignments) for part in ("--set", assignment)]
-
+from tests.conftest import Serving, run_muster, wait_for
+from tests.support.processes import gang_members, processes_of
+from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 
 long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="a minute: MUSTER_LONG=1, in make bits")
-
-
-def submit(server: Serving, *assignments: str) -> dict[str, Any]:
-    done = server.muster("submit", "job_specs/cartpole.yaml", "--json", *changes(*assignments))
-    assert done.returncode == 0, done.stderr
-    return server.detail(json.loads(done.stdout)["jobId"])
-
-
-def wait_for_iteration(server: Serving, run: str, iteration: int) -> None:
-    wait_for(lambda: (raw_iterations(server, run) or [0])[-1] >= iteration, 300, f"iteration {iteration}")
-
-
-def raw_iterations(server: Serving, run: str) -> list[int]:
-    """Every iteration number in every epoch's file, as written."""
-    found = []
-    for path in sorted(Store(server.home / "store").run(run).metrics.glob("metrics-e*.jsonl")):
-        records = [json.loads(line) for line in path.read_text().splitlines()]
-        found += [record["iteration"] for record in records if "iteration" in record]
-    return found
 
 
 def test_one_command_trains_a_gang_of_three_that_balances_the_pole(tmp_path: Path) -> None:
@@ -118,8 +93,8 @@ def _check_damage(server: Serving, run: str, target: int) -> None:
 def test_a_killed_rank_restarts_the_gang_from_the_last_checkpoint(server: Serving) -> None:
     job = submit(server, "train.iterations=4000", "retry.attempts=2")
     wait_for_iteration(server, job["run"], 6)
-    victims = [pid for pid in processes_of(server.home) if _is_rank(pid, "1")]
-    os.kill(victims[0], signal.SIGKILL)
+    [victim] = gang_members(server.home, "rank", 1)
+    victim.strike(signal.SIGKILL)
     wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 60, "a second attempt")
     reached = raw_iterations(server, job["run"])[-1]
     wait_for(lambda: raw_iterations(server, job["run"])[-1] > reached + 6, 120, "progress after the restart")
@@ -151,9 +126,3 @@ def test_a_task_that_refuses_its_configuration_says_so_in_one_line(server: Servi
     job = submit(server, "train.iterations=2", "train.config={no_such_key: 1}", "retry.attempts=1")
     detail = server.wait(job["id"], timeout=120)
     assert detail["status"] == "FAILED" and "config.no_such_key" in detail["statusReason"]
-
-
-def _is_rank(pid: int, number: str) -> bool:
-    environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    writer = b"worker.saver" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    return f"RANK={number}".encode() in environment and not writer

@@ -12,9 +12,9 @@ import pytest
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import Serving, wait_for
-from tests.support.engines.sites import processes
 from tests.support.engines.slurm_cluster import SlurmCluster, started
 from tests.support.engines.training import same_bits, submit
+from tests.support.processes import processes_of_job, signal_all
 
 long = pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="minutes: MUSTER_LONG=1, in make bits")
 
@@ -39,26 +39,24 @@ def test_it_survives_the_loss_of_a_node_and_of_the_controller_with_the_bits_of_t
         job = submit(slurm, "queued", "slurm", 24)
         wait_for(lambda: len(read_metrics(run)) >= 6, 120, "some iterations")
         # the main node is on n1; n2 hangs with all that is on it, as a machine that swaps does
-        frozen = set(processes(job, SLURMD_NODENAME="n2"))
+        frozen = set(processes_of_job(job, SLURMD_NODENAME="n2"))
         assert len(frozen) >= 2, "supervisor and rank"
-        for pid in frozen:
-            os.kill(pid, signal.SIGSTOP)
+        signal_all(frozen, signal.SIGSTOP)
         cluster.kill("n2")
         # meanwhile the same on the local engine, undisturbed
         local = Serving(tmp_path / "local", "--store", str(home / "store"), "--cpus", "4")
         other = submit(local, "unqueued", "local", 24)
         wait_for(lambda: len(slurm.detail(job)["attempts"]) == 2, 60, "the loss is noticed")
-        assert frozen <= set(processes(job, SLURMD_NODENAME="n2")), "what ran there is still there"
+        assert frozen <= set(processes_of_job(job, SLURMD_NODENAME="n2")), "what ran there is still there"
         slurm.kill()
         slurm.start()
         wait_for(lambda: slurm.detail(job)["status"] == "RUNNING", 60, "it runs again")
-        for pid in frozen:
-            os.kill(pid, signal.SIGCONT)
+        signal_all(frozen, signal.SIGCONT)
         done = slurm.wait(job, timeout=180)
         assert done["status"] == "SUCCEEDED", (done["statusReason"], slurm.log(job)[-20:])
         assert [attempt["number"] for attempt in done["attempts"]] == [1, 2], done["attempts"]
         assert any("resumed from checkpoint" in line for line in slurm.log(job))
-        wait_for(lambda: not cluster.processes(b"worker."), 30, "no process is left")
+        wait_for(lambda: not cluster.processes("worker."), 30, "no process is left")
         assert local.wait(other, timeout=180)["status"] == "SUCCEEDED"
     finally:
         slurm.close()

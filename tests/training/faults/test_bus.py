@@ -17,8 +17,10 @@ import pytest
 from orchestrator.bus import Bus, BusError
 from shared_store.bus import LONGEST_ANSWER
 from shared_store.contract import NodeContract
-from tests.conftest import PATIENCE, REPOSITORY, Serving, processes_of, wait_for
-from tests.training.e2e.test_training import submit, wait_for_iteration
+from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
+from tests.support.processes import gang_members, processes_of
+from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
+from tests.support.worker.node import node_contract
 from worker.bus import NodeBus
 
 NODE = """
@@ -51,10 +53,6 @@ def start_node(bus: Bus, then: str, index: int = 0) -> subprocess.Popen[bytes]:
 
 def contract(bus: Bus, index: int = 0) -> NodeContract:
     return node_contract(bus.endpoint, bus.token("j", 1), index)
-
-
-def node_contract(endpoint: str | None, token: str | None, index: int = 0, job: str = "j") -> NodeContract:
-    return NodeContract(job, 1, index, 2, 0, "127.0.0.1", 1, "r", "/", 1, 1, bus=endpoint, bus_token=token)
 
 
 def test_a_killed_node_is_noticed_in_less_than_a_second(bus: Bus) -> None:
@@ -213,12 +211,8 @@ def test_a_training_that_still_starts_has_nothing_to_save(server: Serving) -> No
 def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(server: Serving) -> None:
     job = submit(server, "train.iterations=100000", "stall_timeout=4s")
     wait_for_iteration(server, job["run"], 6)
-    victim = next(
-        pid
-        for pid in processes_of(server.home)
-        if _is(pid, b"RANK=1") and _is(pid, b"LOCAL_RANK=0") and not _is_writer(pid)
-    )
-    os.kill(victim, signal.SIGSTOP)
+    [victim] = gang_members(server.home, "rank", 1)
+    victim.strike(signal.SIGSTOP)
     wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 30, "the second attempt")
     first = server.detail(job["id"])["attempts"][0]
     assert re.search(
@@ -250,14 +244,4 @@ def test_without_the_bus_jobs_run_and_commands_say_why_they_can_not(
 
 
 def _iteration(server: Serving, run: str) -> int:
-    from tests.training.e2e.test_training import raw_iterations
-
     return raw_iterations(server, run)[-1]
-
-
-def _is(pid: int, entry: bytes) -> bool:
-    return entry in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-
-
-def _is_writer(pid: int) -> bool:
-    return b"worker.saver" in Path(f"/proc/{pid}/cmdline").read_bytes()

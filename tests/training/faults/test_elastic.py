@@ -17,7 +17,8 @@ import torch
 from shared_store.checkpoints import Checkpoint, list_checkpoints
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import Serving, processes_of, wait_for
+from tests.conftest import Serving, wait_for
+from tests.support.processes import gang_members
 from worker.learning.shards import Shards
 
 WORLDS = 21
@@ -153,7 +154,8 @@ def test_an_elastic_gang_starts_with_what_is_free_and_grows_at_a_restart(server:
     wait_for(lambda: list_checkpoints(run), 120, "a checkpoint")
     end(server, holder)
     assert len(server.detail(job["id"])["attempts"]) == 1, "room alone does not disturb a gang that runs"
-    os.kill(next(pid for pid in processes_of(server.home) if is_rank(pid, "1")), signal.SIGKILL)
+    [rank] = gang_members(server.home, "rank", 1)
+    rank.strike(signal.SIGKILL)
     wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 60, "a second attempt")
     reached = wait_for(lambda: re.search(r"resumed from checkpoint (\d+)", text(server, job, 2)), 120, "a restart")
     wait_for(lambda: read_metrics(run)[-1]["iteration"] > int(reached[1]), 60, "an iteration")
@@ -170,13 +172,3 @@ def test_an_elastic_gang_starts_with_what_is_free_and_grows_at_a_restart(server:
 
 def text(server: Serving, job: dict[str, Any], attempt: int) -> str:
     return "\n".join(server.log(job["id"], attempt=attempt))
-
-
-def is_rank(pid: int, number: str) -> bool:
-    """Whether ``pid`` is that rank itself; the writer of its checkpoints has the same environment."""
-    try:
-        process = Path(f"/proc/{pid}")
-        trains = b"worker.train" in (process / "cmdline").read_bytes().split(b"\0")
-        return trains and f"RANK={number}".encode() in (process / "environ").read_bytes().split(b"\0")
-    except OSError:
-        return False

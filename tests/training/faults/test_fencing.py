@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 from pathlib import Path
 
@@ -15,7 +14,9 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
-from tests.conftest import REPOSITORY, processes_of, wait_for
+from tests.conftest import REPOSITORY, wait_for
+from tests.support.engines.bench import make_gang
+from tests.support.processes import end_all, processes_of, signal_all
 
 
 def gang(store: Store, job: str, epoch: int) -> Gang:
@@ -24,34 +25,18 @@ def gang(store: Store, job: str, epoch: int) -> Gang:
     spec = specfile.load(str(REPOSITORY / "job_specs" / "cartpole.yaml"), small)
     needs = gang_needs(compile_definition(spec, str(REPOSITORY))["nodeProperties"])
     node = needs.nodes[0]
-    return Gang(
+    return make_gang(
+        store.path,
         job=job,
-        attempt=1,
         epoch=epoch,
         job_epoch=epoch,
         run="r",
-        store=str(store.path),
-        queue="default",
-        pool="local",
-        main=0,
         commands=[node.command],
         environments=[node.environment],
         placements=[Placement("localhost", (), node.cpus, node.memory)],
         grace=30.0,
         directory=str(REPOSITORY),
     )
-
-
-def members(store: Store, job: str) -> list[int]:
-    """Pids of a gang's shim, supervisor, ranks and writers."""
-    found = []
-    for pid in processes_of(store.path):
-        try:
-            if f"MUSTER_JOB_ID={job}".encode() in Path(f"/proc/{pid}/environ").read_bytes():
-                found.append(pid)
-        except OSError:
-            continue
-    return found
 
 
 def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(tmp_path: Path) -> None:
@@ -63,19 +48,17 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
     stale = engine.launch(engine.plan(gang(store, "stale", 1)))
     try:
         wait_for(lambda: len(list_checkpoints(run)) >= 2, 180, "checkpoints of the first gang")
-        frozen = members(store, "stale")
+        frozen = processes_of(store.path, MUSTER_JOB_ID="stale")
         assert len(frozen) == 4, "shim, supervisor, rank and writer"
-        for pid in frozen:
-            os.kill(pid, signal.SIGSTOP)
+        signal_all(frozen, signal.SIGSTOP)
 
         raise_epoch(run, 2)
         successor = engine.launch(engine.plan(gang(store, "successor", 2)))
         wait_for(lambda: sum(c.epoch == 2 for c in list_checkpoints(run)) >= 2, 180, "checkpoints of its successor")
         log = run.log("stale", 1, 0)
         before = (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size)
-        for pid in frozen:
-            os.kill(pid, signal.SIGCONT)
-        wait_for(lambda: not members(store, "stale"), 10, "the end of the gang that woke")
+        signal_all(frozen, signal.SIGCONT)
+        wait_for(lambda: not processes_of(store.path, MUSTER_JOB_ID="stale"), 10, "the end of the gang that woke")
 
         wait_for(lambda: not engine.observe(stale)[0].running, 5, "its supervisor's end")
         assert engine.observe(stale)[0].exit_code == 3
@@ -92,5 +75,4 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
         engine.stop(successor, 30)
         assert json.loads(run.outcome("successor", 1, 0).read_text())["exit_code"] == 75
     finally:
-        for pid in processes_of(store.path):
-            os.kill(pid, signal.SIGKILL)
+        end_all(store.path)

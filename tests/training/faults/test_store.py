@@ -15,8 +15,10 @@ import pytest
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
-from tests.conftest import Serving, processes_of, wait_for
-from tests.training.e2e.test_training import raw_iterations, submit, wait_for_iteration
+from tests.conftest import Serving, wait_for
+from tests.support.faults.full_disk import fill
+from tests.support.processes import end_all, gang_members
+from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 
 
 def mount(*arguments: str) -> None:
@@ -43,21 +45,7 @@ def on_volume(tmp_path: Path, volume: Path) -> Iterator[Serving]:
     server = Serving(tmp_path / "home", "--cpus", "4", "--store", str(volume / "store"))
     yield server
     server.close()  # first: it would start again what is killed
-    for pid in processes_of(volume):
-        os.kill(pid, signal.SIGKILL)
-
-
-def fill(volume: Path) -> Path:
-    """Take all the space that is left."""
-    filler = volume / "filler"
-    with open(filler, "wb", buffering=0) as file:
-        for size in (1 << 20, 1 << 12, 1):
-            try:
-                while True:
-                    file.write(b"\0" * size)
-            except OSError:
-                continue
-    return filler
+    end_all(volume)
 
 
 def test_a_full_disk_costs_saves_and_nothing_else(on_volume: Serving, volume: Path) -> None:
@@ -104,20 +92,18 @@ def test_slow_writes_do_not_hold_up_training(server: Serving) -> None:
     job = submit(server, "train.iterations=100000", "nodes=1", "checkpoint.every=100000")
     wait_for_iteration(server, job["run"], 5)
     assert server.muster("checkpoint", job["id"]).returncode == 0
-    writer = next(
-        pid for pid in processes_of(server.home) if b"worker.saver" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
-    os.kill(writer, signal.SIGSTOP)  # a volume that takes for ever, as the writer sees it
+    [writer] = gang_members(server.home, "writer")
+    writer.strike(signal.SIGSTOP)  # a volume that takes for ever, as the writer sees it
     answers: list[str] = []
     asking = threading.Thread(target=lambda: answers.append(server.muster("checkpoint", job["id"]).stdout))
     asking.start()
     reached = raw_iterations(server, job["run"])[-1]
     wait_for(lambda: raw_iterations(server, job["run"])[-1] > reached + 30, 30, "progress while the writer waits")
     assert not answers, "it was acknowledged before it was durable"
-    os.kill(writer, signal.SIGCONT)
+    writer.strike(signal.SIGCONT)
     asking.join(30)
     assert answers and answers[0].startswith("checkpoint ")
-    os.kill(writer, signal.SIGKILL)
+    writer.strike(signal.SIGKILL)
     died = server.muster("checkpoint", job["id"]).stdout
     assert died.startswith("checkpoint "), "a writer that died is replaced"
     assert server.muster("stop", job["id"]).returncode == 0
@@ -142,13 +128,8 @@ def test_a_node_that_is_told_to_leave_takes_the_gang_along_and_loses_no_iteratio
     job = submit(server, "train.iterations=100000", "checkpoint.every=100000")
     wait_for_iteration(server, job["run"], 5)
     wait_for(lambda: _age(server, job["id"]) > 10.5, 30, "an attempt that is old enough to be worth a requeue")
-    supervisor = next(
-        pid
-        for pid in processes_of(server.home)
-        if b"worker.supervisor" in Path(f"/proc/{pid}/cmdline").read_bytes()
-        and b"AWS_BATCH_JOB_NODE_INDEX=1" in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    )
-    os.kill(supervisor, signal.SIGTERM)
+    [supervisor] = gang_members(server.home, "supervisor", 1)
+    supervisor.strike(signal.SIGTERM)
     wait_for(lambda: len(server.detail(job["id"])["attempts"]) == 2, 60, "the second attempt")
     first = server.detail(job["id"])["attempts"][0]
     assert first["ending"] == "requeue" and not first["spent"], first

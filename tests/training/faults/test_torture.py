@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tests.support.faults.fire import Fire, run_straight
 from tests.support.faults.home import Home
-from tests.support.faults.processes import end_all
 from tests.support.faults.schedule import SHARES, draw_plan
+from tests.support.processes import end_all
 
 ITERATIONS = 250
 PLAN = draw_plan("suite-518", 8)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +14,9 @@ from orchestrator.clock import Clock
 from orchestrator.database import Database
 from orchestrator.server import Server
 from orchestrator.tables import ShareUsage
-from tests.conftest import processes_of, submit_gang
-from tests.integration.orchestrator.test_troubles import FOREVER, await_status, detail
+from tests.conftest import submit_gang
+from tests.support.orchestrator.jobs import FOREVER, await_status, detail
+from tests.support.processes import end_all
 
 HOUR = 3600
 
@@ -131,9 +129,7 @@ def test_a_step_of_the_clock_ends_no_job_also_where_the_controller_starts_again(
             assert 0 < attempt["cpuSeconds"] < 600
     finally:
         server.close()
-        for pid in processes_of(tmp_path):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(tmp_path)
     steps = [record.getMessage() for record in caplog.records if "the wall clock moved by" in record.getMessage()]
     # another controller of this process sees the same steps
     assert list(dict.fromkeys(step.split()[5] for step in steps))[:3] == ["+7200", "-93600", "+97200"], steps

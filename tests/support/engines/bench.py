@@ -1,0 +1,148 @@
+"""An engine with a home and a store of its own, and the gangs that a test starts on it: what the tests of every engine share."""
+
+from __future__ import annotations
+
+import uuid
+from pathlib import Path
+from typing import Any
+
+from orchestrator.engines.base import Engine, Gang, NodeStatus, NotYet, Placement
+from shared_store.epoch import raise_epoch, read_epoch
+from shared_store.layout import Store
+from shared_store.logs import LogFollower, LogLine
+from shared_store.outcomes import Outcome, read_outcome
+from tests.support.engines.sites import WAIT
+from tests.support.processes import processes_of
+from tests.support.waiting import wait_for
+
+
+def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -> Gang:
+    """A gang whose nodes run ``sh -c script``, with ``changes``."""
+    attempt = changes.get("attempt", 1)
+    facts: dict[str, Any] = {
+        "job": "job",
+        "attempt": attempt,
+        "epoch": attempt,
+        "job_epoch": 1,
+        "run": "run",
+        "store": str(store),
+        "queue": "default",
+        "pool": "pool",
+        "main": 0,
+        "commands": [["sh", "-c", script]] * nodes,
+        "environments": [{"GREETING": "hello"}] * nodes,
+        "placements": [Placement("localhost", (), 0.5, 64)] * nodes,
+        "grace": 5.0,
+        "directory": None,
+    }
+    return Gang(**{**facts, **changes})
+
+
+class Bench:
+    """An engine, its home and its store, and the gangs that it started. A subclass says which engine, and what a gang needs there."""
+
+    asks_again = ""
+    """What the reason of a launch that has to wait says where :meth:`start` goes on asking; empty for nothing."""
+
+    def __init__(self, home: Path, store: Store | None = None, job: str = "") -> None:
+        """``store``: if not one of its own; ``job``: the gangs' job, if not one that nobody else has."""
+        self.home = home
+        self.store = store or Store(home / "store").open()
+        self.job = job or str(uuid.uuid4())
+        self.run = self.store.run("run")
+        self.run.create({"run": "run"})
+        if read_epoch(self.run) < 1:
+            raise_epoch(self.run, 1)
+        self.engine = self.new_engine()
+        self.handles: list[str] = []
+
+    def new_engine(self) -> Engine:
+        """The engine, as a controller that is started, or started again, has it."""
+        raise NotImplementedError
+
+    # -- gangs --------------------------------------------------------------------------------------------------------
+
+    def gang(self, script: str = WAIT, nodes: int = 2, *, suffix: str = "", **changes: Any) -> Gang:
+        """A gang whose nodes run ``sh -c script``, with ``changes``. ``suffix``: of the job's id, for another job."""
+        return make_gang(self.store.path, script, nodes, **{"job": self.job + suffix, **changes})
+
+    def launch(self, gang: Gang, engine: Engine | None = None) -> str:
+        """Give the run to the gang and start it, as a controller does; returns the handle."""
+        run = self.store.run(gang.run)
+        if read_epoch(run) < gang.epoch:
+            raise_epoch(run, gang.epoch)
+        return self.start(gang, engine)
+
+    def start(self, gang: Gang, engine: Engine | None = None) -> str:
+        """Start the gang, whomever the run belongs to."""
+        engine = engine or self.engine
+        plan = engine.plan(gang)
+
+        def started() -> str | None:
+            try:
+                return engine.launch(plan)
+            except NotYet as reason:
+                if self.asks_again and self.asks_again in str(reason):
+                    return None
+                raise
+
+        handle: str = wait_for(started, 60, "an answer")
+        if handle not in self.handles:
+            self.handles.append(handle)
+        return handle
+
+    def ready(self, gang: Gang) -> str:
+        """Launch the gang, if that was not done, and wait until every node has said ``ready``; returns the handle."""
+        handle = self.launch(gang)
+
+        def said() -> bool:
+            self.engine.observe(handle)  # as a controller does all the time
+            return self.log(gang.attempt, job=gang.job, run=gang.run).count("ready") == len(gang.commands)
+
+        wait_for(said, 60, f"{len(gang.commands)} ready nodes")
+        return handle
+
+    def ended(self, handle: str, engine: Engine | None = None) -> list[NodeStatus]:
+        """Wait until all nodes have ended; returns how."""
+
+        def over() -> list[NodeStatus] | None:
+            status = list((engine or self.engine).observe(handle))
+            return None if any(node.running for node in status) else status
+
+        found: list[NodeStatus] = wait_for(over, 60, "the gang's end")
+        return found
+
+    def stopped(self, handle: str, grace: float = 5.0) -> list[int | None]:
+        """Stop the only gang, of which nothing is left then; returns the exit codes."""
+        self.engine.stop(handle, grace)
+        self.nothing_is_left()
+        return [node.exit_code for node in self.engine.observe(handle)]
+
+    # -- what is there of them ----------------------------------------------------------------------------------------
+
+    def lines(self, attempt: int = 1, *, job: str = "", run: str = "run") -> list[LogLine]:
+        """All lines of an attempt's log."""
+        found = LogFollower(self.store.run(run), job or self.job).drain()
+        return [line for line in found if line.attempt == attempt]
+
+    def log(self, attempt: int = 1, *, job: str = "", run: str = "run") -> list[str]:
+        """What the ranks of an attempt printed."""
+        return [line.text for line in self.lines(attempt, job=job, run=run) if line.rank is not None]
+
+    def outcome(self, node: int, attempt: int = 1) -> Outcome:
+        found = read_outcome(self.run, self.job, attempt, node)
+        assert found is not None, (node, self.lines(attempt))
+        return found
+
+    def processes(self) -> list[int]:
+        """Pids of all that the gangs run."""
+        return processes_of(self.store.path)
+
+    def nothing_is_left(self) -> None:
+        assert self.processes() == [], "a process of a gang lives"
+
+    def close(self) -> None:
+        """Stop all gangs, of which nothing is left then."""
+        for handle in self.handles:
+            self.engine.stop(handle, 0.0)
+        self.nothing_is_left()
