@@ -110,7 +110,9 @@ def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: SlurmBench, monke
     plan = bench.engine.plan(gang)
     for _ in range(3):
         asked = time.monotonic()
-        with pytest.raises(NotYet, match="Slurm: slurmctld has not answered yet; see `scontrol ping`") as late:
+        with pytest.raises(
+            NotYet, match="Slurm: the gang is being handed to slurmctld; if this lasts, see `scontrol ping`"
+        ) as late:
             bench.engine.launch(plan)
         assert late.value.unknown and time.monotonic() - asked < 5
     go.set()

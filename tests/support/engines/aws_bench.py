@@ -19,7 +19,7 @@ class AwsBench(Bench):
     """A controller's home and store, the volume that the nodes have, and the engine between them."""
 
     engine: AwsBatchEngine
-    asks_again = "AWS Batch"
+    asks_again = ("AWS Batch",)
 
     def __init__(self, aws: Serving, home: Path, **config: Any) -> None:
         self.aws = aws

@@ -41,8 +41,8 @@ def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -
 class Bench:
     """An engine, its home and its store, and the gangs that it started. A subclass says which engine, and what a gang needs there."""
 
-    asks_again = ""
-    """What the reason of a launch that has to wait says where :meth:`start` goes on asking; empty for nothing."""
+    asks_again: tuple[str, ...] = ()
+    """Parts of the reasons for which a launch has to wait where :meth:`start` goes on asking."""
 
     def __init__(self, home: Path, store: Store | None = None, job: str = "") -> None:
         """``store``: if not one of its own; ``job``: the gangs' job, if not one that nobody else has."""
@@ -82,7 +82,7 @@ class Bench:
             try:
                 return engine.launch(plan)
             except NotYet as reason:
-                if self.asks_again and self.asks_again in str(reason):
+                if any(text in str(reason) for text in self.asks_again):
                     return None
                 raise
 
