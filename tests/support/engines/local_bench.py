@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.processes import end_all
 
-_JOB = "local-engine-job"
+_JOB = f"local-engine-job-{os.getpid()}"
 """A name that no other test gives, since gangs are found by their name on the whole machine; the same each time, since their
 addresses and ports follow from it."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.bench import make_gang
 from tests.support.processes import end_all, processes_of, signal_all
+
+STALE, SUCCESSOR = (f"{name}-{os.getpid()}" for name in ("stale", "successor"))
+"""A job's id is nobody else's on a machine: an engine takes up what it finds of it."""
 
 
 def gang(store: Store, job: str, epoch: int) -> Gang:
@@ -45,25 +49,25 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
     run.create({"run": "r"})
     engine = LocalEngine(tmp_path / "home")
     raise_epoch(run, 1)
-    stale = engine.launch(engine.plan(gang(store, "stale", 1)))
+    stale = engine.launch(engine.plan(gang(store, STALE, 1)))
     try:
         wait_for(lambda: len(list_checkpoints(run)) >= 2, 180, "checkpoints of the first gang")
-        frozen = processes_of(store.path, MUSTER_JOB_ID="stale")
+        frozen = processes_of(store.path, MUSTER_JOB_ID=STALE)
         assert len(frozen) == 4, "shim, supervisor, rank and writer"
         signal_all(frozen, signal.SIGSTOP)
 
         raise_epoch(run, 2)
-        successor = engine.launch(engine.plan(gang(store, "successor", 2)))
+        successor = engine.launch(engine.plan(gang(store, SUCCESSOR, 2)))
         wait_for(lambda: sum(c.epoch == 2 for c in list_checkpoints(run)) >= 2, 180, "checkpoints of its successor")
-        log = run.log("stale", 1, 0)
+        log = run.log(STALE, 1, 0)
         before = (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size)
         signal_all(frozen, signal.SIGCONT)
-        wait_for(lambda: not processes_of(store.path, MUSTER_JOB_ID="stale"), 10, "the end of the gang that woke")
+        wait_for(lambda: not processes_of(store.path, MUSTER_JOB_ID=STALE), 10, "the end of the gang that woke")
 
         wait_for(lambda: not engine.observe(stale)[0].running, 5, "its supervisor's end")
         assert engine.observe(stale)[0].exit_code == 3
         assert (log.stat().st_size, (run.metrics / "metrics-e1.jsonl").stat().st_size) == before
-        assert not run.outcome("stale", 1, 0).exists()
+        assert not run.outcome(STALE, 1, 0).exists()
         assert engine.observe(successor)[0].running
         newest = list_checkpoints(run)[-1]
         wait_for(lambda: list_checkpoints(run)[-1].iteration > newest.iteration + 3, 60, "undisturbed progress")
@@ -73,6 +77,6 @@ def test_a_gang_that_wakes_after_its_successor_started_stops_and_writes_nothing(
         iterations = [record["iteration"] for record in read_metrics(run)]
         assert iterations == list(range(1, len(iterations) + 1))
         engine.stop(successor, 30)
-        assert json.loads(run.outcome("successor", 1, 0).read_text())["exit_code"] == 75
+        assert json.loads(run.outcome(SUCCESSOR, 1, 0).read_text())["exit_code"] == 75
     finally:
         end_all(store.path)
