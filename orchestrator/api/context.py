@@ -14,6 +14,7 @@ from orchestrator.api.damaged import DamagedRow
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
 from orchestrator.controller import Controller
+from orchestrator.database import find_job
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
@@ -92,9 +93,7 @@ def find_run(controller: Controller, name: str) -> Run:
                 over = Status(job.status).is_terminal
                 what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
                 raise ClientError(f"run {name} does not exist: job {job.name} ({job.id[:8]}) {what}", 404)
-            named = session.scalars(
-                select(Job).where(Job.name == name).order_by(Job.created_at.desc()).limit(1)
-            ).first()
+            named = find_job(session, name, visible_queues())
             if named is not None and is_visible(named):
                 raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
             runs = [each.name for each in visible_runs(session, controller.store, most=_COMPARED)]

@@ -143,9 +143,9 @@ class DockerEngine:
             if found:
                 with ThreadPoolExecutor(len(found)) as pool:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
-                with self._copying:
-                    copies = [self._copies[key] for key in self._copies if key.startswith(f"{facts['gang']}/")]
-                for copy in copies:  # what is not copied yet would go with the container
+                for copy in self._copies_of(
+                    facts["gang"]
+                ).values():  # what is not copied yet would go with the container
                     copy.wait()
             self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
             for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
@@ -361,9 +361,13 @@ class DockerEngine:
                 network.remove()
             except APIError:
                 pass  # a container that is still going; the next stop removes it
+        for key in self._copies_of(gang):
+            self._copies.pop(key, None)
+
+    def _copies_of(self, gang: str) -> dict[str, LogCopy]:
+        """The copies of a gang's logs, by their keys."""
         with self._copying:
-            for key in [key for key in self._copies if key.startswith(f"{gang}/")]:
-                del self._copies[key]
+            return {key: copy for key, copy in self._copies.items() if key.startswith(f"{gang}/")}
 
 
 def _check_image(name: str, image: Image, command: Sequence[str]) -> None:

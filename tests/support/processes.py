@@ -40,7 +40,7 @@ def command(pid: int) -> list[str]:
 
 
 def environment(pid: int) -> dict[str, str]:
-    """The environment that it was started with; empty where the process is gone or somebody else's."""
+    """The environment that it was started with; empty where the process is gone or belongs to another user."""
     return dict(item.split("=", 1) for item in _items(pid, "environ") if "=" in item)
 
 
@@ -90,7 +90,7 @@ def processes_of_job(job: str, **variables: str) -> list[int]:
 
 
 def processes_running(text: str) -> list[int]:
-    """Pids of all with ``text`` in their command line, whose words are told apart by zero bytes."""
+    """Pids of all processes with ``text`` in their command line; zero bytes separate its words."""
     return find_processes(lambda pid: text in "\0".join(command(pid)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,14 @@ def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -
     return Gang(**{**facts, **changes})
 
 
-class Bench:
+class Bench(ABC):
     """An engine, its home and its store, and the gangs that it started. A subclass says which engine, and what a gang needs there."""
 
     asks_again: tuple[str, ...] = ()
     """Parts of the reasons for which a launch has to wait where :meth:`start` goes on asking."""
 
     def __init__(self, home: Path, store: Store | None = None, job: str = "") -> None:
-        """``store``: if not one of its own; ``job``: the gangs' job, if not one that nobody else has."""
+        """``store``: a new one by default. ``job``: the id of the gangs' job, a new one by default."""
         self.home = home
         self.store = store or Store(home / "store").open()
         self.job = job or str(uuid.uuid4())
@@ -56,9 +57,9 @@ class Bench:
         self.engine = self.new_engine()
         self.handles: list[str] = []
 
+    @abstractmethod
     def new_engine(self) -> Engine:
-        """The engine, as a controller that is started, or started again, has it."""
-        raise NotImplementedError
+        """A new object for the engine, such as a controller makes at its start."""
 
     # -- gangs --------------------------------------------------------------------------------------------------------
 
@@ -74,7 +75,7 @@ class Bench:
         return self.start(gang, engine)
 
     def start(self, gang: Gang, engine: Engine | None = None) -> str:
-        """Start the gang, whomever the run belongs to."""
+        """Start the gang, even where the run is another one's."""
         engine = engine or self.engine
         plan = engine.plan(gang)
 
@@ -113,12 +114,12 @@ class Bench:
         return found
 
     def stopped(self, handle: str, grace: float = 5.0) -> list[int | None]:
-        """Stop the only gang, of which nothing is left then; returns the exit codes."""
+        """Stop the only gang and check that nothing of it is left; returns the exit codes."""
         self.engine.stop(handle, grace)
         self.nothing_is_left()
         return [node.exit_code for node in self.engine.observe(handle)]
 
-    # -- what is there of them ----------------------------------------------------------------------------------------
+    # -- logs, outcomes, processes ------------------------------------------------------------------------------------
 
     def lines(self, attempt: int = 1, *, job: str = "", run: str = "run") -> list[LogLine]:
         """All lines of an attempt's log."""
@@ -142,7 +143,7 @@ class Bench:
         assert self.processes() == [], "a process of a gang lives"
 
     def close(self) -> None:
-        """Stop all gangs, of which nothing is left then."""
+        """Stop all gangs and check that nothing of them is left."""
         for handle in self.handles:
             self.engine.stop(handle, 0.0)
         self.nothing_is_left()

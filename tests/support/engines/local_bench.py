@@ -14,8 +14,7 @@ from tests.support.engines.sites import WAIT
 from tests.support.processes import end_all
 
 _JOB = f"local-engine-job-{os.getpid()}"
-"""A name that no other test gives, since gangs are found by their name on the whole machine; the same each time, since their
-addresses and ports follow from it."""
+"""One for all tests of this process and no other, since the engine finds gangs by their names on the whole machine."""
 
 
 class LocalBench(Bench):
