@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.rank:
-        from worker.learning import ppo
+        from worker.learning.ppo import fused as ppo
 
         ppo.COLLECTIVES_IN_GRAPH = os.environ["MUSTER_BENCH_INSIDE"] == "1"
         rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")

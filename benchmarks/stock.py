@@ -12,7 +12,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from worker.tasks.config import PPOConfig
+from worker.learning.ppo.settings import PPOConfig
 from worker.tasks.task import Task
 
 

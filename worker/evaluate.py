@@ -20,8 +20,9 @@ def main() -> int:
         placement = Placement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    from worker.learning.algorithm import Share
     from worker.learning.evaluation import evaluate
-    from worker.learning.ppo import PPO, Share
+    from worker.learning.ppo.fused import PPO
     from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.runner import build_task
     from worker.learning.trained import choose_checkpoint, load_learner

@@ -44,7 +44,7 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
     """
     import torch
 
-    from worker.learning.models import GROUP
+    from worker.learning.ppo.models import GROUP
     from worker.learning.trained import load_actor
 
     actor = load_actor(checkpoint)

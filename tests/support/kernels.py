@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 BUILD = """
 import warp
 from worker.distributed import warm_marker
-from worker.learning import objective
+from worker.learning.ppo import objective
 from worker.tasks import find_task
 
 warp.config.log_level = warp.LOG_WARNING

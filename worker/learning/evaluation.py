@@ -12,7 +12,7 @@ import torch
 from shared_store.files import write_json
 from shared_store.layout import Run
 from worker.distributed import Gang
-from worker.learning.ppo import PPO
+from worker.learning.ppo.fused import PPO
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task

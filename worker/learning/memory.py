@@ -16,8 +16,9 @@ import torch
 
 from worker.distributed import Gang
 from worker.errors import UserError
+from worker.learning.algorithm import Share
 from worker.learning.job import user_errors
-from worker.learning.ppo import PPO, Share
+from worker.learning.ppo.fused import PPO
 from worker.learning.runner import build_task
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import torch
 from shared_store.files import write_atomic
 
 if TYPE_CHECKING:
-    from worker.learning.ppo import PPO
+    from worker.learning.ppo.fused import PPO
     from worker.tasks.task import Task
 
 

@@ -15,13 +15,14 @@ import warp
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang, warm_marker
 from worker.errors import TrainingError, UserError
-from worker.learning import objective
+from worker.learning.algorithm import Share
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence, Fence
 from worker.learning.evaluation import evaluate
 from worker.learning.faults import die, kill_at
 from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
-from worker.learning.ppo import LOSSES, PPO, Share
+from worker.learning.ppo import objective
+from worker.learning.ppo.fused import LOSSES, PPO
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.recording import HostCopy, Recorded
 from worker.learning.replay import Replay

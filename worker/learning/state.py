@@ -24,8 +24,9 @@ from shared_store.checkpoints import (
 from shared_store.epoch import check_epoch
 from worker.distributed import Gang
 from worker.errors import UserError
+from worker.learning.algorithm import Share
 from worker.learning.job import Job
-from worker.learning.ppo import PPO, Share
+from worker.learning.ppo.fused import PPO
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
 from worker.learning.shards import Shards, read_file

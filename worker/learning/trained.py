@@ -50,7 +50,7 @@ def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
 
 def load_actor(checkpoint: Checkpoint) -> MLPModel:
     """The policy of ``checkpoint`` on the CPU, in evaluation mode."""
-    from worker.learning.models import build_models
+    from worker.learning.ppo.models import build_models
 
     facts = checkpoint.manifest
     config: Any = SimpleNamespace(**facts["ppo"])

@@ -136,6 +136,11 @@ class Randomizer:
             wp.launch(_draw_factors, dim=factors.shape, inputs=[episodes, ends], outputs=[factors], device=self._device)
         self._apply()
 
+    @property
+    def has_noise(self) -> bool:
+        """Whether anything that the policy sees is blurred."""
+        return self._noise is not None
+
     def push(self) -> None:
         """Before a control step: push some worlds."""
         if self._push_probability:

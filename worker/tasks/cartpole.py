@@ -10,6 +10,7 @@ from typing import ClassVar
 import newton
 import warp as wp
 
+from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     STEP,
     EpisodeArrays,
@@ -21,7 +22,7 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import WorldArrays, is_sound
-from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.config import TaskConfig, reward_weights
 from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.camera import CameraConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.config import PPOConfig, nested
+from worker.tasks.config import nested
 
 
 @dataclass(frozen=True)

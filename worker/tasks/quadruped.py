@@ -12,6 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     ACTION_LIMIT,
     STEP,
@@ -24,7 +25,7 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
-from worker.tasks.config import PPOConfig, TaskConfig, reward_weights
+from worker.tasks.config import TaskConfig, reward_weights
 from worker.tasks.interface import Interface, Observation, servo
 from worker.tasks.task import Task
 

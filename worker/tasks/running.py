@@ -11,6 +11,7 @@ import newton.examples
 import numpy as np
 import warp as wp
 
+from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     STEP,
     EpisodeArrays,
@@ -22,7 +23,7 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
-from worker.tasks.config import PPOConfig, TaskConfig
+from worker.tasks.config import TaskConfig
 from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 

@@ -54,6 +54,9 @@ class Task:
         states: What ``observe`` writes, named by ``observation_names``, shape ``(worlds, states)``, float32: without a camera the
             observations.
         terminal_observations: The states before the reset, valid where ``dones``; same shape as ``states``, float32.
+        groups: The observation groups by name: ``policy`` is :attr:`observations`, ``critic`` what the simulation knows: the states
+            without noise.
+        terminal_groups: The groups before the reset, valid where ``dones``; of images there is none.
         rewards: Shape ``(worlds,)``, float32.
         dones: Whether the episode ended, shape ``(worlds,)``, bool.
         time_outs: Whether it ended by the clock alone, shape ``(worlds,)``, bool.
@@ -154,6 +157,7 @@ class Task:
             if self._camera:
                 self.observations = self._camera.images
                 self.observation_shape = tuple(self.observations.shape[1:])
+            self.groups, self.terminal_groups = self._group()
             self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
         self._graph = CapturedStep(self._launch_step, self.device)
         self._assert_captured()
@@ -360,6 +364,21 @@ class Task:
         self.level.fill_(1.0)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
 
+    def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """The observation groups, and those before the reset. The critic's have buffers of their own only where there is noise."""
+        if self.randomizer.has_noise:
+            self._exact = (
+                wp.zeros_like(self._episodes.observations),
+                wp.zeros_like(self._episodes.terminal_observations),
+            )
+            known, ended = map(wp.to_torch, self._exact)
+        else:
+            self._exact = None
+            known, ended = self.states, self.terminal_observations
+        seen = {"policy": self.observations, "critic": known}
+        before = {"critic": ended} if self._camera else {"policy": self.terminal_observations, "critic": ended}
+        return seen, before
+
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
         arrays = self.worlds.arrays
@@ -373,6 +392,7 @@ class Task:
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
             "observations": self.states,
+            **({"exact_observations": wp.to_torch(self._exact[0])} if self._exact else {}),
             "episode_length": self.episode_length,
             "episode_sums": self._sums,
             "random": self._random,
@@ -413,6 +433,9 @@ class Task:
             device=self.device,
         )
         wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
+        if self._exact:
+            wp.copy(self._exact[0], self._episodes.observations)
+            wp.copy(self._exact[1], self._episodes.terminal_observations)
         self.randomizer.add_noise(int(mode))
         if self._camera:
             self._camera.render(int(mode))

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from worker.tasks.config import PPOConfig, Randomization
+from worker.learning.ppo.settings import PPOConfig
+from worker.tasks.config import Randomization
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from tests.support.worker.runs import assert_same_bits, runner, train
 from worker.errors import UserError
 from worker.learning import state
 from worker.learning.job import configure
-from worker.learning.ppo import PPO
+from worker.learning.ppo.fused import PPO
+from worker.learning.ppo.settings import PPOConfig
 from worker.learning.runner import Runner
-from worker.tasks.config import PPOConfig
 
 
 @pytest.fixture(scope="module")

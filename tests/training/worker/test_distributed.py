@@ -34,7 +34,8 @@ def learn() -> int:
 def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
     """Three iterations on whole batches."""
     from tests.support.worker.point_task import Point, PointConfig, PointPPO
-    from worker.learning.ppo import PPO, Share
+    from worker.learning.algorithm import Share
+    from worker.learning.ppo.fused import PPO
 
     share = Share.of(gang.rank, gang.size, WORLDS)
     config = PointPPO(epochs=1, minibatches=1)

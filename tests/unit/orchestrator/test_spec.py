@@ -16,7 +16,7 @@ from orchestrator.definition import compile_definition, compile_submission, gang
 from orchestrator.errors import SpecError
 from orchestrator.spec import Spec, known_tasks, override, validate
 from orchestrator.specfile import load, read
-from worker.tasks.config import PPOConfig
+from worker.learning.ppo.settings import PPOConfig
 
 REPOSITORY = Path(__file__).parents[3]
 SHIPPED = sorted((REPOSITORY / "job_specs").glob("*.yaml"))

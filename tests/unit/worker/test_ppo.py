@@ -15,9 +15,10 @@ from torch.distributions import Normal
 
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
-from worker.learning import linear
-from worker.learning.objective import Objective
-from worker.learning.ppo import LOSSES, PPO, Share
+from worker.learning.algorithm import Share
+from worker.learning.ppo import linear
+from worker.learning.ppo.fused import LOSSES, PPO
+from worker.learning.ppo.objective import Objective
 from worker.learning.randomness import mix_seed
 
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import nn
 
 if TYPE_CHECKING:
-    from worker.tasks.config import PPOConfig
+    from worker.learning.ppo.settings import PPOConfig
 
 GROUP = "policy"
 """Name of the one observation group."""

@@ -8,7 +8,7 @@ rsl-rl's PPO is subclassed at its seams, with rsl-rl's models, distribution and 
   (Of images there is none after the step: there it is as in rsl-rl.)
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws a new permutation (rsl-rl draws one and repeats the same minibatches in all epochs).
-- The objective and its gradient are one kernel (:mod:`worker.learning.objective`), and on CUDA actor and critic run side by side.
+- The objective and its gradient are one kernel (:mod:`worker.learning.ppo.objective`), and on CUDA actor and critic run side by side.
 - The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device, and on CUDA all of
   :meth:`PPO.learn` is one graph.
 - Action noise depends on (seed, iteration, step, global world index) alone: not on the number of ranks, nor on a restart.
@@ -19,7 +19,6 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,35 +26,21 @@ from rsl_rl.algorithms.ppo import PPO as RslPPO
 from rsl_rl.storage.rollout_storage import RolloutStorage
 
 from worker.distributed import Gang
-from worker.learning import linear, moments
-from worker.learning.models import GROUP, build_models, example_observations
-from worker.learning.objective import LOSSES, Objective
+from worker.learning.algorithm import Share
+from worker.learning.ppo import linear, moments
+from worker.learning.ppo.models import GROUP, build_models, example_observations
+from worker.learning.ppo.objective import LOSSES, Objective
 from worker.learning.randomness import mix_seed
 from worker.learning.recording import Recorded
 
 if TYPE_CHECKING:
-    from worker.tasks.config import PPOConfig
+    from worker.learning.ppo.settings import PPOConfig
 
 COLLECTIVES_IN_GRAPH = True
 """Whether a gang's collectives are part of the graph of learning, or stand between smaller graphs."""
 RATE_LIMITS = (1e-5, 1e-2)
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within these limits."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """Which worlds a rank holds: ``[first, first + count)`` of ``total``, by global index."""
-
-    first: int
-    count: int
-    total: int
-
-    @classmethod
-    def of(cls, rank: int, ranks: int, total: int) -> Share:
-        """Rank r of R holds worlds ``[r·T // R, (r + 1)·T // R)`` of T."""
-        first = rank * total // ranks
-        return cls(first, (rank + 1) * total // ranks - first, total)
 
 
 class PPO(RslPPO):

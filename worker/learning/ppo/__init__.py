@@ -1,0 +1,1 @@
+"""The fused PPO: rollout, objective and update made for graphs and gangs."""
