@@ -24,7 +24,8 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner
 from benchmarks.training import CUDA, build, wait
 from worker.learning.evaluation import evaluate
-from worker.learning.runner import Runner, build_task
+from worker.learning.loop import Loop
+from worker.learning.setup import build_task
 
 PLAN = {
     "Cartpole": (4096, 60),
@@ -59,7 +60,7 @@ def train(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -
     return found | {"failed_worlds": failed} | worth(runner)
 
 
-def worth(runner: Runner) -> dict[str, float]:
+def worth(runner: Loop) -> dict[str, float]:
     """Mean return of the policy's mean action, as trained and under :data:`REFERENCE`."""
     own = evaluate(runner.task, runner.ppo, runner.gang, checkpoint="-")
     found = {"evaluated": own.mean_return, "evaluated_length": own.mean_length, "longest": own.max_length}

@@ -31,7 +31,8 @@ from shared_store.layout import Store
 from worker.distributed import Placement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.recording import Recorded
-from worker.learning.runner import Runner, build_task
+from worker.learning.loop import Loop
+from worker.learning.setup import build_task
 from worker.tasks import find_task
 
 CUDA = torch.cuda.is_available()
@@ -44,7 +45,7 @@ DEFAULT_CPU = {"Cartpole": [64, 1024], "Ant": [64], "Humanoid": [32], "Quadruped
 SWEEP = [2048, 8192, 32768, 65536]
 
 
-def build(task: str, worlds: int, store: Path, seed: int = 0, **train: Any) -> Runner:
+def build(task: str, worlds: int, store: Path, seed: int = 0, **train: Any) -> Loop:
     """A runner of the real training loop, on a store of its own, that never saves."""
     placement = Placement.from_env(os.environ)
     run = Store(store).open().run(f"bench-{task}-{worlds}-{seed}".lower())
@@ -54,7 +55,7 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, **train: Any) -> R
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
     spec = {"train": section, "checkpoint": {"every": 10**9}}
     job = Job(spec, Store(store), run, 1, 1, "bench", None, section)
-    return Runner(job, connect(placement), find_task(task), StopRequest())
+    return Loop(job, connect(placement), find_task(task), StopRequest())
 
 
 def wait() -> None:

@@ -22,10 +22,9 @@ def main() -> int:
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from worker.learning.algorithm import Share
     from worker.learning.evaluation import evaluate
-    from worker.learning.ppo.fused import PPO
     from worker.learning.randomness import held_out_seed, seed_generators
-    from worker.learning.runner import build_task
-    from worker.learning.trained import choose_checkpoint, load_learner
+    from worker.learning.setup import build_task, spaces_from, spaces_of
+    from worker.learning.trained import choose_checkpoint, load_policy
     from worker.tasks import find_task
 
     checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
@@ -37,17 +36,14 @@ def main() -> int:
     seed_generators(seed)
     share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
     task = build_task(task_type, config, share, gang, seed)
-    with user_errors():
-        ppo = PPO(config.ppo, share, task.observation_shape, task.action_size, gang)
     task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
-    try:
-        ppo.load(load_learner(checkpoint, gang.device)["ppo"], {"actor": True, "critic": True})
-    except RuntimeError as error:
+    policy = load_policy(checkpoint, gang.device)
+    if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
         raise UserError(
-            f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: {error}"
-        ) from error
+            f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: it had {then}, it has {now}"
+        )
     end_startup()
-    result = evaluate(task, ppo, gang, checkpoint=checkpoint.name, episodes=episodes * share.total)
+    result = evaluate(task, policy, gang, checkpoint=checkpoint.name, episodes=episodes * share.total)
     if gang.is_main:
         print(result, flush=True)
         print(f"written: {result.write(run)}", flush=True)

@@ -29,12 +29,11 @@ from worker.learning.job import Job, run_command
 
 if TYPE_CHECKING:
     import numpy as np
-    from rsl_rl.models.mlp_model import MLPModel
+
+    from worker.learning.algorithm import ExportedPolicy
 
 TOLERANCE = 1e-5
 """Greatest absolute difference between the exported and the trained policy's actions."""
-SAMPLES, IMAGES = 1024, 16
-"""Observations on which they are compared: numbers, or images, for which ONNX's evaluator takes its time."""
 
 
 def export(run: Run, checkpoint: Checkpoint) -> Path:
@@ -44,14 +43,13 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
     """
     import torch
 
-    from worker.learning.ppo.models import GROUP
-    from worker.learning.trained import load_actor
+    from worker.learning.trained import load_policy
 
-    actor = load_actor(checkpoint)
-    facts = checkpoint.manifest
-    observations = _observations(actor)
+    policy = load_policy(checkpoint)
+    facts, exported = checkpoint.manifest, policy.module()
+    observations = exported.sample["policy"]
     with torch.no_grad():
-        actions = actor.mlp(actor.get_latent({GROUP: observations}))  # as it was trained, not as it is exported
+        actions = policy.act(exported.sample)  # as it was trained, not as it is exported
     few = 8 if observations.ndim == 2 else 1
     metadata = {
         "format": 1,
@@ -65,7 +63,7 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
         "output": "actions",
         "self_test": {"obs": observations[:few].tolist(), "actions": actions[:few].tolist(), "tolerance": TOLERANCE},
     }
-    model = to_onnx(actor, metadata)
+    model = to_onnx(exported, metadata)
     metadata["max_difference"] = check(model, observations.numpy(), actions.numpy())
     metadata["sha256"] = hashlib.sha256(model).hexdigest()
     metadata["created"] = time.time()
@@ -83,25 +81,25 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
     return target
 
 
-def to_onnx(actor: MLPModel, metadata: dict[str, Any]) -> bytes:
+def to_onnx(policy: ExportedPolicy, metadata: dict[str, Any]) -> bytes:
     """The policy as one self-contained ONNX file, batch size free; ``metadata`` is inside, as JSON under ``muster``."""
     import onnx
     import torch
 
-    module = actor.as_onnx(verbose=False).eval()
+    inputs, outputs = list(policy.inputs), list(policy.outputs)
     buffer = io.BytesIO()
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         # torch's newer exporter takes ten times as long here and writes two files by default
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            module,
-            module.get_dummy_inputs(),
+            policy.network,
+            tuple(policy.inputs.values()),
             buffer,
             dynamo=False,
             opset_version=18,
-            input_names=module.input_names,
-            output_names=module.output_names,
-            dynamic_axes={name: {0: "batch"} for name in (*module.input_names, *module.output_names)},
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes={name: {0: "batch"} for name in (*inputs, *outputs)},
         )
     model = onnx.load_from_string(buffer.getvalue())
     # the comma-separated keys are those that other consumers of RL policies read
@@ -124,24 +122,6 @@ def check(model: bytes, observations: np.ndarray, actions: np.ndarray) -> float:
             f"the exported policy differs from the trained one by {difference:g} (at most {TOLERANCE:g} is allowed); not published"
         )
     return difference
-
-
-def _observations(actor: MLPModel) -> Any:
-    """Observations as the policy has met them (its normaliser's moments), a few far outside: shape (SAMPLES, observations).
-
-    Of a policy that sees images, (IMAGES, channels, height, width): any bytes."""
-    import torch
-
-    generator = torch.Generator().manual_seed(0)
-    if not actor.obs_dim:
-        (example,) = actor.as_onnx(verbose=False).get_dummy_inputs()
-        shape = (IMAGES, *example.shape[1:])
-        return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
-    samples = torch.randn(SAMPLES, actor.obs_dim, generator=generator)
-    samples[-SAMPLES // 8 :] *= 5.0
-    if actor.obs_normalization:
-        samples = actor.obs_normalizer.inverse(samples)
-    return samples
 
 
 def main() -> int:

@@ -25,18 +25,22 @@ def main() -> int:
 
     with user_errors("train.task"):
         task_type = find_task(job.section["task"])
+    from worker.learning.algorithms import DEFAULT, find_algorithm, settings
+    from worker.learning.loop import Loop
     from worker.learning.memory import within_memory
-    from worker.learning.runner import Runner, total_worlds
+    from worker.learning.setup import total_worlds
 
+    config = configure(task_type, job.section)
+    name = job.section.get("algorithm", DEFAULT)
+    algorithm = find_algorithm(name)
+    learner = algorithm, settings(algorithm, name, config, job.section)
     worlds = -(-total_worlds(job, gang) // gang.size)
-    runner: Runner | None = None
+    loop: Loop | None = None
     # what fails later than the first iterations, which allocate everything, is not the worlds' fault
-    with within_memory(
-        task_type, configure(task_type, job.section), worlds, gang, lambda: runner is None or runner.iterated < 3
-    ):
-        runner = Runner(job, gang, task_type, stop)
-        code = runner.train()
-    runner.close()
+    with within_memory(task_type, config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
+        loop = Loop(job, gang, task_type, stop)
+        code = loop.train()
+    loop.close()
     return code
 
 

@@ -7,7 +7,7 @@ it, and :meth:`Algorithm.learn` may replay graphs of its own (:class:`worker.lea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -136,7 +136,8 @@ class Algorithm(Protocol):
     """
 
     config_type: ClassVar[Any]
-    """Its settings: a pydantic dataclass that is imported without torch."""
+    """Its settings: a pydantic dataclass that is imported without torch. ``fixed``, where it has that, names those that a resumed run
+    can't change."""
     captures_rollout: ClassVar[bool]
     """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.recording.Recorded`."""
 
@@ -178,10 +179,20 @@ class Algorithm(Protocol):
     def state_dict(self) -> Mapping[str, Any]:
         """All that outlasts an iteration and is the same on all ranks (live tensors and plain values), with the policy under ``policy``."""
 
-    def load_state_dict(self, state: Mapping[str, Any], *, weights_only: bool = False) -> None:
-        """Go on from :meth:`state_dict`; ``weights_only``: from its networks and normalisers alone, with a fresh optimizer.
+    def load_state_dict(
+        self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
+    ) -> Sequence[str]:
+        """Go on from :meth:`state_dict`.
 
-        Raises RuntimeError, ValueError or KeyError where it does not fit.
+        Args:
+            weights_only: From its networks and normalisers alone, with a fresh optimizer.
+            changed: Settings that this job gives otherwise than the one before it, so that they count, not what was saved.
+
+        Returns:
+            Lines for the log: what was set in place of what was saved.
+
+        Raises:
+            RuntimeError, ValueError, KeyError: It does not fit.
         """
 
     def world_state(self) -> Mapping[str, torch.Tensor]:

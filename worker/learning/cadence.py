@@ -1,14 +1,9 @@
-"""When to save, and whether this attempt still may."""
+"""When to save."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import time
 from collections.abc import Mapping
-
-from shared_store.epoch import check_epoch
-from shared_store.layout import Run
 
 OVERHEAD = 0.01
 """Share of the time that ``every: auto`` spends on saving."""
@@ -35,20 +30,3 @@ class Cadence:
             return False
         self._last = iteration
         return True
-
-
-class Fence:
-    """Looks, at most once a second, whether a newer attempt owns the run: a rank that was frozen for long sees it at once."""
-
-    def __init__(self, run: Run, epoch: int) -> None:
-        self.run, self.epoch = run, epoch
-        self._next = 0.0
-
-    def check(self) -> None:
-        """Raises StaleEpoch where a newer attempt owns the run."""
-        if time.monotonic() >= self._next:
-            with contextlib.suppress(
-                OSError, ValueError
-            ):  # a volume that is away for a while: the next look reads it again
-                check_epoch(self.run, self.epoch)
-            self._next = time.monotonic() + 1.0

@@ -12,7 +12,8 @@ import torch
 from shared_store.files import write_json
 from shared_store.layout import Run
 from worker.distributed import Gang
-from worker.learning.ppo.fused import PPO
+from worker.learning.algorithm import Policy
+from worker.learning.setup import observed
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
@@ -54,15 +55,16 @@ class Evaluation:
         return str(path)
 
 
-def evaluate(task: Task, ppo: PPO, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
+def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
     """Run at least ``episodes`` episodes, by default one a world; all ranks call it. The worlds are left as they were.
 
     Every world contributes equally many whole episodes, so that short ones are not counted more often than long ones.
     """
     started = time.perf_counter()
     before = task.state_dict()
-    rounds = 1 if episodes is None else math.ceil(episodes / ppo.share.total)
-    results = torch.cat([_one_episode(task, ppo) for _ in range(rounds)])
+    worlds = int(gang.sum(torch.tensor(float(task.world_count), device=gang.device)))
+    rounds = 1 if episodes is None else math.ceil(episodes / worlds)
+    results = torch.cat([_one_episode(task, policy) for _ in range(rounds)])
     task.load_state_dict(before)
     task.clear_statistics()
     returns, lengths, timed = results.double().unbind(1)
@@ -88,13 +90,16 @@ def evaluate(task: Task, ppo: PPO, gang: Gang, *, checkpoint: str, episodes: int
     )
 
 
-def _one_episode(task: Task, ppo: PPO) -> torch.Tensor:
+def _one_episode(task: Task, policy: Policy) -> torch.Tensor:
     """Return, length and whether only the clock ended it, of each world's first episode after a reset: shape (worlds, 3)."""
     task.reset()
+    policy.reset()
+    observations = observed(task)
     result = torch.zeros(task.world_count, 3, device=task.device)
     running = torch.ones(task.world_count, device=task.device)
     for step in range(task.max_episode_length):
-        task.step(ppo.act_mean(task.observations))
+        task.step(policy.act(observations))
+        policy.reset(task.dones)
         result[:, 0] += torch.where(running > 0, task.rewards, 0.0)
         result[:, 1] += running
         result[:, 2] += running * (task.time_outs > 0)

@@ -107,18 +107,18 @@ class Job:
 
 
 def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
-    """``task``'s configuration with the overrides of a ``train`` section (``config`` and ``ppo``).
+    """``task``'s configuration with the overrides of a ``train`` section (``config``).
 
     Raises UserError for a key that does not exist or a value of another type, naming both.
     """
     with user_errors(f"task {task.__name__}: its own configuration"):
         config = task.config_type()
-    ppo = _override(config.ppo, section.get("ppo") or {}, "ppo")
-    return _override(dataclasses.replace(config, ppo=ppo), section.get("config") or {}, "config")
+    return _override(config, section.get("config") or {}, "config")
 
 
 def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
-    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "ppo"}
+    # an algorithm's settings stand in a section of their own
+    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name not in ("ppo", "sac", "rsl_rl")}
     # settings that are a number, or a number for each name
     by_name = {f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")}
     changes: dict[str, Any] = {}

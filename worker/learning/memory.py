@@ -10,21 +10,21 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from worker.distributed import Gang
 from worker.errors import UserError
-from worker.learning.algorithm import Share
-from worker.learning.job import user_errors
-from worker.learning.ppo.fused import PPO
-from worker.learning.runner import build_task
+from worker.learning.algorithm import Algorithm, Share
+from worker.learning.setup import build_algorithm, build_task, observed, transition
 
 if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
+Learner = tuple[type[Algorithm], Any]
+"""An algorithm, and its settings."""
 FEW, MORE = 64, 2048
 """Worlds of two builds: the first loads kernels and libraries, the second is measured."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
@@ -36,19 +36,25 @@ SPARE = 0.9
 
 @contextmanager
 def within_memory(
-    task_type: type[Task], config: TaskConfig, worlds: int, gang: Gang, starting: Callable[[], bool] = lambda: True
+    task_type: type[Task],
+    config: TaskConfig,
+    learner: Learner,
+    worlds: int,
+    gang: Gang,
+    starting: Callable[[], bool] = lambda: True,
 ) -> Iterator[None]:
     """In here, worlds for which the memory does not suffice are the user's error, which says how many would do.
 
     Args:
         task_type: The task, with its ``config``.
+        learner: The algorithm, and its settings.
         worlds: The most that a rank has; the same number on all ranks.
         gang: On whose devices they are to be.
         starting: Whether memory that runs out now is that of the worlds; else its error passes.
     """
     free = free_bytes(gang)
     if worlds >= CHECKED[gang.device.partition(":")[0]]:
-        size = bytes_per_world(task_type, config, gang)
+        size = bytes_per_world(task_type, config, learner, gang)
         if worlds * size > SPARE * free:
             raise UserError(_explain(task_type, worlds, gang, free, size))
     try:
@@ -58,7 +64,7 @@ def within_memory(
             raise
         traceback.clear_frames(error.__traceback__)  # what was built so far goes
         try:
-            size = bytes_per_world(task_type, config, gang)
+            size = bytes_per_world(task_type, config, learner, gang)
         except Exception:  # on a device that is full, or in the middle of a recording: the first error is what counts
             size = 0.0
         raise UserError(_explain(task_type, worlds, gang, free, size)) from error
@@ -84,26 +90,31 @@ def free_bytes(gang: Gang) -> int:
     return max(free, 0) // gang.placement.local_world_size
 
 
-def bytes_per_world(task_type: type[Task], config: TaskConfig, gang: Gang) -> float:
+def bytes_per_world(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> float:
     """What a world takes with its part of rollout and update. Takes some seconds; every rank calls it."""
-    _taken(task_type, config, FEW, gang)
-    return _taken(task_type, config, MORE, gang) / MORE
+    _taken(task_type, config, learner, FEW, gang)
+    return _taken(task_type, config, learner, MORE, gang) / MORE
 
 
-def _taken(task_type: type[Task], config: TaskConfig, worlds: int, gang: Gang) -> int:
-    """The most memory that ``worlds`` take while they are built and learn from one minibatch."""
+def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
+    """The most memory that ``worlds`` take while they are built and learn once, from an iteration in which nothing moves."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()
     before = _start_measuring(gang.device)
     share = Share(0, worlds, worlds)
     task = build_task(task_type, config, share, gang, 0)
-    with user_errors():
-        learner = PPO(config.ppo, share, task.observation_shape, task.action_size, alone)
-    learner.begin_iteration(0)
-    learner._compute_gradients()
+    kind, settings = learner
+    algorithm = build_algorithm(kind, settings, task, share, alone, 0)
+    observations = observed(task)
+    step = transition(task, observations)
+    algorithm.begin(0)
+    for _ in range(algorithm.steps):
+        algorithm.act(observations)
+        algorithm.record(step)
+    algorithm.learn(observations)
     taken = _most(gang.device) - before
-    del task, learner
+    del task, algorithm, observations, step
     gc.collect()
     return max(taken, 0)
 

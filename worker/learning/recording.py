@@ -35,6 +35,11 @@ class Recorded:
         """How long recording took [s]."""
 
     @property
+    def can_be_captured(self) -> bool:
+        """Whether it will be, sooner or later."""
+        return self._cuda
+
+    @property
     def captured(self) -> bool:
         """Whether calls replay a graph by now."""
         return self._graph is not None

@@ -12,17 +12,18 @@ import torch
 from shared_store.files import write_atomic
 
 if TYPE_CHECKING:
-    from worker.learning.ppo.fused import PPO
+    from worker.learning.algorithm import Share
     from worker.tasks.task import Task
 
 
 class Replay:
     """Keeps, on the device, what :meth:`write` needs. Costs a copy of the worlds' state an iteration, in the rollout's own graph."""
 
-    def __init__(self, task: Task, ppo: PPO, section: dict[str, Any], seed: int) -> None:
-        self._ppo, self._section, self._seed = ppo, section, seed
+    def __init__(self, task: Task, share: Share, steps: int, section: dict[str, Any], seed: int) -> None:
+        self._share, self._section, self._seed = share, section, seed
         self._live = task.state_tensors()
         self._kept = {name: tensor.clone() for name, tensor in self._live.items()}
+        self._actions = torch.zeros(steps, *task.actions.shape, device=task.device)
         self._began: tuple[int, float | None, float | None] = (0, None, None)
 
     def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
@@ -33,9 +34,13 @@ class Replay:
         """The worlds are about to be stepped."""
         torch._foreach_copy_(list(self._kept.values()), list(self._live.values()))
 
+    def note(self, step: int, actions: torch.Tensor) -> None:
+        """What the worlds are about to do, shape (worlds, actions)."""
+        self._actions[step].copy_(actions)
+
     def write(self, path: Path, iteration: int) -> None:
         """Write the state at the beginning of the last iteration and all its actions."""
-        share = self._ppo.share
+        share = self._share
         content = {
             "iteration": iteration,
             "directory": os.getcwd(),
@@ -45,7 +50,7 @@ class Replay:
             "first_world": share.first,
             "worlds": share.count,
             "state": {name: tensor.cpu() for name, tensor in self._kept.items()},
-            "actions": self._ppo.storage.actions.cpu(),
+            "actions": self._actions.cpu(),
         }
         buffer = io.BytesIO()
         torch.save(content, buffer)

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import torch
 
 from shared_store.checkpoints import (
     Checkpoint,
@@ -24,9 +26,8 @@ from shared_store.checkpoints import (
 from shared_store.epoch import check_epoch
 from worker.distributed import Gang
 from worker.errors import UserError
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import Algorithm, Share
 from worker.learning.job import Job
-from worker.learning.ppo.fused import PPO
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
 from worker.learning.shards import Shards, read_file
@@ -84,10 +85,24 @@ class TrainingState:
     """What is saved and restored: the learner, this rank's worlds, the progress."""
 
     def __init__(
-        self, job: Job, gang: Gang, share: Share, task: Task, ppo: PPO, facts: dict[str, Any], keep: int
+        self,
+        job: Job,
+        gang: Gang,
+        share: Share,
+        task: Task,
+        algorithm: Algorithm,
+        facts: dict[str, Any],
+        keep: int,
     ) -> None:
         """``facts``: what the manifest says besides (task, configuration), for those who read a checkpoint without the job."""
-        self.job, self.gang, self.share, self.task, self.ppo, self.facts = job, gang, share, task, ppo, facts
+        self.job, self.gang, self.share, self.task, self.algorithm, self.facts = (
+            job,
+            gang,
+            share,
+            task,
+            algorithm,
+            facts,
+        )
         self.progress = Progress()
         self.seconds = 0.0
         """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
@@ -98,8 +113,8 @@ class TrainingState:
         """How long it took to read and take over the checkpoint that was loaded [s]; its digests not counted."""
         self.learning_rate: float | None = None
         """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
-        self.set_rate: float | None = None
-        """The learning rate that this job sets in place of the checkpoint's; None where the checkpoint's stays."""
+        self.set_anew: Sequence[str] = ()
+        """What this job's settings put in place of the checkpoint's, a line each."""
 
     def save(self) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
@@ -109,14 +124,18 @@ class TrainingState:
         worlds = {"first": self.share.first, "count": self.share.count}
         files: dict[str, Callable[[], Any]] = {
             f"rank-{self.gang.rank}.pt": lambda: {
-                "worlds": {**worlds, "state": self.task.state_dict()},
+                "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
                 "generators": generator_state(),
             }
         }
         if self.gang.is_main:
-            files["learner.pt"] = lambda: {"ppo": self.ppo.save(), "progress": asdict(self.progress)}
+            files["learner.pt"] = lambda: {"algorithm": self.algorithm.state_dict(), "progress": asdict(self.progress)}
         self.saver.save(self.progress.iteration, files, self._manifest() if self.gang.is_main else None)
         self.ordered_at = self.progress.iteration
+
+    def _of_algorithm(self) -> dict[str, torch.Tensor]:
+        """What the algorithm keeps for each world, beside what the task does."""
+        return {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
 
     def finish(self) -> list[str]:
         """Wait until every save is durable or has failed; every rank calls it. Returns lines for the log.
@@ -194,45 +213,39 @@ class TrainingState:
         self._check_fit(checkpoint)
         learner = read_file(checkpoint, "learner.pt", self.gang.device)
         try:
-            self.ppo.load(learner["ppo"])
+            self.set_anew = self.algorithm.load_state_dict(learner["algorithm"], changed=self._changed(checkpoint))
             self.progress = Progress(**learner["progress"])
         except (RuntimeError, ValueError, KeyError, TypeError) as error:
             raise UserError(
-                f"checkpoint {checkpoint.name} does not fit this job's task and networks: {error}"
+                f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {error}"
             ) from error
-        self.set_rate = self._rate_to_set(checkpoint)
-        if self.set_rate is not None:
-            self.ppo.learning_rate = self.set_rate
-        self.learning_rate = self.ppo.learning_rate
+        self.learning_rate = checkpoint.manifest.get("learning_rate")
         self.seconds = float(checkpoint.manifest.get("seconds", 0.0))
         self._load_worlds(checkpoint)
         self.saver.committed, self.ordered_at = checkpoint.name, checkpoint.iteration
         self.load_seconds = time.perf_counter() - started
 
-    def _rate_to_set(self, checkpoint: Checkpoint) -> float | None:
-        """The learning rate of this job's configuration, where it replaces the one that ``checkpoint`` arrived at.
-
-        A fixed rate always does. An adapted one does where the job sets another than the job before it did: otherwise the run
-        would not go on as if it had never stopped.
-        """
-        config = self.task.config.ppo
-        if config.schedule == "fixed":
-            return float(config.learning_rate)
+    def _changed(self, checkpoint: Checkpoint) -> set[str]:
+        """The algorithm's settings that differ from those of ``checkpoint``, or that the job gives and did not give there."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        for path in (("ppo", "learning_rate"), ("train", "ppo", "learning_rate")):
-            if "ppo" in there and _at(there, path) != _at(here, path):
-                return float(config.learning_rate)
-        return None
+        given = [("train", here["algorithm"]), ("train", "settings"), ("settings",)]
+        pairs = [(_at(there, path) or {}, _at(here, path) or {}) for path in given]
+        return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
         """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        learnt = [("ppo", key) for key in NETWORK if key in there.get("ppo", {})]
-        for path in [("task",), *(("train", key) for key in ("seed", "config")), *learnt]:
+        if "algorithm" not in there:
+            raise UserError(
+                f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
+            )
+        fixed = getattr(self.algorithm.config_type, "fixed", ())
+        settings = [("settings", key) for key in fixed if key in there["settings"]]
+        for path in [("task",), ("algorithm",), *(("train", key) for key in ("seed", "config")), *settings]:
             old, new = _at(there, path), _at(here, path)
             if old != new:
                 raise UserError(
-                    f"checkpoint {checkpoint.name} does not fit this job's task and networks: {'.'.join(path)} is "
+                    f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {_called(path, there)} is "
                     f"{old!r} there and {new!r} here; start a new run for that"
                 )
 
@@ -246,18 +259,23 @@ class TrainingState:
             )
         shards = Shards(checkpoint)
         try:
-            self.task.load_state_dict(shards.worlds(self.share.first, self.share.count))
+            state = shards.worlds(self.share.first, self.share.count)
+            own = {name: state.pop(name) for name in list(state) if name.startswith(_OF_ALGORITHM)}
+            self.task.load_state_dict(state)
+            self.algorithm.load_world_state({name.removeprefix(_OF_ALGORITHM): own[name] for name in own})
             if len(bounds) == self.gang.size:  # dealt out anew, a rank's own generators have no counterpart
                 restore_generators(shards.rank(self.gang.rank)["generators"])
         except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
 
 
-NETWORK = (
-    *("hidden_sizes", "activation", "normalize_observations", "init_std"),
-    *("channels", "kernel_sizes", "strides"),
-)
-"""Settings of PPO that make the network: a checkpoint holds what became of them, so that a resumed run can't change them."""
+_OF_ALGORITHM = "algorithm/"
+"""Begins the names of what an algorithm keeps for each world."""
+
+
+def _called(path: tuple[str, ...], manifest: Any) -> str:
+    """How a job's YAML calls it: settings stand under the algorithm's name."""
+    return ".".join((manifest["algorithm"] if part == "settings" else part) for part in path)
 
 
 def _at(facts: Any, path: tuple[str, ...]) -> Any:

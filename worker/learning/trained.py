@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints, newest_checkpoint
@@ -10,9 +9,8 @@ from shared_store.layout import Run
 from worker.errors import UserError
 
 if TYPE_CHECKING:
-    from rsl_rl.models.mlp_model import MLPModel
-
     from worker.distributed import Gang
+    from worker.learning.algorithm import Policy
 
 
 def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:
@@ -48,17 +46,26 @@ def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
     return found[-1]
 
 
-def load_actor(checkpoint: Checkpoint) -> MLPModel:
-    """The policy of ``checkpoint`` on the CPU, in evaluation mode."""
-    from worker.learning.ppo.models import build_models
+def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
+    """The policy of ``checkpoint``, without anything that learning needs.
+
+    >>> actions = load_policy(checkpoint).act({"policy": observations})  # shape (n, actions) for (n, observations)
+
+    Raises UserError where the checkpoint is of another version, or its algorithm can't be found.
+    """
+    from worker.learning.algorithms import find_algorithm
+    from worker.learning.setup import spaces_from
 
     facts = checkpoint.manifest
-    config: Any = SimpleNamespace(**facts["ppo"])
-    policy = facts["policy"]
-    shape = policy.get("observation_shape") or [policy["observation_size"]]  # the name of older checkpoints
-    actor, _ = build_models(config, shape, policy["action_size"])
-    actor.load_state_dict(load_learner(checkpoint)["ppo"]["actor_state_dict"])
-    return actor.eval()
+    if "algorithm" not in facts:
+        raise UserError(f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms")
+    algorithm = find_algorithm(facts["algorithm"])
+    policy = algorithm.build_policy(algorithm.config_type(**facts["settings"]), spaces_from(facts["policy"]), device)
+    try:
+        policy.load_state_dict(load_learner(checkpoint, device)["algorithm"]["policy"])
+    except (RuntimeError, KeyError) as error:
+        raise UserError(f"checkpoint {checkpoint.name}: its policy can't be read: {error}") from error
+    return policy
 
 
 def load_learner(checkpoint: Checkpoint, device: str = "cpu") -> dict[str, Any]:

@@ -59,6 +59,9 @@ class Point:
         self._sums = torch.zeros(world_count)
         self.observations = torch.zeros(world_count, 2)
         self.terminal_observations = torch.full((world_count, 2), float("nan"))
+        self.groups = {"policy": self.observations, "critic": self.observations}
+        self.terminal_groups = {"policy": self.terminal_observations, "critic": self.terminal_observations}
+        self.actions = torch.zeros(world_count, 1)
         self.rewards = torch.zeros(world_count)
         self.dones = torch.zeros(world_count, dtype=torch.bool)
         self.time_outs = torch.zeros(world_count, dtype=torch.bool)

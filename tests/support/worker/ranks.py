@@ -81,13 +81,13 @@ def train() -> int:
     from tests.support.worker.point_task import Point
     from worker.distributed import Placement, connect, use_cpu_threads
     from worker.learning.job import Job, StopRequest
-    from worker.learning.runner import Runner
+    from worker.learning.loop import Loop
 
     stop = StopRequest().listen()
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
     gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
-    code = Runner(job, gang, Point, stop).train()  # type: ignore[arg-type]
+    code = Loop(job, gang, Point, stop).train()  # type: ignore[arg-type]
     gang.close()
     return code
 

@@ -19,7 +19,7 @@ from tests.conftest import Serving
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from worker.errors import UserError
-from worker.learning.runner import Runner
+from worker.learning.loop import Loop
 from worker.learning.trained import load_learner
 
 
@@ -147,7 +147,7 @@ def store(trained: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "store"))
 
 
-def go_on(store: Path, **changes: Any) -> Runner:
+def go_on(store: Path, **changes: Any) -> Loop:
     return runner(training(store, iterations=4, epoch=2, **changes))
 
 
@@ -194,7 +194,7 @@ def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, na
         (b"", "learner.pt"),
         (b"no archive at all", "learner.pt"),
         ([1, 2], "learner.pt holds a list, not the state of a training"),
-        ({"progress": {}}, "does not fit this job's task and networks: 'ppo'"),
+        ({"progress": {}}, "does not fit this job's task and algorithm: 'ppo'"),
     ],
 )
 def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str) -> None:

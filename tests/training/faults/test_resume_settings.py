@@ -21,9 +21,9 @@ from tests.support.worker.runs import assert_same_bits, runner, train
 from worker.errors import UserError
 from worker.learning import state
 from worker.learning.job import configure
+from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.settings import PPOConfig
-from worker.learning.runner import Runner
 
 
 @pytest.fixture(scope="module")
@@ -34,32 +34,34 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return store
 
 
-def go_on(store: Path, **changes: Any) -> Runner:
+def go_on(store: Path, **changes: Any) -> Loop:
     return runner(training(store, iterations=4, epoch=2, **changes))
 
 
 @pytest.fixture(scope="module")
-def unchanged(store: Path) -> Runner:
+def unchanged(store: Path) -> Loop:
     return go_on(store)
 
 
 def objective(index: int) -> Callable[[PPO], float]:
-    return lambda ppo: ppo._objective._numbers[index]
+    return lambda ppo: ppo._head._objective._numbers[index]  # type: ignore[attr-defined]
 
 
 APPLIED: dict[str, tuple[Any, Callable[[PPO], Any]]] = {
-    "steps": (4, lambda ppo: len(ppo.storage.rewards)),
-    "epochs": (3, lambda ppo: ppo._orders.view(ppo.num_learning_epochs, ppo.num_mini_batches, -1).shape[0]),
-    "minibatches": (4, lambda ppo: ppo._orders.view(ppo.num_learning_epochs, ppo.num_mini_batches, -1).shape[1]),
+    "steps": (4, lambda ppo: len(ppo.rollout.rewards)),
+    "epochs": (3, lambda ppo: len(ppo._scratch)),
+    "minibatches": (4, lambda ppo: len(ppo._orders) // len(ppo._scratch)),
     "learning_rate": (1e-4, lambda ppo: float(ppo.optimizer.param_groups[0]["lr"])),
-    "schedule": ("fixed", lambda ppo: ppo.schedule),
-    "desired_kl": (0.02, lambda ppo: ppo.desired_kl),
-    "gamma": (0.9, lambda ppo: ppo.gamma),
-    "lam": (0.8, lambda ppo: ppo.lam),
+    "schedule": ("fixed", lambda ppo: ppo.config.schedule),
+    "desired_kl": (0.02, lambda ppo: ppo.config.desired_kl),
+    "gamma": (0.9, lambda ppo: ppo.config.gamma),
+    "lam": (0.8, lambda ppo: ppo.config.lam),
     "clip": (0.1, objective(0)),
-    "value_loss_coef": (0.5, objective(1)),
-    "entropy_coef": (0.01, objective(2)),
-    "max_grad_norm": (0.5, lambda ppo: ppo.max_grad_norm),
+    "clip_values": (False, objective(1)),
+    "value_loss_coef": (0.5, objective(2)),
+    "entropy_coef": (0.01, objective(3)),
+    "learning_rate_limits": ((1e-4, 1e-3), lambda ppo: ppo.config.learning_rate_limits),
+    "max_grad_norm": (0.5, lambda ppo: ppo.config.max_grad_norm),
 }
 """Of each setting that a resumed run may change: another value, and where the learner has it."""
 REFUSED: dict[str, Any] = {
@@ -67,6 +69,9 @@ REFUSED: dict[str, Any] = {
     "activation": "tanh",
     "normalize_observations": False,
     "init_std": 0.5,
+    "critic_hidden_sizes": [8],
+    "critic_observations": "critic",
+    "optimizer": "adamw",
     "channels": [16, 32, 16],
     "kernel_sizes": [8, 4, 2],
     "strides": [4, 2, 2],
@@ -74,7 +79,7 @@ REFUSED: dict[str, Any] = {
 """Of each setting that it can't change: another value."""
 
 
-def test_every_setting_is_in_one_of_the_two_tables(unchanged: Runner) -> None:
+def test_every_setting_is_in_one_of_the_two_tables(unchanged: Loop) -> None:
     refused = {"task", "seed", "config", "worlds"}  # test_refusals.py
     assert Train.model_fields.keys() == {*refused, "iterations", "ppo"}
     assert unchanged.iterations == 4, "the run was started with 2"
@@ -84,12 +89,12 @@ def test_every_setting_is_in_one_of_the_two_tables(unchanged: Runner) -> None:
 
 
 @pytest.mark.parametrize("name", APPLIED)
-def test_a_setting_that_is_accepted_is_what_the_learner_uses(store: Path, unchanged: Runner, name: str) -> None:
+def test_a_setting_that_is_accepted_is_what_the_learner_uses(store: Path, unchanged: Loop, name: str) -> None:
     value, used = APPLIED[name]
     after = go_on(store, ppo={name: value})
-    assert used(unchanged.ppo) != pytest.approx(value) and used(after.ppo) == pytest.approx(value)
+    assert used(unchanged.algorithm) != pytest.approx(value) and used(after.algorithm) == pytest.approx(value)
     assert after.resumed is not None
-    assert after.state._manifest()["ppo"][name] == pytest.approx(value)
+    assert after.state._manifest()["settings"][name] == pytest.approx(value)
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -101,9 +106,9 @@ def test_a_setting_that_the_network_holds_is_refused(store: Path, name: str) -> 
 def test_a_fixed_rate_is_the_rate_of_every_iteration_and_of_the_manifest(tmp_path: Path) -> None:
     train(training(tmp_path, iterations=2))
     resumed = train(training(tmp_path, iterations=4, epoch=2, ppo={"schedule": "fixed", "learning_rate": 2e-4}))
-    assert float(resumed.ppo.learning_rate_tensor) == pytest.approx(2e-4)
+    assert float(resumed.algorithm._rate) == pytest.approx(2e-4)
     manifest = list_checkpoints(Store(tmp_path).run("run"))[-1].manifest
-    assert manifest["learning_rate"] == pytest.approx(2e-4) and manifest["ppo"]["schedule"] == "fixed"
+    assert manifest["learning_rate"] == pytest.approx(2e-4) and manifest["settings"]["schedule"] == "fixed"
 
 
 def test_an_adapted_rate_goes_on_unless_the_setting_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,14 +117,14 @@ def test_an_adapted_rate_goes_on_unless_the_setting_changes(tmp_path: Path, caps
     adapted = saved.manifest["learning_rate"]
     assert adapted != pytest.approx(1e-3), "it was adapted"
     kept = go_on(tmp_path)
-    assert float(kept.ppo.learning_rate_tensor) == torch.tensor(adapted) and kept.state.set_rate is None
+    assert float(kept.algorithm._rate) == torch.tensor(adapted) and not kept.state.set_anew
     # the task's own rate, now that it is asked for
-    assert float(go_on(tmp_path, ppo={"learning_rate": 1e-3}).ppo.learning_rate_tensor) == pytest.approx(1e-3)
+    assert float(go_on(tmp_path, ppo={"learning_rate": 1e-3}).algorithm._rate) == pytest.approx(1e-3)
     changed = train(training(tmp_path, iterations=3, epoch=2, ppo={"learning_rate": 1e-4}))
     assert "learning rate set to 0.0001" in capsys.readouterr().out
     assert changed.state.learning_rate is not None and changed.state.learning_rate < 5e-4
     again = runner(training(tmp_path, iterations=4, epoch=3, ppo={"learning_rate": 1e-4}))
-    assert again.state.set_rate is None, "the next attempt of that job goes on with the rate that it has adapted since"
+    assert not again.state.set_anew, "the next attempt of that job goes on with the rate that it has adapted since"
 
 
 def test_a_run_with_a_fixed_rate_still_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -144,7 +149,5 @@ def test_a_task_whose_own_configuration_is_wrong_is_refused_in_one_line() -> Non
         config_type = Config
 
     with pytest.raises(UserError) as error:
-        configure(Task, {})  # type: ignore[arg-type]
-    assert str(error.value) == (
-        "task Task: its own configuration: schedule: expected one of adaptive, fixed; got 'linear'"
-    )
+        settings(PPO, "ppo", configure(Task, {}), {})  # type: ignore[arg-type]
+    assert str(error.value) == "ppo.schedule: Input should be 'adaptive' or 'fixed', got 'linear'"

@@ -19,7 +19,7 @@ from tests.support.worker.tasks import put, statistics
 from worker.distributed import Gang, Placement
 from worker.errors import TrainingError
 from worker.learning.job import Job, StopRequest
-from worker.learning.runner import Runner
+from worker.learning.loop import Loop
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 
 STILL = torch.zeros(4, 1)
@@ -63,13 +63,13 @@ def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None
     assert task.dones.tolist() == [False, False, True, False] and task.rewards[2] == 0, "finite, but past belief"
 
 
-def runner(path: Path, limit: float) -> Runner:
+def runner(path: Path, limit: float) -> Loop:
     env = training(
         path, iterations=3, worlds=16, config={"nan_limit": limit}, task="tests.support.worker.broken_task:Rooted"
     )
     job = Job.from_env(env, "train")
     raise_epoch(job.run, job.epoch)
-    return Runner(job, Gang(Placement(), "cpu", None, ["here"]), Rooted, StopRequest())
+    return Loop(job, Gang(Placement(), "cpu", None, ["here"]), Rooted, StopRequest())
 
 
 def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,7 @@ from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.export import export
 from worker.learning.job import Job, StopRequest, configure
-from worker.learning.runner import Runner
+from worker.learning.loop import Loop
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 from worker.tasks.config import Randomization
@@ -115,11 +115,11 @@ def test_what_only_a_camera_sees_needs_one_and_the_other_way_round() -> None:
         CartpolePixels(CartpolePixelsConfig(randomize=Randomization(observation_noise=0.1)), 1)
 
 
-def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Runner:
+def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Loop:
     env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task="CartpolePixels")
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)
-    started = Runner(job, Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+    started = Loop(job, Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
     assert started.train() == 0
     return started
 
@@ -168,7 +168,7 @@ def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: P
     with pytest.raises(
         UserError, match=r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
     ):
-        Runner(Job.from_env(env, "train"), Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+        Loop(Job.from_env(env, "train"), Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
 
 
 def test_layers_of_the_network_have_to_match() -> None:

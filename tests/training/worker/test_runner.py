@@ -91,7 +91,7 @@ def test_another_number_of_worlds_is_refused(two_ranks: Path) -> None:
 
 
 def test_another_network_is_refused(two_ranks: Path) -> None:
-    with pytest.raises(UserError, match="does not fit this job's task and networks"):
+    with pytest.raises(UserError, match="does not fit this job's task and algorithm"):
         runner(training(two_ranks, run="stopped", worlds=16, epoch=4, ppo={"hidden_sizes": [8]}))
 
 

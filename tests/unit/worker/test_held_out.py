@@ -16,7 +16,7 @@ from tests.support.worker.runs import train
 from worker.distributed import Gang, Placement
 from worker.learning.evaluation import evaluate
 from worker.learning.job import Job, StopRequest
-from worker.learning.runner import Runner
+from worker.learning.loop import Loop
 from worker.learning.state import Progress
 from worker.tasks.cartpole import Cartpole
 
@@ -67,11 +67,11 @@ def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -
 # -- evaluation ------------------------------------------------------------------------------------------------------
 
 
-def cartpole(store: Path, epoch: int = 1, **train: Any) -> Runner:
+def cartpole(store: Path, epoch: int = 1, **train: Any) -> Loop:
     env = training(store, epoch=epoch, task="Cartpole", worlds=16, iterations=2, **train)
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)
-    return Runner(job, Gang(Placement(), "cpu", None, ["here"]), Cartpole, StopRequest())
+    return Loop(job, Gang(Placement(), "cpu", None, ["here"]), Cartpole, StopRequest())
 
 
 def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
+from worker.learning.runner import describe
 
 from tests.support.worker.tasks import observe, put
 from worker.errors import UserError
 from worker.learning.job import configure
-from worker.learning.runner import describe
 from worker.tasks import BUILT_IN, find_task
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.interface import Interface

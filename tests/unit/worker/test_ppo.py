@@ -15,10 +15,12 @@ from torch.distributions import Normal
 
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.distributed import Gang, Placement
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.ppo import linear
-from worker.learning.ppo.fused import LOSSES, PPO
+from worker.learning.ppo.fused import PPO
+from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
 from worker.learning.ppo.objective import Objective
+from worker.learning.ppo.settings import PPOConfig
 from worker.learning.randomness import mix_seed
 
 
@@ -26,9 +28,20 @@ def alone() -> Gang:
     return Gang(Placement(), "cpu", None, ["here"])
 
 
-def make(worlds: int = 4, **settings: object) -> PPO:
+def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:
     torch.manual_seed(5)
-    return PPO(dataclasses.replace(PointPPO(), **settings), Share(0, worlds, worlds), (2,), 1, alone(), seed=1)
+    share = Share(first, worlds, total or worlds)
+    spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
+    return PPO(dataclasses.replace(PointPPO(), **settings), Setting(spaces, share, alone(), 1), plain=plain)
+
+
+def groups(observations: torch.Tensor) -> TensorDict:
+    return TensorDict({"policy": observations, "critic": observations}, [len(observations)])
+
+
+def transition(task: Point) -> Transition:
+    ended = groups(task.terminal_observations)
+    return Transition(groups(task.observations), ended, task.rewards, task.dones, task.time_outs)
 
 
 class FirstComponent(torch.nn.Module):
@@ -42,10 +55,15 @@ def play(
     ppo: PPO, observations: torch.Tensor, rewards: list, dones: list, time_outs: list, terminal: torch.Tensor
 ) -> None:
     """Put a rollout of one world into ``ppo``."""
-    ppo.begin_iteration(0)
-    for step, row in enumerate(zip(rewards, dones, time_outs, strict=True)):
-        ppo.act(observations[step].view(1, 2))
-        ppo.process_env_step(terminal[step].view(1, 2), *(torch.tensor([float(value)]) for value in row))
+    ppo.begin(0)
+    for step, (reward, done, time_out) in enumerate(zip(rewards, dones, time_outs, strict=True)):
+        ppo.act(groups(observations[step].view(1, 2)))
+        flags = (torch.tensor([bool(value)]) for value in (done, time_out))
+        ended = groups(terminal[step].view(1, 2))
+        ppo.record(Transition(groups(observations[step].view(1, 2)), ended, torch.tensor([float(reward)]), *flags))
+    for view in ppo.rollout.views:
+        view.last.copy_(observations[-1].view(1, 2))
+    ppo._estimate()
 
 
 # r = (1, 0, 2), V = (1, 2, 3), V after the last step 4, γ = 0.9, λ = 0.5; the second step ends an episode
@@ -57,11 +75,11 @@ def test_gae_by_hand() -> None:
     ppo = make(1, **RETURNS)
     ppo.critic.mlp = FirstComponent()
     play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 0, 0], torch.full((3, 2), float("nan")))
-    ppo.compute_returns(VALUES[3].view(1, 2))
     # δ₂ = 2 + 0.9·4 − 3 = 2.6, δ₁ = 0 − 2 = −2 (ended), δ₀ = 1 + 0.9·2 − 1 = 1.8; A = (1.8 + 0.45·(−2), −2, 2.6)
-    assert ppo.storage.returns.flatten().tolist() == pytest.approx([1.9, 0.0, 5.6])
+    assert ppo.rollout.returns.flatten().tolist() == pytest.approx([1.9, 0.0, 5.6])
     # mean 0.5, squares of the offsets 0.16 + 6.25 + 4.41, over n − 1 = 2: deviation √5.41
-    assert ppo.storage.advantages.flatten().tolist() == pytest.approx(
+    ppo._normalize()
+    assert ppo.rollout.advantages.flatten().tolist() == pytest.approx(
         [0.4 / 5.41**0.5, -2.5 / 5.41**0.5, 2.1 / 5.41**0.5]
     )
 
@@ -71,9 +89,8 @@ def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:
     ppo.critic.mlp = FirstComponent()
     terminal = torch.tensor([[float("nan"), 0.0], [5.0, 0.0], [float("nan"), 0.0]])
     play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 1, 0], terminal)
-    ppo.compute_returns(VALUES[3].view(1, 2))
     # now δ₁ = 0 + 0.9·5 − 2 = 2.5 and A₀ = 1.8 + 0.45·2.5 = 2.925; V(s_t) = 2 in place of 5 would give −0.2 and 1.71
-    assert ppo.storage.returns.flatten().tolist() == pytest.approx([3.925, 4.5, 5.6])
+    assert ppo.rollout.returns.flatten().tolist() == pytest.approx([3.925, 4.5, 5.6])
 
 
 @pytest.mark.parametrize(
@@ -90,32 +107,49 @@ def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:
 )
 def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
     ppo = make(desired_kl=0.01)
-    ppo.learning_rate = before
+    ppo._rate.fill_(before)
     ppo._adapt_learning_rate(torch.tensor(kl))
-    assert ppo.learning_rate == pytest.approx(after)
-    assert ppo.optimizer.param_groups[0]["lr"] is ppo.learning_rate_tensor
+    assert float(ppo._rate) == pytest.approx(after)
+    assert ppo.optimizer.param_groups[0]["lr"] is ppo._rate
 
 
 def test_a_fixed_schedule_keeps_the_learning_rate() -> None:
     ppo = make(schedule="fixed")
     ppo._adapt_learning_rate(torch.tensor(1.0))
-    assert ppo.learning_rate == pytest.approx(1e-3)
+    assert float(ppo._rate) == pytest.approx(1e-3)
 
 
-def test_noise_belongs_to_worlds_not_to_ranks() -> None:
-    def actions(first: int, count: int, iteration: int) -> torch.Tensor:
-        torch.manual_seed(5)
-        ppo = PPO(PointPPO(), Share(first, count, 6), (2,), 1, alone(), seed=1)
-        ppo.begin_iteration(iteration)
-        drawn = []
-        for ppo.storage.step in range(3):
-            drawn.append(ppo.act(torch.zeros(count, 2)).clone())
-        return torch.stack(drawn)
+def test_noise_and_minibatches_belong_to_worlds_not_to_ranks() -> None:
+    def drawn(first: int, count: int, iteration: int) -> tuple[torch.Tensor, torch.Tensor]:
+        ppo = make(count, first, 6, epochs=3)
+        ppo.begin(iteration)
+        actions = []
+        for ppo.rollout.step in range(3):
+            actions.append(ppo.act(groups(torch.zeros(count, 2))).clone())
+        ppo._draws.order(ppo._orders, ppo._scratch)
+        steps, worlds = ppo._orders // count, ppo._orders % count + first
+        return torch.stack(actions), torch.stack((steps, worlds))
 
-    whole = actions(0, 6, 4)
-    torch.testing.assert_close(whole, torch.cat((actions(0, 2, 4), actions(2, 4, 4)), 1))
-    assert not torch.allclose(whole, actions(0, 6, 5), atol=0.1)
+    (whole, order), (left, first), (right, second) = drawn(0, 6, 4), drawn(0, 2, 4), drawn(2, 4, 4)
+    torch.testing.assert_close(whole, torch.cat((left, right), 1))  # the network's outputs differ by rounding
+    assert torch.equal(order, torch.cat((first, second), 3))
+    other, later = drawn(0, 6, 5)
+    assert not torch.allclose(whole, other, atol=0.1) and not torch.equal(order, later)
     assert len(torch.unique(whole)) == whole.numel()
+
+
+def test_noise_is_normal_and_independent() -> None:
+    ppo = make(512, steps=32, minibatches=1)
+    ppo.begin(0)
+    drawn = []
+    for ppo.rollout.step in range(32):
+        mean = ppo.act(groups(torch.zeros(512, 2)))
+        drawn.append((mean - ppo.rollout.outputs[ppo.rollout.step]).flatten().clone())
+    noise = torch.stack(drawn)
+    assert abs(float(noise.mean())) < 0.03 and float(noise.std()) == pytest.approx(1.0, abs=0.02)
+    assert float((noise.abs() > 2.0).float().mean()) == pytest.approx(0.0455, abs=0.01)
+    for one, two in ((noise[1:], noise[:-1]), (noise[:, 1:], noise[:, :-1])):
+        assert abs(float((one * two).mean())) < 0.03
 
 
 def test_shares_cover_all_worlds_once() -> None:
@@ -123,8 +157,10 @@ def test_shares_cover_all_worlds_once() -> None:
     assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
 
 
-def test_fewer_samples_than_minibatches_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"ppo.minibatches: 9 minibatches .* a rank collects 8"):
+def test_more_minibatches_than_steps_are_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"ppo.minibatches: 9 minibatches need as many steps of each world, there are 8"
+    ):
         make(1, minibatches=9)
 
 
@@ -163,27 +199,27 @@ def test_an_update_is_that_of_rsl_rl(entropy_coef: float) -> None:
     stock = stock_twin(ppo, config, worlds)
     task = Point(PointConfig(episode_seconds=1000.0), worlds)
     for iteration in range(3):
-        ppo.begin_iteration(iteration)
+        ppo.begin(iteration)
         for _ in range(config.steps):
+            seen = groups(task.observations)
             stock.act(TensorDict({"policy": task.observations.clone()}, batch_size=[worlds]))
-            task.step(ppo.act(task.observations))
-            ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
+            task.step(ppo.act(seen))
+            ppo.record(transition(task))
             stock.transition.rewards, stock.transition.dones = task.rewards.clone(), task.dones.clone()
             stock.storage.add_transition(stock.transition)
             stock.transition.clear()
-        stock.storage.actions.copy_(ppo.storage.actions)
+        stock.storage.actions.copy_(ppo.rollout.actions)
         # the actions are ours: rsl-rl's own draws would differ
         stock.actor.distribution.update(stock.storage.distribution_params[0])
         stock.storage.actions_log_prob[..., 0] = stock.actor.distribution.log_prob(stock.storage.actions).detach()
-        ppo.compute_returns(task.observations)
         stock.compute_returns(TensorDict({"policy": task.observations}, batch_size=[worlds]))
-        torch.testing.assert_close(ppo.storage.advantages, stock.storage.advantages, rtol=1e-4, atol=1e-5)
-        losses = dict(zip(LOSSES, ppo.update().tolist(), strict=True))
+        losses = {name: float(value) for name, value in ppo.learn(groups(task.observations)).items()}
+        torch.testing.assert_close(ppo.rollout.advantages, stock.storage.advantages[..., 0], rtol=1e-4, atol=1e-5)
         theirs = stock.update()
         assert losses["value_loss"] == pytest.approx(theirs["value"], rel=1e-4)
         assert losses["surrogate_loss"] == pytest.approx(theirs["surrogate"], rel=1e-3, abs=1e-6)
         assert losses["entropy"] == pytest.approx(theirs["entropy"], rel=1e-5)
-        assert ppo.learning_rate == pytest.approx(stock.learning_rate)
+        assert losses["learning_rate"] == pytest.approx(stock.learning_rate)
     for ours, other in ((ppo.actor, stock.actor), (ppo.critic, stock.critic)):
         for name, tensor in ours.state_dict().items():
             torch.testing.assert_close(tensor, other.state_dict()[name], rtol=1e-3, atol=1e-4, msg=name)
@@ -193,24 +229,24 @@ def test_an_update_is_that_of_rsl_rl(entropy_coef: float) -> None:
 def test_losses_ignore_what_terminal_observations_hold_where_nothing_ended() -> None:
     ppo = make()
     task = Point(PointConfig(), 4)
-    ppo.begin_iteration(0)
+    ppo.begin(0)
     for _ in range(8):
-        task.step(ppo.act(task.observations))
+        task.step(ppo.act(groups(task.observations)))
         terminal = torch.where(task.time_outs.unsqueeze(1), task.terminal_observations, float("nan"))
-        ppo.process_env_step(terminal, task.rewards, task.dones, task.time_outs)
-    ppo.compute_returns(task.observations)
-    assert torch.isfinite(ppo.update()).all()
+        ppo.record(dataclasses.replace(transition(task), terminal_observations=groups(terminal)))
+    assert all(torch.isfinite(value) for value in ppo.learn(groups(task.observations)).values())
 
 
-def test_every_epoch_has_its_own_order() -> None:
+def test_every_epoch_has_its_own_minibatches_with_each_sample_once_and_as_many_of_every_world() -> None:
     ppo = make(epochs=3, minibatches=2)
-    ppo.begin_iteration(0)
-    first, second, third = ppo._orders.view(3, -1).clone()
-    assert not torch.equal(first, second) and not torch.equal(second, third)
-    for epoch in (first, second, third):  # each sample once
-        assert torch.equal(epoch.sort().values, torch.arange(32))
-    ppo.begin_iteration(1)
-    assert not torch.equal(first, ppo._orders.view(3, -1)[0])
+    ppo.begin(0)
+    ppo._draws.order(ppo._orders, ppo._scratch)
+    epochs = ppo._orders.view(3, 2, -1).clone()
+    assert not torch.equal(epochs[0], epochs[1]) and not torch.equal(epochs[1], epochs[2])
+    for epoch in epochs:
+        assert torch.equal(epoch.flatten().sort().values, torch.arange(32))
+        for minibatch in epoch:
+            assert (minibatch % 4).bincount().tolist() == [4, 4, 4, 4]
 
 
 def test_gradients_of_a_layer_are_those_of_torch() -> None:
@@ -246,11 +282,82 @@ def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
 
     order = torch.randperm(samples)
     rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
-    numbers = {"weight": weight, "clip": clip, "value_coef": value_coef, "entropy_coef": entropy_coef}
-    objective = Objective(samples, actions, "cpu", **numbers)
+    settings = Clipping(clip, True, value_coef, entropy_coef)
+    objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
     losses = objective.backward(order, rollout, old_std, *leaves)
     torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
 
     mean.data[7, 0] = float("nan")
     assert objective.backward(order, rollout, old_std, *leaves)[[0, 3]].isnan().all()
     assert mean.grad[7].isnan().all()
+
+
+@pytest.mark.parametrize("clip_values", [True, False])
+def test_the_kernel_is_the_plain_loss_on_random_data(clip_values: bool) -> None:
+    torch.manual_seed(4)
+    samples, actions, weight = 300, 4, 0.3
+    settings = Clipping(0.2, clip_values, 0.6, 0.01)
+    drawn, old_mean = (torch.randn(samples, actions) for _ in range(2))
+    old_std, std = torch.rand(actions) + 0.5, (torch.rand(actions) + 0.5).requires_grad_()
+    mean, values = torch.randn(samples, actions, requires_grad=True), torch.randn(samples, 1, requires_grad=True)
+    told = Samples(
+        gaussian_terms(drawn, old_mean, old_std, old_mean, old_std)[0], *(torch.randn(samples) for _ in range(3))
+    )
+    terms = gaussian_terms(drawn, old_mean, old_std, mean, std)
+    loss, losses = clipped_loss(settings, told, *terms, values[:, 0])
+    expected = [*torch.autograd.grad(weight * loss, (mean, std, values)), weight * losses]
+    objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
+    rollout = (drawn, old_mean, told.log_prob, told.advantages, told.returns, told.values)
+    found = objective.backward(torch.arange(samples), rollout, old_std, mean, std, values)
+    torch.testing.assert_close([mean.grad, std.grad, values.grad, found], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_choices_are_those_of_torch() -> None:
+    torch.manual_seed(6)
+    old, new = torch.randn(50, 5), torch.randn(50, 5)
+    choices = torch.randint(0, 5, (50, 1))
+    log_prob, entropy, kl = categorical_terms(choices.float(), old, new)
+    policy, before = (torch.distributions.Categorical(logits=each) for each in (new, old))
+    torch.testing.assert_close(log_prob, policy.log_prob(choices[:, 0]))
+    torch.testing.assert_close(entropy, policy.entropy())
+    torch.testing.assert_close(kl, torch.distributions.kl_divergence(before, policy))
+
+
+def played(ppo: PPO, iterations: int = 3) -> dict[str, torch.Tensor]:
+    """The networks after some iterations on the point task."""
+    task = Point(PointConfig(), ppo.setting.share.count)
+    for iteration in range(iterations):
+        ppo.begin(iteration)
+        for _ in range(ppo.steps):
+            task.step(ppo.act(groups(task.observations)))
+            ppo.record(transition(task))
+        ppo.learn(groups(task.observations))
+    return {**ppo.actor.state_dict(), **{f"critic.{name}": each for name, each in ppo.critic.state_dict().items()}}
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"clip_values": False}, {"schedule": "fixed"}, {"critic_observations": "critic"}]
+)
+def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) -> None:
+    fused, plain = played(make(**settings)), played(make(plain=True, **settings))
+    for name, tensor in fused.items():
+        torch.testing.assert_close(tensor, plain[name], rtol=1e-3, atol=1e-5, msg=name)
+
+
+def test_a_critic_of_its_own_has_its_own_widths_and_normaliser() -> None:
+    ppo = make(critic_observations="critic", critic_hidden_sizes=(24,))
+    assert [layer.out_features for layer in ppo.critic.mlp if isinstance(layer, torch.nn.Linear)] == [24, 1]
+    assert ppo.critic.obs_normalizer is not ppo.actor.obs_normalizer
+    played(ppo)
+    assert int(ppo.critic.obs_normalizer.count) == int(ppo.actor.obs_normalizer.count) == 96
+    torch.testing.assert_close(ppo.critic.obs_normalizer._mean, ppo.actor.obs_normalizer._mean)
+
+
+def test_what_it_can_not_do_it_refuses_by_name() -> None:
+    with pytest.raises(ValueError, match=r"critic_observations: the task has no group 'critic'; it has policy"):
+        PPO(PointPPO(critic_observations="critic"), Setting(Spaces({"policy": (2,)}, 1), Share(0, 4, 4), alone(), 1))
+    with pytest.raises(ValueError, match=r"'critic' is a group of images .*; rsl_rl can do that"):
+        spaces = Spaces({"policy": (2,), "critic": (3, 8, 8)}, 1)
+        PPO(PointPPO(critic_observations="critic"), Setting(spaces, Share(0, 4, 4), alone(), 1))
+    with pytest.raises(ValueError, match="adam has none; set optimizer: adamw"):
+        PPOConfig(weight_decay=0.1)

@@ -1,11 +1,12 @@
-"""The networks: rsl-rl's models, with the image's bytes made into numbers inside."""
+"""The networks: rsl-rl's models, with the image's bytes made into numbers inside, and the policy that is made of the actor."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from rsl_rl.models.cnn_model import CNNModel
@@ -14,11 +15,11 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 
-if TYPE_CHECKING:
-    from worker.learning.ppo.settings import PPOConfig
+from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
+from worker.learning.ppo.settings import PPOConfig
 
-GROUP = "policy"
-"""Name of the one observation group."""
+SAMPLES, IMAGES = 1024, 16
+"""Observations on which an exported policy is compared: numbers, or images, for which ONNX's evaluator takes its time."""
 
 
 class PixelModel(CNNModel):
@@ -27,28 +28,7 @@ class PixelModel(CNNModel):
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
         """What the convolutions make of images, shape (batch, channels, height, width), uint8: shape (batch, features)."""
         # the bytes are few: bring them into the order that convolutions are fastest with before they become numbers
-        return self.cnns[GROUP](to_numbers(obs[GROUP].contiguous(memory_format=torch.channels_last)))
-
-    def as_onnx(self, verbose: bool = False) -> nn.Module:
-        """The mean action for images of bytes."""
-        return _PixelPolicy(self)
-
-
-class _PixelPolicy(nn.Module):
-    """The policy as one module with one input, as it is exported."""
-
-    input_names, output_names = ["obs"], ["actions"]
-
-    def __init__(self, model: PixelModel) -> None:
-        super().__init__()
-        self.cnn, self.mlp = model.cnns[GROUP], model.mlp
-        self._shape = (model.obs_channels_2d[0], *model.obs_dims_2d[0])
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return self.mlp(self.cnn(to_numbers(obs)))
-
-    def get_dummy_inputs(self) -> tuple[torch.Tensor]:
-        return (torch.zeros(1, *self._shape, dtype=torch.uint8),)
+        return self.cnns[POLICY](to_numbers(obs[POLICY].contiguous(memory_format=torch.channels_last)))
 
 
 def to_numbers(images: torch.Tensor) -> torch.Tensor:
@@ -56,34 +36,107 @@ def to_numbers(images: torch.Tensor) -> torch.Tensor:
     return images.to(torch.float32) / 255.0 - 0.5
 
 
-def build_models(
-    config: PPOConfig, observation_shape: Sequence[int], action_size: int
-) -> tuple[MLPModel | PixelModel, MLPModel | PixelModel]:
-    """Actor, a Gaussian with its own learnt deviation, and critic.
+class ActorPolicy:
+    """The mean action, or of a task with choices the likeliest; made of the actor's network alone."""
 
-    For vectors two MLPs over one shared observation normaliser; for images two MLPs over one shared stack of convolutions.
-    """
-    example = example_observations(1, observation_shape, "cpu")
-    groups = {"actor": [GROUP], "critic": [GROUP]}
-    common = {"hidden_dims": tuple(config.hidden_sizes), "activation": config.activation}
-    distribution = {"class_name": GaussianDistribution, "init_std": config.init_std}
-    if len(observation_shape) == 1:
+    def __init__(self, actor: MLPModel | PixelModel, spaces: Spaces) -> None:
+        self.actor, self._spaces = actor, spaces
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict | Mapping[str, torch.Tensor]) -> torch.Tensor:
+        outputs = self.actor.mlp(self.actor.get_latent({POLICY: observations[POLICY]}))
+        return outputs.argmax(1, keepdim=True).to(torch.float32) if self._spaces.discrete else outputs
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """It remembers nothing."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(self.actor.state_dict())
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Any:
+        return self.actor.load_state_dict(state)
+
+    def module(self) -> ExportedPolicy:
+        actor = copy.deepcopy(self.actor).cpu().eval()
+        network = _Network(actor, self._spaces.discrete).eval()
+        seen = _seen(actor, self._spaces.observations[POLICY])
+        return ExportedPolicy(network, {"obs": seen[:1]}, ["actions"], TensorDict({POLICY: seen}, [len(seen)]))
+
+
+class _Network(nn.Module):
+    """The policy as one module with one input, as it is exported: the normaliser, or the making of numbers, is inside."""
+
+    def __init__(self, actor: MLPModel | PixelModel, discrete: bool) -> None:
+        super().__init__()
+        self.mlp, self._discrete = actor.mlp, discrete
+        if isinstance(actor, PixelModel):
+            self.before: nn.Module = nn.Sequential(_Numbers(), actor.cnns[POLICY])
+        else:
+            self.before = actor.obs_normalizer
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        outputs = self.mlp(self.before(obs))
+        return outputs.argmax(1, keepdim=True).to(torch.float32) if self._discrete else outputs
+
+
+class _Numbers(nn.Module):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return to_numbers(obs)
+
+
+def _seen(actor: MLPModel | PixelModel, shape: Sequence[int]) -> torch.Tensor:
+    """Observations as the policy has met them (its normaliser's moments), a few far outside; of one that sees images, any bytes."""
+    generator = torch.Generator().manual_seed(0)
+    if len(shape) > 1:
+        return torch.randint(0, 256, (IMAGES, *shape), dtype=torch.uint8, generator=generator)
+    samples = torch.randn(SAMPLES, *shape, generator=generator)
+    samples[-SAMPLES // 8 :] *= 5.0
+    return actor.obs_normalizer.inverse(samples) if actor.obs_normalization else samples
+
+
+def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:
+    """A network that sees the group ``policy``: its outputs are the mean of a Gaussian with its own learnt deviation, or logits."""
+    example, common = spaces.example(1, "cpu"), _common(config, config.hidden_sizes)
+    if not spaces.discrete:
+        common["distribution_cfg"] = {"class_name": GaussianDistribution, "init_std": config.init_std}
+    shape = spaces.observations[POLICY]
+    groups = {"actor": [POLICY]}
+    if len(shape) == 1:
         common["obs_normalization"] = config.normalize_observations
-        actor = MLPModel(example, groups, "actor", action_size, distribution_cfg=distribution, **common)
-        critic = MLPModel(example, groups, "critic", 1, **common)
+        return MLPModel(example, groups, "actor", spaces.actions, **common)
+    _check_layers(config, shape)
+    layers = {"output_channels": config.channels, "kernel_size": config.kernel_sizes, "stride": config.strides}
+    layers = {name: list(value) for name, value in layers.items()} | {"activation": config.activation}
+    return PixelModel(example, groups, "actor", spaces.actions, cnn_cfg=layers, **common)
+
+
+def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel) -> MLPModel | PixelModel:
+    """A network whose output is a value. One that sees what the actor does shares its normaliser, or its convolutions.
+
+    Raises ValueError where the task has no such group, or it is one of images.
+    """
+    group = config.critic_observations
+    if group not in spaces.observations:
+        raise ValueError(
+            f"critic_observations: the task has no group {group!r}; it has {', '.join(spaces.observations)}"
+        )
+    example, common = spaces.example(1, "cpu"), _common(config, config.critic_hidden_sizes or config.hidden_sizes)
+    groups = {"critic": [group]}
+    if isinstance(actor, PixelModel) and group == POLICY:
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl says that they are shared
+            return PixelModel(example, groups, "critic", 1, cnns=actor.cnns, **common)
+    if len(spaces.observations[group]) > 1:
+        raise ValueError(
+            f"critic_observations: {group!r} is a group of images that the policy does not see; rsl_rl can do that"
+        )
+    critic = MLPModel(example, groups, "critic", 1, obs_normalization=config.normalize_observations, **common)
+    if group == POLICY:
         critic.obs_normalizer = actor.obs_normalizer  # both see the same observations: keep one set of moments
-        return actor, critic
-    _check_layers(config, observation_shape)
-    layers = {
-        "output_channels": list(config.channels),
-        "kernel_size": list(config.kernel_sizes),
-        "stride": list(config.strides),
-        "activation": config.activation,
-    }
-    seeing = PixelModel(example, groups, "actor", action_size, distribution_cfg=distribution, cnn_cfg=layers, **common)
-    with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl says that they are shared
-        judging = PixelModel(example, groups, "critic", 1, cnns=seeing.cnns, **common)
-    return seeing, judging
+    return critic
+
+
+def _common(config: PPOConfig, sizes: Sequence[int]) -> dict[str, Any]:
+    return {"hidden_dims": tuple(sizes), "activation": config.activation}
 
 
 def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:
@@ -96,10 +149,3 @@ def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:
                 f"the image of {shape[2]} x {shape[1]}; change kernel_sizes and strides, or the camera's size"
             )
         height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
-
-
-def example_observations(worlds: int, shape: Sequence[int], device: str) -> TensorDict:
-    """Zeros in the form in which rsl-rl's constructors want observations: shape (worlds, *shape), images as bytes."""
-    dtype = torch.float32 if len(shape) == 1 else torch.uint8
-    zeros = torch.zeros(worlds, *shape, device=device, dtype=dtype)
-    return TensorDict({GROUP: zeros}, batch_size=[worlds], device=device)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from worker.learning.ppo.loss import LOSSES, Clipping
 from worker.simulation.capture import on_torch_stream
-
-LOSSES = ("surrogate_loss", "value_loss", "entropy", "kl")
-"""The first columns of what the kernel writes; the gradient of each component of the deviation follows."""
 
 _HALF_LOG_TWO_PI = wp.constant(0.9189385332046727)
 
@@ -27,6 +25,7 @@ def _objective(
     std: wp.array(dtype=wp.float32),
     values: wp.array(dtype=wp.float32),
     clip: wp.float32,
+    clip_values: wp.bool,
     value_coef: wp.float32,
     entropy_coef: wp.float32,
     scale: wp.float32,
@@ -34,7 +33,7 @@ def _objective(
     value_gradient: wp.array(dtype=wp.float32),
     terms: wp.array2d(dtype=wp.float32),
 ):
-    """One sample. Comparisons are such that NaN, which none of them holds for, goes on into losses and gradients."""
+    """One sample; columns of ``terms`` are :data:`LOSSES`, then the gradient of each component of the deviation. Comparisons are such that NaN, which none of them holds for, goes on into losses and gradients."""
     i = wp.tid()
     row = rows[i]
     log_prob = wp.float32(0.0)
@@ -62,7 +61,7 @@ def _objective(
     value = error * error
     value_slope = 2.0 * error
     change = values[i] - old_values[row]
-    if change < -clip or change > clip:
+    if clip_values and (change < -clip or change > clip):
         near = old_values[row] + wp.clamp(change, -clip, clip) - returns[row]
         if near * near >= value:
             value = near * near
@@ -85,29 +84,20 @@ def load(device: str) -> None:
 
 
 class Objective:
-    """The clipped objective (arXiv:1707.06347, eq. 7 and 9, and rsl-rl's clipped value loss) of minibatches of one size.
+    """:func:`worker.learning.ppo.loss.clipped_loss` of a diagonal Gaussian, for minibatches of one size.
 
     Args:
         samples: Samples of a minibatch.
         actions: Length of an action.
         device: ``"cpu"`` or ``"cuda:<n>"``.
         weight: Of the mean over a minibatch, in losses and gradients alike: this rank's part of all ranks' samples.
-        clip: Ratios are clipped to 1 ± ``clip``, values to the old ones ± ``clip``.
+        settings: The weights of the loss.
     """
 
-    def __init__(
-        self,
-        samples: int,
-        actions: int,
-        device: str,
-        *,
-        weight: float,
-        clip: float,
-        value_coef: float,
-        entropy_coef: float,
-    ) -> None:
+    def __init__(self, samples: int, actions: int, device: str, *, weight: float, settings: Clipping) -> None:
         wp.init()
-        self._numbers = (clip, value_coef, entropy_coef, weight / samples)
+        coefficients = settings.value_coef, settings.entropy_coef
+        self._numbers = (settings.clip, settings.clip_values, *coefficients, weight / samples)
         self._device = device
         self._mean_gradient = torch.zeros(samples, actions, device=device)
         self._value_gradient = torch.zeros(samples, 1, device=device)
@@ -135,7 +125,7 @@ class Objective:
             values: Of the critic now, shape (samples, 1).
 
         Returns:
-            The weighted means of :data:`LOSSES`, shape (4,).
+            The weighted means of :data:`worker.learning.ppo.loss.LOSSES`, shape (4,).
         """
         read = (rows, *rollout, old_std, mean.detach(), std.detach(), values.detach().view(-1))
         written = (self._mean_gradient, self._value_gradient.view(-1), self._terms)

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import statistics
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-import warp
 
 from shared_store.outcomes import EX_TEMPFAIL
-from worker.distributed import Gang, warm_marker
-from worker.errors import TrainingError, UserError
+from worker.distributed import Gang
+from worker.errors import TrainingError
+from worker.learning import algorithms
 from worker.learning.algorithm import Share
 from worker.learning.beacon import Beacon
-from worker.learning.cadence import Cadence, Fence
+from worker.learning.cadence import Cadence
 from worker.learning.evaluation import evaluate
 from worker.learning.faults import die, kill_at
-from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
-from worker.learning.ppo import objective
-from worker.learning.ppo.fused import LOSSES, PPO
+from worker.learning.job import Job, StopRequest, configure, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.recording import HostCopy, Recorded
 from worker.learning.replay import Replay
 from worker.learning.report import Report, Stopwatch
+from worker.learning.reporter import Fence, Reporter
+from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
 from worker.learning.state import TrainingState
+from worker.learning.totals import Totals
 from worker.tasks.config import value_at
 
 if TYPE_CHECKING:
-    from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
 
@@ -44,7 +44,7 @@ SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
 many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
 
 
-class Runner:
+class Loop:
     """Trains one task on the worlds of one rank, in step with the other ranks."""
 
     def __init__(self, job: Job, gang: Gang, task_type: type[Task], stop: StopRequest) -> None:
@@ -62,18 +62,14 @@ class Runner:
         share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
         seed_generators(self.seed)
         self.task = build_task(task_type, self.config, share, gang, self.seed)
-        with user_errors():
-            self.ppo = PPO(
-                self.config.ppo,
-                share,
-                self.task.observation_shape,
-                self.task.action_size,
-                gang,
-                seed=self.seed,
-                extras=2 * gang.size + len(self.task.statistic_names) + len(SIGNALS),
-            )
-        self.replay = Replay(self.task, self.ppo, job.section, self.seed)
-        self.ppo.broadcast_parameters()
+        self.algorithm_name = job.section.get("algorithm", algorithms.DEFAULT)
+        chosen = algorithms.find_algorithm(self.algorithm_name)
+        settings = algorithms.settings(chosen, self.algorithm_name, self.config, job.section)
+        self.share = share
+        self.algorithm = build_algorithm(chosen, settings, self.task, share, gang, self.seed)
+        self._observations = observed(self.task)
+        self._step = transition(self.task, self._observations)
+        self.replay = Replay(self.task, share, self.algorithm.steps, job.section, self.seed)
         seed_generators(self.seed, gang.rank)
         self.iterated = 0
         """Iterations that this process has done."""
@@ -82,8 +78,8 @@ class Runner:
             gang,
             share,
             self.task,
-            self.ppo,
-            describe(job, self.task, self.config),
+            self.algorithm,
+            describe(job, self.task, self.config, self.algorithm_name, settings),
             int(checkpoints.get("keep", 5)),
         )
         self.resumed = self.state.restore()
@@ -91,12 +87,24 @@ class Runner:
             self.task.set_random_episode_length()
         self.task.clear_statistics()
         self._stopwatch = Stopwatch(gang.device)
-        self._collecting = Recorded(self._collect, gang.device, "rollout")
+        captured = gang.device if self.algorithm.captures_rollout else "cpu"
+        self._collecting = Recorded(self._collect, captured, "rollout")
         self._numbers = HostCopy(gang.device)
-        self._own_signals = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
+        self._totals = Totals(
+            {
+                "collected": gang.size,  # [s], of each rank in the iteration before
+                "mishap": gang.size,  # of each rank, see Task.read_mishap
+                "statistics": len(self.task.statistic_names),
+                **dict.fromkeys(SIGNALS, 1),
+            },
+            gang.device,
+        )
+        self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
+        self._read_at = time.perf_counter()
         self._told_captured = False
         self._warnings = 0
         self._iteration_seconds = self._collect_seconds = self._stall_seconds = 0.0
+        self.reporter = Reporter()
         self.fence = Fence(job.run, job.epoch)
         self.beacon = Beacon()
         self.state.saver.start()
@@ -110,6 +118,7 @@ class Runner:
         progress = self.state.progress
         report = Report(self.job, self.iterations, progress.iteration) if self.gang.is_main else None
         self._say(self._beginning())
+        self._read_at = time.perf_counter()
         try:
             while progress.iteration < self.iterations:
                 record, signals = self._iterate()
@@ -117,32 +126,38 @@ class Runner:
                     die()
                 self.fence.check()
                 if report:
-                    report.iteration(record)
+                    self.reporter.do(report.iteration, record)
                 self._tell_captured()
                 self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
                 if self._handle(signals):
                     self._say(f"asked to stop: left after iteration {progress.iteration} of {self.iterations}")
                     return EX_TEMPFAIL
+            self._finish()
+            return 0
         finally:
             if report:
-                report.close()
-        self._finish()
-        return 0
+                self.reporter.do(report.close)
+            self.reporter.close()
+            self.fence.close()
 
     def close(self) -> None:
         """Leave the gang; nothing can be trained afterwards."""
-        for part in (self._collecting, *self.ppo.recordings):
+        for part in (self._collecting, *self.algorithm.recordings):
             part.release()
         self.gang.close()
 
     def _tell_captured(self) -> None:
         """Say once, when it has come to that, which parts of an iteration the device replays by itself."""
-        parts = [self._collecting, *self.ppo.recordings]
-        if not self._told_captured and all(part.captured for part in parts):
+        parts = [self._collecting, *self.algorithm.recordings]
+        if (
+            not self._told_captured
+            and all(part.captured or not part.can_be_captured for part in parts)
+            and any(part.captured for part in parts)
+        ):
             self._told_captured = True
             self._say(
                 "captured as CUDA graphs: "
-                + ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in parts)
+                + ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in parts if part.captured)
             )
 
     def _handle(self, signals: dict[str, float]) -> bool:
@@ -153,6 +168,7 @@ class Runner:
             state.saver.abandon()
         due = self.cadence.due(iteration, signals)
         if stopping or due or signals["save_now"] > 0 or iteration == self.iterations:
+            self.reporter.flush()  # a run that goes on from this save has the records before it
             state.save()
             self._stall_seconds = state.saver.stall
         self._tell_saved(state.saver.poll())
@@ -162,60 +178,60 @@ class Runner:
 
     def _beginning(self) -> str:
         ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
-        there = f"{self.ppo.share.total} worlds on {ranks}"
+        there = f"{self.share.total} worlds on {ranks}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
-        size, rate = self.resumed.size / 1e6, self.state.set_rate
+        size = self.resumed.size / 1e6
         return (
             f"resumed from checkpoint {self.resumed.name}: {there} ({size:.2f} MB in {self.state.load_seconds:.3f} s)"
-            + (f"; learning rate set to {rate:g}" if rate is not None else "")
+            + "".join(f"; {line}" for line in self.state.set_anew)
         )
 
     def _tell_saved(self, lines: list[str]) -> None:
         for line in filter(None, lines):
-            print(line, flush=True)
+            self.reporter.do(_print, line)
             self.beacon.tell(said=line)
 
     def _iterate(self) -> tuple[dict[str, Any], dict[str, float]]:
         """One iteration; the numbers of it (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""
-        progress, ppo = self.state.progress, self.ppo
+        progress, algorithm = self.state.progress, self.algorithm
         self._stopwatch.start()
-        ppo.begin_iteration(progress.iteration)
+        algorithm.begin(progress.iteration)
         self._begin_iteration(progress.iteration)
         self._collecting()
         self._stopwatch.mark()
-        ppo.extra.zero_()
-        ranks = self.gang.size
-        ppo.extra[ranks + self.gang.rank].copy_(self.task.mishap[0])
-        ppo.extra[2 * ranks : -len(SIGNALS)].copy_(self.task.statistics)
-        self._own_signals.copy_(torch.tensor([self._collect_seconds, *self._signals()], dtype=torch.float64))
-        ppo.extra[self.gang.rank].copy_(self._own_signals[0], non_blocking=True)
-        ppo.extra[-len(SIGNALS) :].copy_(self._own_signals[1:], non_blocking=True)
-        self.task.clear_statistics()
-        losses = ppo.learn(self.task.observations)
+        self._gather()
+        metrics = algorithm.learn(self._observations)
         self._stopwatch.mark()
         # the one transfer of the iteration: from here on the host knows
-        known = self._numbers.read(
-            torch.cat(
-                [losses.double(), ppo.learning_rate_tensor.double().view(1), ppo.action_std.double().view(1), ppo.extra]
-            )
-        )
-        values, rate, std = known[: len(LOSSES)], known[len(LOSSES)], known[len(LOSSES) + 1]
-        extra = known[len(LOSSES) + 2 :]
-        collected, mishaps = extra[:ranks], extra[ranks : 2 * ranks]
-        totals, signals = extra[2 * ranks : -len(SIGNALS)], extra[-len(SIGNALS) :]
+        numbers = torch.cat([torch.stack([value.double() for value in metrics.values()]), self._totals.values])
+        known = self._numbers.read(numbers)
+        learnt = dict(zip(metrics, known, strict=False))
+        totals = Totals.named(self._totals.layout, known[len(metrics) :])
+        signals = {name: totals[name][0] for name in SIGNALS}
         progress.iteration += 1
-        self.state.learning_rate = rate
+        self.state.learning_rate = learnt.get("learning_rate")
         self.iterated += 1
-        if not all(map(math.isfinite, values)):
-            worst = ", ".join(f"{name} {value:g}" for name, value in zip(LOSSES, values, strict=True))
+        if not all(map(math.isfinite, learnt.values())):
+            worst = ", ".join(f"{name} {value:g}" for name, value in learnt.items())
             raise self._failure(f"the loss is not finite ({worst})", "Try a smaller learning_rate")
-        record = self._count(totals)
+        record = self._count(totals["statistics"])
         if record.get("nan_worlds"):
-            self._judge_resets(int(record["nan_worlds"]), mishaps)
-        record |= {**dict(zip(LOSSES, values, strict=True)), "learning_rate": rate, "action_std": std}
-        record |= straggler(collected)
-        return record, dict(zip(SIGNALS, signals, strict=True))
+            self._judge_resets(int(record["nan_worlds"]), totals["mishap"])
+        return record | learnt | straggler(totals["collected"]), signals
+
+    def _gather(self) -> None:
+        """Add up over the ranks what happened in the rollout, and what each rank has to tell."""
+        totals, rank = self._totals, self.gang.rank
+        totals.values.zero_()
+        totals["mishap"][rank].copy_(self.task.mishap[0])
+        totals["statistics"].copy_(self.task.statistics)
+        self.task.clear_statistics()
+        self._own.copy_(torch.tensor([self._collect_seconds, *self._signals()], dtype=torch.float64))
+        totals["collected"][rank].copy_(self._own[0], non_blocking=True)
+        for place, name in enumerate(SIGNALS, start=1):
+            totals[name].copy_(self._own[place : place + 1], non_blocking=True)
+        self.gang.sum(totals.values)
 
     def _failure(self, what: str, hint: str) -> TrainingError:
         """The end of a training that can't go on. The figures are those of the gang: every rank is here."""
@@ -225,7 +241,7 @@ class Runner:
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
         """Tell of worlds that were reset since something was not finite or the physics failed; raises TrainingError where they are too many."""
-        total, iteration = self.ppo.share.total, self.state.progress.iteration
+        total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
         first = f"world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
@@ -263,29 +279,32 @@ class Runner:
         return float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds
 
     def _collect(self) -> None:
-        task, ppo = self.task, self.ppo
         self.replay.keep()
-        for _ in range(self.config.ppo.steps):
-            task.step(ppo.act(task.observations))
-            ppo.process_env_step(task.terminal_observations, task.rewards, task.dones, task.time_outs)
+        for step in range(self.algorithm.steps):
+            actions = self.algorithm.act(self._observations)
+            self.replay.note(step, actions)
+            self.task.step(actions)
+            self.algorithm.record(self._step)
 
     def _count(self, totals: list[float]) -> dict[str, Any]:
         """Bring the progress up to date with the ``totals`` of all ranks; the iteration's record without the losses."""
         progress = self.state.progress
         collect, learn = self._stopwatch.parts()
-        steps = self.ppo.share.total * self.config.ppo.steps
+        now = time.perf_counter()
+        took, self._read_at = now - self._read_at, now
+        steps = self.share.total * self.algorithm.steps
         progress.env_steps += steps
-        self.state.seconds += collect + learn
-        self._iteration_seconds, self._collect_seconds = collect + learn, collect
+        self.state.seconds += took
+        self._iteration_seconds, self._collect_seconds = took, collect
         stall, self._stall_seconds = self._stall_seconds, 0.0
         finished, returns, lengths, *others = totals
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
         progress.count(
-            self.config.ppo.steps,
+            self.algorithm.steps,
             finished,
             returns,
-            worlds=self.ppo.share.total,
+            worlds=self.share.total,
             longest=self.task.max_episode_length,
         )
         return {
@@ -295,10 +314,10 @@ class Runner:
             "episode_length": progress.episode_length,
             "score": progress.score,
             "episodes": int(finished),
-            "steps_per_second": steps / (collect + learn),
+            "steps_per_second": steps / took,  # by the clock, over everything
             "collect_seconds": collect,
             "learn_seconds": learn,
-            "iteration_seconds": collect + learn,
+            "iteration_seconds": took,
             "stall_seconds": stall,  # of the save before this iteration, 0 where there was none
             "total_seconds": self.state.seconds,
             **{
@@ -323,7 +342,7 @@ class Runner:
             )
         self.beacon.tell(done=True)
         self._say(f"evaluating checkpoint {name}")
-        result = evaluate(self.held_out_worlds(), self.ppo, self.gang, checkpoint=name)
+        result = evaluate(self.held_out_worlds(), self.algorithm.policy(), self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:
             return
@@ -333,11 +352,11 @@ class Runner:
 
             plot: Path | None = plot_reward(self.job.run)
         except (OSError, ValueError) as error:
-            print(f"warning: the evaluation or the plot could not be written ({error})", flush=True)
+            self._say(f"warning: the evaluation or the plot could not be written ({error})")
             plot = None
-        print(f"last checkpoint: {self.job.run.checkpoints / name}", flush=True)
+        self._say(f"last checkpoint: {self.job.run.checkpoints / name}")
         if plot:
-            print(f"reward plot: {plot}", flush=True)
+            self._say(f"reward plot: {plot}")
 
     def held_out_worlds(self) -> Task:
         """The worlds on which the policy is evaluated. All ranks call it.
@@ -347,7 +366,7 @@ class Runner:
         """
         worlds, began = self.task, max(0, self.state.progress.iteration - 1)
         if self.config.randomize.draws_worlds:
-            total = min(self.ppo.share.total, EVALUATED * self.gang.size)
+            total = min(self.share.total, EVALUATED * self.gang.size)
             share = Share.of(self.gang.rank, self.gang.size, total)
             worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.seed))
         worlds.begin_iteration(began, self.state.progress.reward, self.state.progress.episode_length)
@@ -355,32 +374,11 @@ class Runner:
 
     def _say(self, text: str) -> None:
         if self.gang.is_main:
-            print(text, flush=True)
+            self.reporter.do(_print, text)
 
 
-def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
-    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses."""
-    marker = warm_marker(task_type, gang.device)
-    if gang.is_main and marker is not None and not marker.exists():
-        print("compiling kernels: this takes a minute or two, the first time", flush=True)
-    warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
-    with user_errors(), gang.build_in_turn(marker):
-        objective.load(gang.device)
-        return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
-
-
-def total_worlds(job: Job, gang: Gang) -> int:
-    """How many worlds the whole gang has: a run's number, which does not change with the ranks that it has just now.
-
-    ``train.worlds`` is each rank's share of a gang of full size; a run that is resumed has the worlds of its checkpoint.
-    """
-    if given := os.environ.get("MUSTER_WORLDS"):
-        if not given.isdecimal() or int(given) < gang.size:
-            raise UserError(f"MUSTER_WORLDS is {given!r}; expected a number of worlds, at least one for each rank")
-        return int(given)
-    nodes = job.spec.get("nodes")
-    full = nodes["max"] * gang.placement.local_world_size if isinstance(nodes, dict) else gang.size
-    return job.setting("worlds", 256) * max(full, gang.size)
+def _print(text: str) -> None:
+    print(text, flush=True)
 
 
 def straggler(seconds: list[float]) -> dict[str, float]:
@@ -401,27 +399,3 @@ def _figure(name: str, total: float, episodes: float) -> float | None:
     if not name.startswith("reward_"):
         return total
     return total / episodes if episodes else None
-
-
-def describe(job: Job, task: Task, config: Any) -> dict[str, Any]:
-    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
-    names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
-    if interface := task.interface():
-        names |= dataclasses.asdict(interface)
-    if len(task.observation_shape) > 1:
-        names["camera"] = dataclasses.asdict(config.camera)
-        for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
-            names.pop(key, None)
-    return {
-        "task": job.section["task"],
-        "train": job.section,
-        "ppo": dataclasses.asdict(config.ppo),
-        "policy": {
-            "observation_shape": list(task.observation_shape),
-            **({"observation_size": task.observation_shape[0]} if len(task.observation_shape) == 1 else {}),
-            "action_size": task.action_size,
-            "control_hz": config.control_hz,
-            **names,
-        },
-        "torch": torch.__version__,
-    }

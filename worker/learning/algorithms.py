@@ -1,0 +1,98 @@
+"""The algorithms by the names that ``train.algorithm`` gives them."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from worker.errors import UserError
+from worker.learning.algorithm import Algorithm
+from worker.tasks.config import TaskConfig
+
+BUILT_IN = {
+    "ppo": "worker.learning.ppo.fused:PPO",
+    "rsl_rl": "worker.learning.rsl.algorithm:RslRl",
+    "sac": "worker.learning.sac.sac:SAC",
+}
+"""Where each is."""
+DEFAULT = "ppo"
+
+
+def find_algorithm(name: str) -> type[Algorithm]:
+    """The class of an algorithm. Raises UserError for a name of none.
+
+    Args:
+        name: One of :data:`BUILT_IN`, or ``module:Class`` of a user's own, importable from the job's directory.
+    """
+    place = BUILT_IN.get(name, name)
+    module, sign, attribute = place.partition(":")
+    if not sign:
+        raise UserError(
+            f"train.algorithm: there is no {name!r}; there are {', '.join(BUILT_IN)}, and module:Class of your own"
+        )
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"train.algorithm: {name}: {error}") from error
+    missing = [part for part in _PARTS if not hasattr(found, part)]
+    if missing:
+        raise UserError(
+            f"train.algorithm: {name} is no algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
+        )
+    return found  # type: ignore[no-any-return]
+
+
+_PARTS = (
+    "config_type",
+    "captures_rollout",
+    "begin",
+    "act",
+    "record",
+    "learn",
+    "policy",
+    "state_dict",
+    "load_state_dict",
+)
+
+
+def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:
+    """The algorithm's settings: the task's own for it, with what the job sets. Raises UserError naming the key.
+
+    Args:
+        section: The job's ``train``: settings stand under the algorithm's name, those of a user's own under ``settings``.
+    """
+    where = name if name in BUILT_IN else "settings"
+    given = section.get(where) or {}
+    own = getattr(config, name, None)
+    base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
+    kind = algorithm.config_type
+    known = [item.name for item in dataclasses.fields(kind)]
+    for key in given:
+        if key not in known:
+            raise UserError(f"{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
+    try:
+        return kind(**{**base, **given})
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(map(str, (where, *first["loc"])))
+        raise UserError(
+            f"{path}: {first['msg'].removeprefix('Value error, ')}, got {first.get('input')!r}"[:1000]
+        ) from error
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
+    """What to say of a setting that an algorithm does not have."""
+    import difflib
+
+    if key in elsewhere:
+        return f"there is no such setting; set algorithm: {elsewhere[key]}, which has it"
+    near = difflib.get_close_matches(key, known, n=1)
+    return (
+        f"there is no such setting; {f'did you mean {near[0]}?' if near else 'there are ' + ', '.join(sorted(known))}"
+    )

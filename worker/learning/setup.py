@@ -1,0 +1,106 @@
+"""What a training is made of, before it begins: the worlds of this rank, how many the gang has, and what checkpoints say of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import TYPE_CHECKING, Any
+
+import torch
+import warp
+from tensordict import TensorDict
+
+from worker.distributed import Gang, warm_marker
+from worker.errors import UserError
+from worker.learning.algorithm import Algorithm, Setting, Share, Spaces, Transition
+from worker.learning.job import Job, user_errors
+from worker.learning.ppo import draws, objective
+
+if TYPE_CHECKING:
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
+
+
+def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
+    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses."""
+    marker = warm_marker(task_type, gang.device)
+    if gang.is_main and marker is not None and not marker.exists():
+        print("compiling kernels: this takes a minute or two, the first time", flush=True)
+    warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
+    with user_errors(), gang.build_in_turn(marker):
+        for kernels in (objective, draws):
+            kernels.load(gang.device)
+        return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
+
+
+def total_worlds(job: Job, gang: Gang) -> int:
+    """How many worlds the whole gang has: a run's number, which does not change with the ranks that it has just now.
+
+    ``train.worlds`` is each rank's share of a gang of full size; a run that is resumed has the worlds of its checkpoint.
+    """
+    if given := os.environ.get("MUSTER_WORLDS"):
+        if not given.isdecimal() or int(given) < gang.size:
+            raise UserError(f"MUSTER_WORLDS is {given!r}; expected a number of worlds, at least one for each rank")
+        return int(given)
+    nodes = job.spec.get("nodes")
+    full = nodes["max"] * gang.placement.local_world_size if isinstance(nodes, dict) else gang.size
+    return job.setting("worlds", 256) * max(full, gang.size)
+
+
+def spaces_of(task: Task) -> Spaces:
+    """What the task's policies see and do."""
+    shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
+    return Spaces(shapes, task.action_size, getattr(task, "discrete", False))
+
+
+def spaces_from(policy: dict[str, Any]) -> Spaces:
+    """What :func:`describe` wrote of them into a manifest."""
+    groups = {name: tuple(shape) for name, shape in policy["groups"].items()}
+    return Spaces(groups, policy["action_size"], policy.get("discrete", False))
+
+
+def build_algorithm(
+    algorithm: type[Algorithm], settings: Any, task: Task, share: Share, gang: Gang, seed: int
+) -> Algorithm:
+    """Raises UserError for settings that the algorithm refuses."""
+    control_seconds = 1.0 / task.config.control_hz
+    with user_errors("train"):
+        return algorithm(settings, Setting(spaces_of(task), share, gang, seed, control_seconds))
+
+
+def observed(task: Task) -> TensorDict:
+    """The task's observation groups, live, batch size (worlds,)."""
+    return TensorDict(task.groups, [task.world_count], device=task.device)
+
+
+def transition(task: Task, observations: TensorDict) -> Transition:
+    """What the task's last step did, live."""
+    ended = TensorDict(task.terminal_groups, [task.world_count], device=task.device)
+    return Transition(observations, ended, task.rewards, task.dones, task.time_outs)
+
+
+def describe(job: Job, task: Task, config: TaskConfig, algorithm: str, settings: Any) -> dict[str, Any]:
+    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
+    names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
+    if interface := task.interface():
+        names |= dataclasses.asdict(interface)
+    if len(task.observation_shape) > 1:
+        names["camera"] = dataclasses.asdict(config.camera)  # type: ignore[attr-defined]
+        for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
+            names.pop(key, None)
+    return {
+        "task": job.section["task"],
+        "train": job.section,
+        "algorithm": algorithm,
+        "settings": dataclasses.asdict(settings),
+        "policy": {
+            "observation_shape": list(task.observation_shape),
+            **({"observation_size": task.observation_shape[0]} if len(task.observation_shape) == 1 else {}),
+            "action_size": task.action_size,
+            "groups": {name: list(shape) for name, shape in spaces_of(task).observations.items()},
+            "control_hz": config.control_hz,
+            **({"discrete": True} if spaces_of(task).discrete else {}),
+            **names,
+        },
+        "torch": torch.__version__,
+    }

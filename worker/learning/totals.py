@@ -1,0 +1,35 @@
+"""Named numbers that are added up over the ranks once an iteration, in one buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+
+class Totals:
+    """A float64 vector whose parts have names.
+
+    >>> totals = Totals({"episodes": 1, "seconds": 3}, "cpu")
+    >>> totals["seconds"][1] = 0.5
+    >>> Totals.named(totals.layout, totals.values.tolist())["seconds"]
+    [0.0, 0.5, 0.0]
+    """
+
+    def __init__(self, sizes: Mapping[str, int], device: str) -> None:
+        self.layout = dict(sizes)
+        self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device)
+        """All parts, one behind the other, shape (n,)."""
+        self._parts = dict(zip(sizes, self.values.split(list(sizes.values())), strict=True))
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        """A live view of one part, shape (its size,)."""
+        return self._parts[name]
+
+    @staticmethod
+    def named(layout: Mapping[str, int], numbers: list[float]) -> dict[str, list[float]]:
+        """Numbers in the order of ``layout``, by name."""
+        found, start = {}, 0
+        for name, size in layout.items():
+            found[name], start = numbers[start : start + size], start + size
+        return found
