@@ -62,15 +62,15 @@ def train(task: str, worlds: int, iterations: int, store: Path, seed: int = 0) -
 
 def worth(runner: Loop) -> dict[str, float]:
     """Mean return of the policy's mean action, as trained and under :data:`REFERENCE`."""
-    own = evaluate(runner.task, runner.ppo, runner.gang, checkpoint="-")
+    own = evaluate(runner.task, runner.algorithm.policy(), runner.gang, checkpoint="-")
     found = {"evaluated": own.mean_return, "evaluated_length": own.mean_length, "longest": own.max_length}
     options = type(runner.task).solver_options
     if "iterations" in options and CUDA:
         exact: Any = type(
             type(runner.task).__name__, (type(runner.task),), {"solver_options": {**options, **REFERENCE}}
         )
-        task = build_task(exact, runner.config, runner.ppo.share, runner.gang, 1)
-        found["reference"] = evaluate(task, runner.ppo, runner.gang, checkpoint="-").mean_return
+        task = build_task(exact, runner.config, runner.share, runner.gang, 1)
+        found["reference"] = evaluate(task, runner.algorithm.policy(), runner.gang, checkpoint="-").mean_return
     return found
 
 

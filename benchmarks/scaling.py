@@ -1,4 +1,4 @@
-"""Several GPUs of one host: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives inside and between the graphs.
+"""Several GPUs of one host: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives between the graphs.
 
     python -m benchmarks.scaling [--task Ant] [--worlds 4096] [--gpus 1 2 4] [--out DIRECTORY]
 
@@ -49,14 +49,14 @@ def rank(task: str, worlds: int, store: Path, result: Path) -> None:
             "learn": record["learn_seconds"],
             "excess": statistics.median(slowest),
             "rate": runner.gang.size * worlds * runner.config.ppo.steps / seconds,
-            "captured": [part.name for part in runner.ppo.recordings if part.captured],
+            "captured": [part.name for part in runner.algorithm.recordings if part.captured],
         }
         result.write_text(json.dumps(found))
     runner.close()
     os._exit(0)
 
 
-def launch(gpus: int, inside: bool, options: argparse.Namespace) -> dict[str, Any]:
+def launch(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
     """Train on ``gpus`` GPUs."""
     with tempfile.TemporaryDirectory() as directory:
         result = Path(directory) / "result.json"
@@ -64,9 +64,9 @@ def launch(gpus: int, inside: bool, options: argparse.Namespace) -> dict[str, An
             *(sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={gpus}", "-m"),
             *("benchmarks.scaling", "--rank", directory, "--task", options.task, "--worlds", str(options.worlds)),
         ]
-        env = {**os.environ, "MUSTER_BENCH_INSIDE": "1" if inside else "0", "OMP_NUM_THREADS": "4"}
+        env = {**os.environ, "OMP_NUM_THREADS": "4"}
         subprocess.run(command, env=env, check=True, timeout=150)
-        return {"gpus": gpus, "inside": inside, **json.loads(result.read_text())}
+        return {"gpus": gpus, **json.loads(result.read_text())}
 
 
 def _counts() -> list[int]:
@@ -81,26 +81,21 @@ def main() -> None:
     parser.add_argument("--task", default="Ant")
     parser.add_argument("--worlds", type=int, default=4096, help="of each GPU")
     parser.add_argument("--gpus", nargs="+", type=int, default=_counts())
-    parser.add_argument("--where", nargs="+", choices=("inside", "between"), default=["inside", "between"])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     add_option(parser)
     parser.add_argument("--rank", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.rank:
-        from worker.learning.ppo import fused as ppo
-
-        ppo.COLLECTIVES_IN_GRAPH = os.environ["MUSTER_BENCH_INSIDE"] == "1"
         rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")
     watch = Watch(options.loaded_anyway)
     rows = []
     for gpus in options.gpus:
-        for inside in [place == "inside" for place in options.where] if gpus > 1 else [True]:
-            try:
-                rows.append(launch(gpus, inside, options) | watch.check(f"while {gpus} GPUs were measured"))
-            except (subprocess.SubprocessError, OSError) as error:
-                rows.append({"gpus": gpus, "inside": inside, "error": str(error)[:300]})
-            print(rows[-1], flush=True)
-            (options.out / "scaling.json").write_text(json.dumps(rows, indent=1))
+        try:
+            rows.append(launch(gpus, options) | watch.check(f"while {gpus} GPUs were measured"))
+        except (subprocess.SubprocessError, OSError) as error:
+            rows.append({"gpus": gpus, "error": str(error)[:300]})
+        print(rows[-1], flush=True)
+        (options.out / "scaling.json").write_text(json.dumps(rows, indent=1))
     (options.out / "scaling.md").write_text(table(options, rows))
 
 
@@ -114,16 +109,15 @@ def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
         "",
         f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU. {told(rows)}",
         "",
-        "| GPUs | collectives | training | efficiency | iteration | collect | learn | slowest rank |",
-        "|--:|---|--:|--:|--:|--:|--:|--:|",
+        "| GPUs | training | efficiency | iteration | collect | learn | slowest rank |",
+        "|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row in rows:
-        where = "–" if row["gpus"] == 1 else "in the graph" if row["inside"] else "between graphs"
         if "error" in row:
-            lines.append(f"| {row['gpus']} | {where} | failed | | | | | |")
+            lines.append(f"| {row['gpus']} | failed | | | | | |")
             continue
         lines.append(
-            f"| {row['gpus']} | {where} | **{row['rate'] / 1e6:.2f}** | {100 * row['rate'] / row['gpus'] / single:.1f} % | "
+            f"| {row['gpus']} | **{row['rate'] / 1e6:.2f}** | {100 * row['rate'] / row['gpus'] / single:.1f} % | "
             f"{1000 * row['seconds']:.1f} ms | {1000 * row['collect']:.1f} ms | {1000 * row['learn']:.1f} ms | "
             f"+{100 * row['excess']:.1f} % |"
         )

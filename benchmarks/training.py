@@ -30,8 +30,8 @@ from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from worker.distributed import Placement, connect
 from worker.learning.job import Job, StopRequest
-from worker.learning.recording import Recorded
 from worker.learning.loop import Loop
+from worker.learning.recording import Recorded
 from worker.learning.setup import build_task
 from worker.tasks import find_task
 
@@ -113,7 +113,7 @@ def measure(task: str, worlds: int, store: Path, *, stock: bool, profile: bool) 
     started = time.perf_counter()
     runner = build(task, worlds, store)
     built = time.perf_counter() - started
-    own, ppo = runner.task, runner.ppo
+    own, algorithm = runner.task, runner.algorithm
     steps = worlds * runner.config.ppo.steps
     for _ in range(3):
         runner._iterate()
@@ -127,7 +127,7 @@ def measure(task: str, worlds: int, store: Path, *, stock: bool, profile: bool) 
         found["profile"] = kernels(runner._iterate)
 
     def act() -> None:
-        ppo.storage.clear()
+        algorithm.begin(0)
         runner._collecting()
 
     found["policy"] = rate(act, steps)
@@ -139,7 +139,7 @@ def measure(task: str, worlds: int, store: Path, *, stock: bool, profile: bool) 
 
     found["simulation"] = rate(Recorded(simulate, own.device, "simulation"), steps)
     if stock:
-        fresh = build_task(type(own), runner.config, ppo.share, runner.gang, 1)
+        fresh = build_task(type(own), runner.config, runner.share, runner.gang, 1)
         iterations = max(3, round((3e6 if CUDA else 3e3) / steps))
         found["stock"] = steps / stock_seconds(
             stock_runner(fresh, runner.config.ppo), iterations, warm=5 if CUDA else 1

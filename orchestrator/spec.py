@@ -11,12 +11,23 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
+from orchestrator.settings import section_of, settings_classes, train_section
 from shared_store.layout import NAME
 from shared_store.log_files import LEAST_LIMIT, LIMIT
 
@@ -120,6 +131,15 @@ def _finite(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
+def _algorithm_name(value: str) -> str:
+    known = list(ALGORITHMS)
+    if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
+        return value
+    nearest = difflib.get_close_matches(value, known, 1)
+    hint = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(known)}, and module:Class of your own"
+    raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
+
+
 def known_tasks() -> list[str]:
     """Names of the installed tasks, from the entry-point group ``muster.tasks``; nothing is imported."""
     return sorted({entry.name for entry in entry_points(group="muster.tasks")})
@@ -165,47 +185,54 @@ class Resources(_Section):
     memory: Memory = Field(default=1024, ge=4, description="memory, such as 4GiB")
 
 
-Counts = Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)]
-Activation = Literal[
-    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
-]
+ALGORITHMS = settings_classes()
+"""The settings class of each installed algorithm."""
 
 
-class PPO(_Section):
-    """Overrides of the task's own PPO configuration; what is not given stays as the task has it."""
-
-    steps: int | None = Field(default=None, ge=1, description="steps per world and iteration")
-    hidden_sizes: Counts | None = None
-    channels: Counts | None = Field(default=None, description="of each convolution, for images")
-    kernel_sizes: Counts | None = Field(default=None, description="of each convolution [px]")
-    strides: Counts | None = Field(default=None, description="of each convolution [px]")
-    activation: Activation | None = None
-    epochs: int | None = Field(default=None, ge=1)
-    minibatches: int | None = Field(default=None, ge=1)
-    learning_rate: float | None = Field(default=None, gt=0)
-    schedule: Literal["adaptive", "fixed"] | None = None
-    desired_kl: float | None = Field(default=None, gt=0)
-    gamma: float | None = Field(default=None, ge=0, le=1)
-    lam: float | None = Field(default=None, ge=0, le=1)
-    clip: float | None = Field(default=None, gt=0)
-    entropy_coef: float | None = Field(default=None, ge=0)
-    value_loss_coef: float | None = Field(default=None, ge=0)
-    max_grad_norm: float | None = Field(default=None, gt=0)
-    init_std: float | None = Field(default=None, gt=0)
-    normalize_observations: bool | None = None
-
-
-class Train(_Section):
-    """Train a policy with PPO."""
+class _Train(_Section):
+    """Train a policy."""
 
     task: Annotated[str, AfterValidator(_task_name)] = Field(description="name of a task, or module:Class")
     worlds: int = Field(ge=1, description="simulated worlds of each rank")
     iterations: int = Field(ge=1)
     seed: int = Field(default=1, ge=0, lt=2**31)
-    ppo: PPO = Field(default_factory=PPO)
+    algorithm: Annotated[str, AfterValidator(_algorithm_name)] = Field(
+        default="ppo", description="what learns: a name, or module:Class of your own; its settings stand under its name"
+    )
+    settings: Annotated[dict[str, Any], AfterValidator(_finite)] = Field(
+        default_factory=dict, description="of an algorithm of your own"
+    )
     config: Annotated[dict[str, Any], AfterValidator(_finite)] = Field(
         default_factory=dict, description="overrides of the task's own configuration"
     )
+
+    @model_validator(mode="after")
+    def _of_one_algorithm(self) -> _Train:
+        given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(self, name)).values())]
+        given += ["settings"] if self.settings else []
+        wanted = self.algorithm if self.algorithm in ALGORITHMS else "settings"
+        if others := [name for name in given if name != wanted]:
+            raise ValueError(f"{others[0]} is not of algorithm {self.algorithm}, whose settings stand under {wanted}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_other_algorithms(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        others = {"settings", *ALGORITHMS} - {self.algorithm if self.algorithm in ALGORITHMS else "settings"}
+        written: dict[str, Any] = write(self)
+        return {name: value for name, value in written.items() if name not in others}
+
+    def given(self) -> dict[str, Any]:
+        """The algorithm's settings that the job gives."""
+        if self.algorithm not in ALGORITHMS:
+            return self.settings
+        section: BaseModel = getattr(self, self.algorithm)
+        return {name: value for name, value in section.model_dump(mode="json").items() if value is not None}
+
+
+if TYPE_CHECKING:
+    Train = _Train
+else:
+    Train = train_section(_Train, {name: section_of(name, each, _Section) for name, each in ALGORITHMS.items()})
 
 
 class Evaluate(_Section):
@@ -357,22 +384,6 @@ def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[st
     return result
 
 
-def schema() -> dict[str, Any]:
-    """JSON Schema of the job YAML, for editors."""
-    document = Spec.model_json_schema()
-    definitions = document["$defs"]
-    definitions["NodeRange"] = {"anyOf": [{"type": "integer", "minimum": 1, "maximum": 250}, definitions["NodeRange"]]}
-    definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
-    text = {"type": ["string", "number"]}
-    definitions["Resources"]["properties"]["memory"] |= text
-    definitions["Logs"]["properties"]["limit"] |= {**text, "default": "1GiB"}
-    document["properties"]["stall_timeout"] = {**text, "default": "5m", "description": "of one training iteration"}
-    document["properties"]["timeout"] = {**text, "description": "of each attempt, such as 2h"}
-    document["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    document["title"] = "Muster job"
-    return document
-
-
 _EXPECTED = {
     "missing": "is required",
     "int_type": "expected a whole number",
@@ -381,6 +392,7 @@ _EXPECTED = {
     "finite_number": "expected a finite number",
     "string_type": "expected a text",
     "list_type": "expected a list",
+    "tuple_type": "expected a list",
     "dict_type": "expected a mapping",
     "bool_type": "expected true or false",
     "model_type": "expected a mapping",
@@ -390,7 +402,9 @@ _EXPECTED = {
 def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
     kind, found = problem["type"], problem.get("input")
     if kind == "extra_forbidden":
-        valid = _keys_at(path[:-1])
+        valid, algorithm = _keys_at(path[:-1]), ALGORITHMS.get(str(path[-2])) if len(path) == 3 else None
+        if other := getattr(algorithm, "elsewhere", {}).get(str(path[-1])):
+            return f"{path[-2]} has no such setting; algorithm {other} has"
         nearest = difflib.get_close_matches(str(path[-1]), valid, 1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}?" if nearest else f"valid here: {', '.join(valid)}"
         return f"unknown key; {hint}"
@@ -413,8 +427,9 @@ def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
 def _keys_at(path: tuple[str | int, ...]) -> list[str]:
     model: type[BaseModel] = Spec
     for part in path:
-        annotation = str(model.model_fields[str(part)].annotation) if str(part) in model.model_fields else ""
-        section = next((s for s in _Section.__subclasses__() if re.search(rf"\b{s.__name__}\b", annotation)), None)
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        kinds = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
+        section = next((kind for kind in kinds if issubclass(kind, BaseModel)), None)
         if section is None:
             return []
         model = section

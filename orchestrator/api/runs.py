@@ -21,7 +21,7 @@ from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
-from orchestrator.spec import Spec, override, validate
+from orchestrator.spec import ALGORITHMS, Spec, override, validate
 from orchestrator.tables import Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import DamagedFile, read_json
@@ -207,43 +207,39 @@ def last_metrics(run: Run) -> dict[str, Any] | None:
         return None
 
 
-NETWORK = (
-    *("hidden_sizes", "activation", "normalize_observations", "init_std"),
-    *("channels", "kernel_sizes", "strides"),
-)
-"""Keys of ``train.ppo`` that a checkpoint's network holds, so that no resumed run can change them; the worker has the same list."""
-
-
 def _check_changes(run: Run, before: Spec, after: Spec) -> None:
     """A run is one history: what its state depends on can't change under it."""
     if before.train is None or after.train is None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't go on as {after.kind}")
         return
-    for key in ("task", "seed", "config"):
+    for key in ("task", "algorithm", "seed", "config"):
         old, new = getattr(before.train, key), getattr(after.train, key)
         if old != new:
             raise ClientError(
                 f"run {run.name}: train.{key} is {shown(old)} and can't become {shown(new)}; start a new run for that"
             )
-    for key in NETWORK:
-        old, new = getattr(before.train.ppo, key), getattr(after.train.ppo, key)
-        if old != new:
-            was, wanted = ("the task's own" if value is None else shown(value) for value in (old, new))
+    name = after.train.algorithm
+    was, wanted = before.train.given(), after.train.given()
+    for key in getattr(ALGORITHMS.get(name), "fixed", ()):
+        if was.get(key) != wanted.get(key):
+            old, new = ("the task's own" if each.get(key) is None else shown(each[key]) for each in (was, wanted))
             raise ClientError(
-                f"run {run.name}: train.ppo.{key} is {was} and can't become {wanted}: it is part of the network "
-                "that the run has; start a new run for that"
+                f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
+                "start a new run for that"
             )
 
 
 def _check_rate(run: Run, before: Spec, after: Spec, assignments: Sequence[str]) -> None:
     """Refuse a learning rate that is set to what it is: an adapted rate goes on from the checkpoint, unless the setting differs."""
-    if before.train is None or after.train is None or after.train.ppo.schedule == "fixed":
+    if before.train is None or after.train is None or after.train.given().get("schedule") == "fixed":
         return
-    given = any(assignment.partition("=")[0] == "train.ppo.learning_rate" for assignment in assignments)
-    if given and before.train.ppo.learning_rate == after.train.ppo.learning_rate:
+    key = f"train.{after.train.algorithm}.learning_rate"
+    given = any(assignment.partition("=")[0] == key for assignment in assignments)
+    rate = after.train.given().get("learning_rate")
+    if given and after.train.algorithm == "ppo" and before.train.given().get("learning_rate") == rate:
         raise ClientError(
-            f"run {run.name}: train.ppo.learning_rate is {after.train.ppo.learning_rate!r} already, so that the run would go on with "
+            f"run {run.name}: {key} is {rate!r} already, so that the run would go on with "
             "the rate that its checkpoint has adapted; set another value, or train.ppo.schedule=fixed"
         )
 

@@ -20,7 +20,8 @@ from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
 from orchestrator.engines.base import engine_of
 from orchestrator.errors import SpecError
-from orchestrator.spec import Spec, schema
+from orchestrator.spec import Spec
+from orchestrator.spec_schema import schema
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 SetOption = Annotated[

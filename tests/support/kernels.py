@@ -13,11 +13,12 @@ from tests.conftest import REPOSITORY
 BUILD = """
 import warp
 from worker.distributed import warm_marker
-from worker.learning.ppo import objective
+from worker.learning.ppo import draws, objective
 from worker.tasks import find_task
 
 warp.config.log_level = warp.LOG_WARNING
-objective.load("cpu")
+for kernels in (draws, objective):
+    kernels.load("cpu")
 task = find_task({name!r})
 task(task.config_type(), 2, seed=1)
 warm_marker(task, "cpu").mkdir(parents=True, exist_ok=True)

@@ -118,7 +118,9 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
 def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
     # an algorithm's settings stand in a section of their own
-    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name not in ("ppo", "sac", "rsl_rl")}
+    known = {
+        f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name not in ("ppo", "sac", "rsl_rl")
+    }
     # settings that are a number, or a number for each name
     by_name = {f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")}
     changes: dict[str, Any] = {}

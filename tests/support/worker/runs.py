@@ -13,18 +13,18 @@ from shared_store.layout import Store
 from tests.support.worker.point_task import Point
 from worker.distributed import Gang, Placement
 from worker.learning.job import Job, StopRequest
-from worker.learning.runner import Runner
+from worker.learning.loop import Loop
 
 
-def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Runner:
+def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Loop:
     """One attempt, to which the run is given first, as a controller does."""
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    return Runner(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
+    return Loop(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
 
 
-def train(env: dict[str, str], gang: Gang | None = None) -> Runner:
+def train(env: dict[str, str], gang: Gang | None = None) -> Loop:
     """Train to the end, as one attempt."""
     started = runner(env, gang)
     assert started.train() == 0

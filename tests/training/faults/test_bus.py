@@ -220,7 +220,7 @@ def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(serv
         first["statusReason"],
     )
     log = "\n".join(server.log(job["id"], attempt=1))
-    assert "its stacks:" in log and "worker/learning/runner.py" in log
+    assert "its stacks:" in log and "worker/learning/loop.py" in log
     wait_for_iteration(server, job["run"], _iteration(server, job["run"]) + 2)
     assert server.muster("stop", job["id"]).returncode == 0
 

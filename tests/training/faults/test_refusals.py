@@ -86,9 +86,9 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
         ("train.task=Ant", ["train.task is 'Cartpole' and can't become 'Ant'"]),
         ("train.seed=9", ["train.seed is 1 and can't become 9"]),
         ("train.config={force: 5.0}", ["train.config is {} and can't become {'force': 5.0}"]),
-        ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is the task's own and can't become [8]", "network"]),
+        ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is the task's own and can't become [8]", "has learnt"]),
         ("train.ppo.activation=relu", ["train.ppo.activation is the task's own and can't become 'relu'"]),
-        ("train.ppo.init_std=0.5", ["train.ppo.init_std is the task's own and can't become 0.5", "network"]),
+        ("train.ppo.init_std=0.5", ["train.ppo.init_std is the task's own and can't become 0.5", "has learnt"]),
         ("train.ppo.learning_rate=1.0e-3", ["train.ppo.learning_rate is 0.001 already", "train.ppo.schedule=fixed"]),
         ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 nodes × 1 ranks × 9)", "leave train.worlds"]),
         ("nodes=9", ["8 worlds can't be dealt out to 9 ranks; use fewer nodes"]),
@@ -194,7 +194,7 @@ def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, na
         (b"", "learner.pt"),
         (b"no archive at all", "learner.pt"),
         ([1, 2], "learner.pt holds a list, not the state of a training"),
-        ({"progress": {}}, "does not fit this job's task and algorithm: 'ppo'"),
+        ({"progress": {}}, "does not fit this job's task and algorithm: 'algorithm'"),
     ],
 )
 def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str) -> None:

@@ -12,7 +12,7 @@ import sys
 from worker.distributed import Placement, connect
 connect(Placement(), device="cpu")
 import torch, tensordict
-import worker.learning.runner
+import worker.learning.loop
 weight = torch.ones(3, requires_grad=True)
 adam = torch.optim.Adam([weight], lr=torch.tensor(0.1), fused=True)
 weight.sum().backward()

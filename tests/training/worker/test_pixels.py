@@ -20,8 +20,10 @@ from tests.support.worker.tasks import put
 from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.export import export
+from worker.learning import algorithms
 from worker.learning.job import Job, StopRequest, configure
 from worker.learning.loop import Loop
+from worker.learning.ppo.fused import PPO
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 from worker.tasks.config import Randomization
@@ -126,8 +128,8 @@ def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Loop:
 
 def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_path: Path) -> None:
     straight = run(tmp_path, "straight", 3)
-    assert straight.ppo._observations.dtype == torch.uint8, "the rollout holds bytes"
-    gradients = [p.grad for p in straight.ppo.actor.cnns.parameters()]
+    assert straight.algorithm.rollout.actor.observations.dtype == torch.uint8, "the rollout holds bytes"
+    gradients = [p.grad for p in straight.algorithm.actor.cnns.parameters()]
     assert all(g is not None and g.abs().max() > 0 for g in gradients), "the convolutions learn"
     run(tmp_path, "stopped", 2)
     run(tmp_path, "stopped", 3, epoch=2)
@@ -173,5 +175,5 @@ def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: P
 
 def test_layers_of_the_network_have_to_match() -> None:
     with pytest.raises(UserError, match="channels, kernel_sizes and strides: give one number of each"):
-        configure(CartpolePixels, {"ppo": {"channels": [8, 8]}})
+        algorithms.settings(PPO, "ppo", CartpolePixelsConfig(), {"ppo": {"channels": [8, 8]}})
     assert dataclasses.replace(CartpolePixelsConfig().ppo, channels=(8, 8, 8)).channels == (8, 8, 8)

@@ -23,6 +23,7 @@ from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, t
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
+from worker.learning import algorithms
 from worker.learning.job import configure
 
 
@@ -152,7 +153,9 @@ def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
 
     started = train(training(tmp_path, iterations=1))
     before = started.task.state_dict()
-    results = [evaluate(started.task, started.ppo, started.gang, checkpoint="x", episodes=9) for _ in range(2)]
+    results = [
+        evaluate(started.task, started.algorithm.policy(), started.gang, checkpoint="x", episodes=9) for _ in range(2)
+    ]
     assert results[0].episodes == 16, "whole rounds of all 8 worlds"
     assert results[0].mean_return == results[1].mean_return
     assert all(torch.equal(tensor, before[name]) for name, tensor in started.task.state_dict().items())
@@ -219,22 +222,36 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: PointPPO has no such key; did you mean learning_rate?"),
+        ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
+        ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; set algorithm: rsl_rl, which has it"),
         ({"config": {"ppo": {}}}, "config.ppo: PointConfig has no such key"),
-        ({"ppo": {"steps": 1.5}}, "ppo.steps: expected int, as in 8; got 1.5"),
-        ({"ppo": {"normalize_observations": 1}}, "expected bool"),
-        ({"ppo": {"learning_rate": "fast"}}, "ppo.learning_rate: expected float"),
+        ({"ppo": {"steps": 1.5}}, "ppo.steps: Input should be a valid integer, got 1.5"),
+        ({"ppo": {"normalize_observations": 1}}, "ppo.normalize_observations: Input should be a valid boolean"),
+        ({"ppo": {"learning_rate": "fast"}}, "ppo.learning_rate: Input should be a valid number, got 'fast'"),
+        ({"algorithm": "pppo"}, "train.algorithm: there is no 'pppo'; there are ppo, rsl_rl, sac, and module:Class"),
+        (
+            {"algorithm": "tests.support.worker.point_task:Point"},
+            "is no algorithm: it lacks captures_rollout, begin, act",
+        ),
     ],
 )
 def test_wrong_overrides_are_refused(section: dict, message: str) -> None:
     with pytest.raises(UserError) as error:
-        configure(Point, section)  # type: ignore[arg-type]
+        configured(section)
     assert message in str(error.value)
 
 
+def configured(section: dict[str, Any]) -> tuple[Any, Any]:
+    """The task's configuration and the algorithm's settings of a job."""
+    config, name = configure(Point, section), section.get("algorithm", "ppo")  # type: ignore[arg-type]
+    return config, algorithms.settings(algorithms.find_algorithm(name), name, config, section)
+
+
 def test_right_overrides_are_taken() -> None:
-    config = configure(Point, {"ppo": {"learning_rate": 1, "hidden_sizes": [8, 8]}, "config": {"limit": 2}})  # type: ignore[arg-type]
-    assert config.ppo.learning_rate == 1.0 and config.ppo.hidden_sizes == (8, 8) and config.limit == 2.0  # type: ignore[attr-defined]
+    section = {"ppo": {"learning_rate": 1, "hidden_sizes": [8, 8]}, "config": {"limit": 2}}
+    config, ppo = configured(section)
+    assert ppo.learning_rate == 1.0 and ppo.hidden_sizes == (8, 8) and config.limit == 2.0
+    assert ppo.steps == 8, "the task's own"
 
 
 @pytest.mark.parametrize(
@@ -296,15 +313,15 @@ def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytes
     model = onnx.load(target / "policy.onnx")
     (actions,) = ReferenceEvaluator(model).run(None, {"obs": observations})
     np.testing.assert_allclose(actions, facts["self_test"]["actions"], atol=1e-5)
-    ours = started.ppo.act_mean(torch.from_numpy(observations)).numpy()
+    ours = started.algorithm.policy().act({"policy": torch.from_numpy(observations)}).numpy()  # type: ignore[arg-type]
     np.testing.assert_allclose(actions, ours, atol=1e-5)
     assert json.loads({p.key: p.value for p in model.metadata_props}["muster"])["checkpoint"] == checkpoint.name
     original = export.to_onnx
 
-    def altered(actor: Any, metadata: dict[str, Any]) -> bytes:
+    def altered(policy: Any, metadata: dict[str, Any]) -> bytes:
         with torch.no_grad():
-            actor.mlp[0].weight.mul_(1.01)
-        return original(actor, metadata)
+            policy.network.mlp[0].weight.mul_(1.01)
+        return original(policy, metadata)
 
     monkeypatch.setattr(export, "to_onnx", altered)
     with pytest.raises(TrainingError, match="differs from the trained one"):

@@ -58,7 +58,7 @@ def test_a_training_spec_becomes_a_multinode_definition() -> None:
             ],
         },
     }
-    assert json.loads(environment.pop("MUSTER_SPEC"))["train"] == {**TRAIN, "seed": 1, "config": {}}
+    assert json.loads(environment.pop("MUSTER_SPEC"))["train"] == {**TRAIN, "seed": 1, "algorithm": "ppo", "config": {}}
     assert environment == {
         "MUSTER_ON_CHILD_FAILURE": "restart",
         "MUSTER_RANKS_PER_NODE": "2",

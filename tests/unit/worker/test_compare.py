@@ -53,7 +53,7 @@ def test_twins_are_equal_and_another_seed_is_not(trained: Path, capsys: pytest.C
     assert code == 0 and re.search(r"^equal: \d+ tensors, 3 iterations\n$", said, re.MULTILINE)
     code, said = say(trained, "one", "other", capsys)
     number = r"-?\d+\.\d+(e-\d+)?"
-    line = rf"different: learner.pt: ppo\.\S+: at \[[\d, ]*\]: {number} and {number} \(\d+ of \d+ elements differ\)\n"
+    line = rf"different: learner.pt: algorithm\.\S+: at \[[\d, ]*\]: {number} and {number} \(\d+ of \d+ elements differ\)\n"
     assert code == 1 and re.search(line, said), said
 
 

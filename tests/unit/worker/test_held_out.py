@@ -82,13 +82,13 @@ def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Pa
     others = trained.held_out_worlds()
     assert others.world_count == 16
     assert not (others.randomizer.factors[:, 0][:, None] == trained.task.randomizer.factors[:, 0]).any()
-    found = evaluate(others, trained.ppo, trained.gang, checkpoint="x")
+    found = evaluate(others, trained.algorithm.policy(), trained.gang, checkpoint="x")
     assert all(torch.equal(tensor, before[name]) for name, tensor in trained.task.state_dict().items())
     again = cartpole(tmp_path / "a", epoch=2, **settings)
     assert again.resumed is not None
     worlds = again.held_out_worlds()
     assert torch.equal(worlds.randomizer.factors, others.randomizer.factors)
-    assert evaluate(worlds, again.ppo, again.gang, checkpoint="x").mean_return == found.mean_return
+    assert evaluate(worlds, again.algorithm.policy(), again.gang, checkpoint="x").mean_return == found.mean_return
 
 
 def test_where_worlds_are_alike_those_of_training_are_evaluated_from_new_starts(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
-from worker.learning.runner import describe
 
 from tests.support.worker.tasks import observe, put
 from worker.errors import UserError
 from worker.learning.job import configure
+from worker.learning.setup import describe
 from worker.tasks import BUILT_IN, find_task
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.interface import Interface
@@ -124,7 +124,7 @@ def test_an_episode_begins_at_the_declared_positions(task: Task) -> None:
 
 def test_a_checkpoint_holds_what_a_robot_needs(task: Task) -> None:
     job: Any = SimpleNamespace(section={"task": type(task).__name__})
-    policy = json.loads(json.dumps(describe(job, task, task.config)))["policy"]
+    policy = json.loads(json.dumps(describe(job, task, task.config, "ppo", task.config.ppo)))["policy"]
     assert policy["control_hz"] == task.config.control_hz
     assert [seen["name"] for seen in policy["observations"]] == policy["observation_names"]
     if isinstance(task.config, QuadrupedConfig):
@@ -140,7 +140,7 @@ def test_every_built_in_task_declares_its_interface_and_images_stand_for_themsel
     kind = find_task("CartpolePixels")
     task = kind(kind.config_type(), 1)
     job: Any = SimpleNamespace(section={"task": "CartpolePixels"})
-    policy = describe(job, task, task.config)["policy"]
+    policy = describe(job, task, task.config, "ppo", task.config.ppo)["policy"]
     assert "camera" in policy and "observations" not in policy
     assert [action["name"] for action in policy["actions"]] == ["slider"]
 

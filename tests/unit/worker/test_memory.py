@@ -11,15 +11,17 @@ import torch
 from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.learning import memory
+from worker.learning.ppo.fused import PPO
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 
 HERE = Gang(Placement(), "cpu", None, ["here"])
 CONFIG = CartpoleConfig()
+LEARNER = PPO, CONFIG.ppo
 
 
 def test_too_many_are_refused_before_they_are_built() -> None:
     free = memory.free_bytes(HERE)
-    with pytest.raises(UserError) as refusal, memory.within_memory(Cartpole, CONFIG, 200_000_000, HERE):
+    with pytest.raises(UserError) as refusal, memory.within_memory(Cartpole, CONFIG, LEARNER, 200_000_000, HERE):
         pytest.fail("they are not to be built")
     found = re.fullmatch(
         r"worlds: 200,000,000 worlds of Cartpole on rank 0 need more memory than the ([\d.]+) GB that are free: about ([\d,.]+) GB. "
@@ -35,9 +37,9 @@ def test_too_many_are_refused_before_they_are_built() -> None:
 
 
 def test_what_fits_goes_on_and_other_errors_stay_what_they_are() -> None:
-    with memory.within_memory(Cartpole, CONFIG, 64, HERE):
+    with memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         pass
-    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(Cartpole, CONFIG, 64, HERE):
+    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         raise RuntimeError("something else")
 
 
@@ -54,17 +56,17 @@ def test_an_allocation_that_fails_is_told_as_what_it_is(monkeypatch: pytest.Monk
     assert not memory._is_out_of_memory(RuntimeError("shapes do not fit"))
     error = FULL[0]
     there = r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
-    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, 64, HERE):
+    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
     monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
     little = r"than the 0.0 GB that are free: about 0.0 GB. About \d+ fit: set `worlds`$"
-    with pytest.raises(UserError, match=little), memory.within_memory(Cartpole, CONFIG, 64, HERE):
+    with pytest.raises(UserError, match=little), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         raise error
-    with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, 64, HERE, lambda: False):
+    with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE, lambda: False):
         raise error  # long after the start: not the worlds' fault, and not the user's
 
 
 def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
     refused = dataclasses.replace(CONFIG, substeps=0)
-    with pytest.raises(UserError, match="substeps is 0"), memory.within_memory(Cartpole, refused, 9000, HERE):
+    with pytest.raises(UserError, match="substeps is 0"), memory.within_memory(Cartpole, refused, LEARNER, 9000, HERE):
         pytest.fail("nothing is to be built")

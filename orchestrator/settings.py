@@ -1,0 +1,44 @@
+"""What the installed algorithms accept: their settings classes, which the installation names (entry-point group ``muster.settings``).
+
+They are pydantic dataclasses that are imported without torch. A job's YAML gives some of the fields; the others are the task's own,
+which only the rank knows. So each field is checked by itself here, and all of them together by the rank.
+"""
+
+from __future__ import annotations
+
+import copy
+from importlib.metadata import entry_points
+from typing import Any
+
+from pydantic import BaseModel, Field, create_model
+from pydantic.dataclasses import is_pydantic_dataclass
+
+
+def settings_classes() -> dict[str, Any]:
+    """The settings class of each installed algorithm, by its name. One that can't be imported is left out: its rank will say why."""
+    found = {}
+    for entry in sorted(entry_points(group="muster.settings"), key=lambda entry: entry.name):
+        try:
+            loaded = entry.load()
+        except Exception:
+            continue
+        if isinstance(loaded, type) and is_pydantic_dataclass(loaded):
+            found[entry.name] = loaded
+    return found
+
+
+def section_of(name: str, settings: Any, base: type[BaseModel]) -> type[BaseModel]:
+    """A section of the YAML with the fields of ``settings``, each of which may be left out."""
+    fields: dict[str, Any] = {}
+    for key, field in settings.__pydantic_fields__.items():
+        optional = copy.copy(field)
+        optional.default, optional.default_factory = None, None
+        fields[key] = (field.annotation | None, optional)
+    doc = f"Overrides of the task's own settings of {name}; what is not given stays as the task has it."
+    return create_model(f"Settings_{name}", __base__=base, __doc__=doc, **fields)
+
+
+def train_section(base: type[BaseModel], sections: dict[str, type[BaseModel]]) -> type[BaseModel]:
+    """The ``train`` section of the YAML: ``base`` with a section for each algorithm."""
+    fields: dict[str, Any] = {name: (section, Field(default_factory=section)) for name, section in sections.items()}
+    return create_model("Train", __base__=base, __doc__=base.__doc__, **fields)
