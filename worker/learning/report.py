@@ -62,7 +62,7 @@ class Report:
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
             f"length {_text(record['episode_length'], '.1f')}  steps/s {record['steps_per_second']:.0f}  "
-            f"lr {record['learning_rate']:.1e}  kl {record['kl']:.3f}{mishaps}{_slow(record)}",
+            f"{_learnt(record)}{mishaps}{_slow(record)}",
             flush=True,
         )
         finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
@@ -83,6 +83,17 @@ class Report:
             self._events.close()
         except OSError as error:
             print(f"warning: metrics can't be written ({error})", flush=True)
+
+
+def _learnt(record: dict[str, float | int | None]) -> str:
+    """The figures of learning that tell most at a glance, those of them that the algorithm has."""
+    shown = {
+        "learning_rate": ("lr", ".1e"),
+        "kl": ("kl", ".3f"),
+        "temperature": ("temperature", ".1e"),
+        "q_mean": ("q", ".2f"),
+    }
+    return "  ".join(f"{word} {_text(record[name], form)}" for name, (word, form) in shown.items() if name in record)
 
 
 def _slow(record: dict[str, float | int | None]) -> str:

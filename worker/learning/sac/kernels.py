@@ -1,0 +1,146 @@
+"""What torch would need many launches for, or could not do alike on every number of ranks: exploring, and projecting a distribution."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from worker.simulation.capture import on_torch_stream
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _explore(
+    keys: wp.array(dtype=wp.int32),
+    step: int,
+    first_world: int,
+    uniform: wp.array(dtype=wp.int32),
+    limit: float,
+    mean: wp.array2d(dtype=wp.float32),
+    log_std: wp.array2d(dtype=wp.float32),
+    actions: wp.array2d(dtype=wp.float32),
+):
+    """The action of one world. Its numbers follow from the step's key and the world's global index alone."""
+    world = wp.tid()
+    stream = wp.rand_init(keys[step], first_world + world)
+    for i in range(actions.shape[1]):
+        if uniform[0] != 0:
+            actions[world, i] = limit * wp.randf(stream, -1.0, 1.0)
+        else:
+            actions[world, i] = limit * wp.tanh(mean[world, i] + wp.exp(log_std[world, i]) * wp.randn(stream))
+
+
+@wp.kernel
+def _project(
+    probabilities: wp.array2d(dtype=wp.float32),
+    returns: wp.array(dtype=wp.float32),
+    discounts: wp.array(dtype=wp.float32),
+    bonuses: wp.array(dtype=wp.float32),
+    least: float,
+    gap: float,
+    projected: wp.array2d(dtype=wp.float32),
+):
+    """The probability of one atom of one sample: of all that falls within a gap of it, the nearer the more.
+
+    Adding up what arrives, in order, gives the same bits each time, which scattering what is sent would not on a GPU.
+    """
+    sample, atom = wp.tid()
+    atoms = projected.shape[1]
+    discount = discounts[sample]
+    # where atom 0 falls, counted in gaps from atom 0; atom j falls `discount` · j beyond it
+    start = (returns[sample] + discount * (least + bonuses[sample]) - least) / gap
+    begin = wp.int32(0)
+    end = atoms
+    if discount > 1.0e-3:  # else all may fall into one place
+        nearest = (float(atom) - start) / discount
+        reach = 1.0 / discount + 1.0  # one more, for rounding
+        if atom > 0:
+            begin = wp.clamp(int(wp.clamp(nearest - reach, 0.0, float(atoms))), 0, atoms)
+        if atom < atoms - 1:
+            end = wp.clamp(int(wp.clamp(nearest + reach, -1.0, float(atoms))) + 1, 0, atoms)
+    total = 0.0 * start  # a return that is not finite must not end up as a distribution
+    for other in range(begin, end):
+        place = wp.clamp(start + discount * float(other), 0.0, float(atoms - 1))
+        distance = wp.abs(place - float(atom))
+        if distance < 1.0:
+            total += probabilities[sample, other] * (1.0 - distance)
+    projected[sample, atom] = total
+
+
+def load(device: str) -> None:
+    """Compile the kernels for ``device``, or take them from the cache."""
+    wp.init()
+    wp.load_module(__name__, device)
+
+
+def explore(
+    keys: torch.Tensor,
+    step: int,
+    first_world: int,
+    uniform: torch.Tensor,
+    limit: float,
+    mean: torch.Tensor,
+    log_std: torch.Tensor,
+    actions: torch.Tensor,
+) -> None:
+    """Draw an action for each world, into ``actions``.
+
+    Args:
+        keys: Of the iteration's steps, the same on all ranks; shape (steps,), int32.
+        step: Which of them.
+        first_world: Global index of the first world.
+        uniform: Whether to draw uniformly instead of from the policy; shape (1,), int32.
+        limit: Actions lie within ± this.
+        mean: Of the policy before squashing, shape (worlds, actions), float32.
+        log_std: Logarithm of its standard deviation, same shape.
+        actions: Same shape.
+    """
+    device = str(actions.device)
+    with on_torch_stream(device):
+        wp.launch(
+            _explore,
+            dim=len(actions),
+            inputs=[_array(keys), step, first_world, _array(uniform), limit, _array(mean), _array(log_std)],
+            outputs=[_array(actions)],
+            device=device,
+        )
+
+
+def project(
+    probabilities: torch.Tensor,
+    returns: torch.Tensor,
+    discounts: torch.Tensor,
+    bonuses: torch.Tensor,
+    least: float,
+    greatest: float,
+    projected: torch.Tensor,
+) -> torch.Tensor:
+    """The distribution of ``returns + discounts · (z + bonuses)``, put back on the atoms (arXiv:1707.06887, eq. 7).
+
+    Args:
+        probabilities: Of the atoms z, which lie evenly from ``least`` to ``greatest``; shape (samples, atoms), float32.
+        returns: Rewards up to then, shape (samples,), float32.
+        discounts: Of what comes after, 0 or more; shape (samples,), float32.
+        bonuses: Added to what comes after: SAC's entropy term; shape (samples,), float32.
+        least: The first atom.
+        greatest: The last atom.
+        projected: Filled, and returned; shape (samples, atoms).
+    """
+    device = str(projected.device)
+    read = (probabilities, returns, discounts, bonuses)
+    gap = (greatest - least) / (projected.shape[1] - 1)
+    with on_torch_stream(device):
+        wp.launch(
+            _project,
+            dim=projected.shape,
+            inputs=[*map(_array, read), least, gap],
+            outputs=[_array(projected)],
+            device=device,
+        )
+    return projected
+
+
+def _array(tensor: torch.Tensor) -> object:
+    """The same memory as Warp's kernels take it."""
+    return wp.from_torch(tensor.detach(), return_ctype=True)

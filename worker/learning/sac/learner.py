@@ -1,0 +1,208 @@
+"""The networks of SAC and one update of them: targets, losses, gradients, steps."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn.functional import log_softmax
+
+from worker.distributed import Gang
+from worker.learning.algorithm import Share
+from worker.learning.sac import kernels
+from worker.learning.sac.networks import Actor, Critics, make_normalizer
+from worker.learning.sac.replay import Batch
+from worker.learning.sac.settings import SACConfig
+
+BETAS = (0.9, 0.95)
+"""Decays of AdamW's moments: shorter than usual, since the targets move (arXiv:2512.01996)."""
+LOSSES = ("actor_loss", "entropy", "critic_loss", "q_mean")
+"""What an update measures; the first two only where the policy learns."""
+
+
+class Learner:
+    """Policy, critics, target critics and temperature; what they need to learn lies at fixed addresses.
+
+    An update is :meth:`compute`, the sum of what it gave over the ranks, and :meth:`apply`. All gradients are taken at the same weights
+    and lie in one flat buffer, of which the parameters' gradients are views: the policy's, the temperature's, :data:`LOSSES`, the
+    critics'. An update of the critics alone shares the end of it.
+
+    Args:
+        config: Hyperparameters.
+        sizes: Length of one observation of the policy's group and, where it is another one, of the critics' group.
+        actions: Length of an action.
+        gang: The ranks that learn together. The main rank's weights become everyone's.
+    """
+
+    def __init__(self, config: SACConfig, sizes: Sequence[int], actions: int, gang: Gang) -> None:
+        self.config, self._actions, device = config, actions, gang.device
+        self.actor = Actor(config, sizes[0], actions).to(device)
+        self.critics = Critics(config, sizes[-1], actions).to(device)
+        for parameter in (*self.actor.parameters(), *self.critics.parameters()):
+            gang.broadcast(parameter.data)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        own = [make_normalizer(config, size).to(device) for size in sizes[1:]]
+        self.normalizers = [self.actor.normalizer, *own]
+        """Of each group."""
+        ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
+        self.columns = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        """Where the groups are in a row of all that is observed."""
+        self.width = ends[-1]
+        self.log_temperature = nn.Parameter(torch.tensor(config.init_temperature, device=device).log())
+        self.samples = Share.of(gang.rank, gang.size, config.batch_size).count
+        """This rank's part of a batch."""
+        self._projected = torch.zeros(self.samples, config.atoms, device=device)
+        self._allocate_gradients(device)
+        self._make_optimizers(device.startswith("cuda"))
+
+    def _allocate_gradients(self, device: str) -> None:
+        parts = [*self.actor.parameters()], [self.log_temperature], [*self.critics.parameters()]
+        self._policy_parameters, self._temperature_parameters, self._critic_parameters = parts
+        policy, _, critics = (sum(parameter.numel() for parameter in part) for part in parts)
+        losses = policy + 1
+        self._shared = torch.zeros(losses + len(LOSSES) + critics, device=device)
+        for offset, part in zip((0, policy, losses + len(LOSSES)), parts, strict=True):
+            for parameter in part:
+                parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
+                offset += parameter.numel()
+        self._policy_gradient, self._critic_gradient = self._shared[:policy], self._shared[-critics:]
+        self._temperature_gradient = self._shared[policy]
+        self.losses = self._shared[losses : losses + len(LOSSES)]
+        """:data:`LOSSES` of the newest update, shape (4,); the first two are 0 where the policy did not learn."""
+        self._of_critics = self._shared[losses + LOSSES.index("critic_loss") :]
+
+    def _make_optimizers(self, cuda: bool) -> None:
+        config = self.config
+        options: dict[str, Any] = {"betas": BETAS, "fused": True, "capturable": cuda}
+        decay = config.weight_decay
+        self._policy_optimizer = torch.optim.AdamW(
+            [
+                {"params": self._policy_parameters, "lr": config.actor_learning_rate, "weight_decay": decay},
+                {
+                    "params": self._temperature_parameters,
+                    "lr": config.temperature_learning_rate,
+                    "weight_decay": 0.0,
+                },
+            ],
+            **options,
+        )
+        self._critic_optimizer = torch.optim.AdamW(
+            self._critic_parameters, lr=config.critic_learning_rate, weight_decay=decay, **options
+        )
+
+    @property
+    def temperature(self) -> torch.Tensor:
+        """Worth of the policy's entropy [reward per nat], shape (), on the device."""
+        return self.log_temperature.detach().exp()
+
+    def shared(self, improves: bool) -> torch.Tensor:
+        """What the ranks have to add up after :meth:`compute`."""
+        return self._shared if improves else self._of_critics
+
+    def compute(self, batch: Batch, noise: torch.Tensor, improves: bool) -> None:
+        """This rank's part of the gradients and losses of one update.
+
+        Args:
+            batch: What was sampled.
+            noise: Standard normal, of the action after the transition and of that at its beginning; shape (2, samples, actions).
+            improves: Whether policy and temperature learn too.
+        """
+        self._shared.zero_()
+        share = 1.0 / self.config.batch_size  # the batch is all ranks' together
+        taken = batch.before[:, self.width :]
+        seen, known = self._normalize(batch.before)
+        seen_after, known_after = self._normalize(batch.after)
+        temperature = self.temperature
+        with torch.no_grad():
+            following, log_prob = self.actor.sample(seen_after, noise[0])
+            target = self.target(self.targets(known_after, following), batch, -temperature * log_prob)
+        outputs = self.critics(known, taken)
+        critic_loss = self._critic_loss(outputs, target) * share
+        torch.autograd.backward(critic_loss, inputs=self._critic_parameters)
+        self.losses[2].copy_(critic_loss.detach())
+        self.losses[3].copy_(self.critics.mean(outputs.detach()).mean(0).sum() * share)
+        if improves:
+            chosen, log_prob = self.actor.sample(seen, noise[1])
+            value = self.critics.combined_mean(self.critics(known, chosen))
+            policy_loss = (temperature * log_prob - value).sum() * share
+            torch.autograd.backward(policy_loss, inputs=self._policy_parameters)
+            entropy = -log_prob.detach()
+            # of J(α) = α · E[−log π − H] (arXiv:1812.05905, eq. 18), by log α
+            excess = entropy - self.config.target_entropy * self._actions
+            self._temperature_gradient.copy_(temperature * excess.sum() * share)
+            self.losses[0].copy_(policy_loss.detach())
+            self.losses[1].copy_(entropy.sum() * share)
+
+    def _normalize(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the policy sees and what the critics do, of rows of all that is observed; the same tensor where it is the same group."""
+        groups = [normalizer(rows[:, at]) for normalizer, at in zip(self.normalizers, self.columns, strict=True)]
+        return groups[0], groups[-1]
+
+    def target(self, outputs: torch.Tensor, batch: Batch, bonuses: torch.Tensor) -> torch.Tensor:
+        """What the critics should say: a distribution, shape (samples, atoms), or, of one atom, the return, shape (samples, 1).
+
+        Args:
+            outputs: Of the target critics for what comes after, shape (critics, samples, atoms).
+            batch: What was sampled.
+            bonuses: −α · log π of the action after, shape (samples,).
+        """
+        config = self.config
+        if config.atoms == 1:
+            after = self.targets.combined_mean(outputs) + bonuses
+            return (batch.returns + batch.discounts * after).unsqueeze(1)
+        probabilities = self.targets.combined_distribution(outputs)
+        ends = config.v_min, config.v_max
+        return kernels.project(probabilities, batch.returns, batch.discounts, bonuses, *ends, self._projected)
+
+    def _critic_loss(self, outputs: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Sum over critics and samples of the cross entropy, or of the squared error."""
+        if self.config.atoms == 1:
+            return (outputs - target).square().sum()
+        return -(target * log_softmax(outputs, -1)).sum()
+
+    @torch.no_grad()
+    def apply(self, improves: bool) -> None:
+        """A step of AdamW with the gradients of all ranks; then the target critics follow."""
+        if improves:
+            self._clip(self._policy_gradient)
+            self._policy_optimizer.step()
+        self._clip(self._critic_gradient)
+        self._critic_optimizer.step()
+        torch._foreach_lerp_([*self.targets.parameters()], [*self.critics.parameters()], self.config.tau)
+
+    def _clip(self, gradient: torch.Tensor) -> None:
+        if limit := self.config.max_grad_norm:
+            norm = torch.dot(gradient, gradient).sqrt()
+            gradient.mul_((limit / (norm + 1e-6)).clamp(max=1.0))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, normalisers, temperature and optimizers."""
+        return {
+            "policy": self.actor.state_dict(),
+            "critics": self.critics.state_dict(),
+            "targets": self.targets.state_dict(),
+            "critic_normalizers": [each.state_dict() for each in self.normalizers[1:]],
+            "log_temperature": self.log_temperature.detach(),
+            "policy_optimizer": self._policy_optimizer.state_dict(),
+            "critic_optimizer": self._critic_optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any], *, weights_only: bool = False) -> None:
+        """Go on from :meth:`state_dict`; ``weights_only``: with fresh optimizers."""
+        self.actor.load_state_dict(state["policy"])
+        self.critics.load_state_dict(state["critics"])
+        self.targets.load_state_dict(state["targets"])
+        for normalizer, saved in zip(self.normalizers[1:], state["critic_normalizers"], strict=True):
+            normalizer.load_state_dict(saved)
+        self.log_temperature.data.copy_(state["log_temperature"])
+        for name, optimizer in (("policy", self._policy_optimizer), ("critic", self._critic_optimizer)):
+            if weights_only:
+                optimizer.state.clear()
+                continue
+            own = [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            optimizer.load_state_dict(state[f"{name}_optimizer"])
+            for group, settings in zip(optimizer.param_groups, own, strict=True):
+                group.update(settings)  # of this job and this device, not of those that saved it

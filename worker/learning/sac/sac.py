@@ -1,0 +1,240 @@
+"""Soft actor-critic (Haarnoja et al. 2018, arXiv:1801.01290 and arXiv:1812.05905) over a gang of ranks, for thousands of worlds.
+
+What makes it fast is from FastTD3 (arXiv:2505.22642), FastSAC (arXiv:2512.01996) and FlashSAC (arXiv:2604.04539): thousands of worlds
+and as large batches, several updates a step, critics that predict a distribution and are normalised layer by layer, targets from their
+mean instead of the least, normalised observations, AdamW with a little weight decay, a small discount, and a target entropy near 0.
+
+- The gradients of critics, policy and temperature are taken at the same weights, of the same samples, and lie in one buffer: a gang
+  has one collective an update.
+- Each rank samples from the replay of its own worlds, and its part of the batch. Gradients, losses and the moments of observations are
+  those of the whole gang, so the ranks' weights stay the same bits.
+- What is drawn at random is drawn in :meth:`SAC.begin`; action noise depends on (seed, iteration, step, global world index) alone.
+- A time-out is no end: the target takes the critics' word for the observation before the reset. Only a true end counts as one.
+- On CUDA all updates of an iteration are one graph; in a gang of several ranks the collectives stand between smaller graphs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict
+
+from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
+from worker.learning.ppo import moments
+from worker.learning.randomness import mix_seed
+from worker.learning.recording import Recorded
+from worker.learning.sac import kernels
+from worker.learning.sac.learner import LOSSES, Learner
+from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, size_of
+from worker.learning.sac.replay import Replay
+from worker.learning.sac.settings import SACConfig
+
+
+class SAC:
+    """Collects with :meth:`act` and :meth:`record`, then :meth:`learn`; see :class:`worker.learning.algorithm.Algorithm`."""
+
+    config_type: ClassVar[type[SACConfig]] = SACConfig
+    captures_rollout: ClassVar[bool] = True
+
+    def __init__(self, config: SACConfig, setting: Setting) -> None:
+        """Allocate everything once. Raises ValueError for images, choices, an unknown group, or a batch with no sample for some rank."""
+        self.gang, self.share, self.seed, spaces = setting.gang, setting.share, setting.seed, setting.spaces
+        check_spaces(spaces, (POLICY, config.critic_group))
+        if config.batch_size < self.gang.size:
+            raise ValueError(
+                f"sac.batch_size: {self.gang.size} ranks need at least as many samples, got {config.batch_size}"
+            )
+        self.config, self.steps, self.device = config, config.steps, self.gang.device
+        kernels.load(self.device)
+        self._groups = list(dict.fromkeys((POLICY, config.critic_group)))
+        sizes = [size_of(spaces, group) for group in self._groups]
+        self.learner = Learner(config, sizes, spaces.actions, self.gang)
+        width = self.learner.width
+        self.replay = Replay(
+            config.replay_steps, self.share.count, width, spaces.actions, config.n_step, config.gamma, self.device
+        )
+        self._updates = 0
+        self._learns = False
+        self._allocate(width, spaces.actions)
+        self._make_recordings()
+
+    def _allocate(self, width: int, actions: int) -> None:
+        config, device, samples = self.config, self.device, self.learner.samples
+        self._step = 0
+        self._source = torch.Generator(device)
+        self._keys = torch.zeros(self.steps, dtype=torch.int32, device=device)
+        self._uniform = torch.zeros(1, dtype=torch.int32, device=device)
+        self._slots = torch.zeros(self.steps, dtype=torch.int64, device=device)
+        self._before = torch.zeros(self.share.count, width + actions, device=device)
+        self._actions = torch.zeros(self.share.count, actions, device=device)
+        self._all_rows = torch.zeros(config.updates, samples, dtype=torch.int64, device=device)
+        self._all_noise = torch.zeros(config.updates, 2, samples, actions, device=device)
+        self._rows, self._noise = torch.zeros_like(self._all_rows[0]), torch.zeros_like(self._all_noise[0])
+        self._moment_sums = torch.zeros(1 + 2 * width, dtype=torch.float64, device=device)
+        self._loss_sums = torch.zeros(len(LOSSES), device=device)
+        counts = {"actor_loss": config.updates // config.policy_delay, "entropy": config.updates // config.policy_delay}
+        self._counts = torch.tensor([counts.get(name, config.updates) for name in LOSSES], device=device)
+        self._means = torch.zeros(len(LOSSES), device=device)
+        self._rate = torch.tensor(config.critic_learning_rate, device=device)
+
+    def _make_recordings(self) -> None:
+        """What the device replays as graphs: in a gang of one two of them, else the parts between which the collectives stand."""
+        parts: dict[str, Callable[[], None]] = {
+            "gather moments": self._gather_moments,
+            "merge moments": self._merge_moments,
+            "critic gradients": lambda: self._compute(False),
+            "all gradients": lambda: self._compute(True),
+            "critic step": lambda: self._apply(False),
+            "all steps": lambda: self._apply(True),
+        }
+        wholes: dict[str, Callable[[], None]] = {"moments": self._observe, "updates": self._update}
+        graphs = wholes if self.gang.size == 1 else parts
+        recorded = {name: Recorded(function, self.device, name) for name, function in graphs.items()}
+        self.recordings: Sequence[Recorded] = [*recorded.values()]
+        self._run: dict[str, Callable[[], None]] = {**wholes, **parts, **recorded}
+
+    # -- collecting ---------------------------------------------------------------------------------------------------
+
+    def begin(self, iteration: int) -> None:
+        """Draw the keys of this iteration's action noise, alike on all ranks, and this rank's samples and their noise."""
+        config, replay = self.config, self.replay
+        self._step = 0
+        self._source.manual_seed(mix_seed(self.seed, iteration, 0))
+        self._keys.random_(0, 2**31 - 1, generator=self._source)
+        replay.find_slots(self._slots)
+        self._uniform.fill_(int(self._updates == 0 and replay.recorded < config.warm_up))
+        self._source.manual_seed(mix_seed(self.seed, iteration, 1, self.gang.rank))
+        enough = replay.recorded + self.steps >= config.warm_up
+        self._learns = enough and replay.draw(self._all_rows, self._source, self.steps)
+        if self._learns:
+            torch.randn(self._all_noise.shape, generator=self._source, out=self._all_noise)
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """Actions of the policy with its noise, or uniform ones, shape (worlds, actions), float32."""
+        for group, columns in zip(self._groups, self.learner.columns, strict=True):
+            self._before[:, columns].copy_(observations[group])
+        mean, log_std = self.learner.actor(self._before[:, self.learner.columns[0]])
+        first, limit = self.share.first, self.config.action_limit
+        kernels.explore(self._keys, self._step, first, self._uniform, limit, mean, log_std, self._actions)
+        return self._actions
+
+    @torch.no_grad()
+    def record(self, step: Transition) -> None:
+        """Write what the step did into the replay."""
+        ended = step.dones.unsqueeze(1)
+        after = [torch.where(ended, step.terminal_observations[g], step.observations[g]) for g in self._groups]
+        goes_on = ~step.dones
+        outcomes = torch.stack((step.rewards, goes_on.float(), (goes_on | step.time_outs).float()), 1)
+        self._before[:, self.learner.width :].copy_(self._actions)
+        slot = self._slots[self._step : self._step + 1]
+        self.replay.write(slot, self._before, torch.cat(after, 1), outcomes)
+        self._step += 1
+
+    # -- learning -----------------------------------------------------------------------------------------------------
+
+    def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
+        """All updates of the iteration; until the replay holds enough for them, only the normalisers learn.
+
+        Args:
+            observations: Not needed: those after the last step were recorded with it.
+
+        Returns:
+            Means over the updates of :data:`LOSSES`, the temperature, and the critics' learning rate. Until the first update, losses
+            are 0.
+        """
+        self.replay.advance(self.steps)
+        if self.config.normalize_observations:
+            self._run["moments"]()
+        if self._learns:
+            self._run["updates"]()
+            self._updates += self.config.updates
+        figures = dict(zip(LOSSES, self._means, strict=True))
+        return {**figures, "temperature": self.learner.temperature, "learning_rate": self._rate}
+
+    def _observe(self) -> None:
+        """Merge the iteration's observations, of all ranks, into the normalisers."""
+        self._run["gather moments"]()
+        self.gang.sum(self._moment_sums)
+        self._run["merge moments"]()
+
+    @torch.no_grad()
+    def _gather_moments(self) -> None:
+        seen = self.replay.newest(self._slots)
+        self._moment_sums[0].fill_(seen.shape[0] * seen.shape[1])
+        for normalizer, columns, sums in self._moments():
+            moments.gather(seen[..., columns], normalizer, sums)
+
+    @torch.no_grad()
+    def _merge_moments(self) -> None:
+        for normalizer, _, sums in self._moments():
+            moments.merge(normalizer, self._moment_sums[0], sums)
+
+    def _moments(self) -> list[tuple[torch.nn.Module, slice, torch.Tensor]]:
+        """Of each group: its normaliser, its columns, and the sums of its moments, shape (2 · size,)."""
+        columns = self.learner.columns
+        sums = [self._moment_sums[1 + 2 * each.start : 1 + 2 * each.stop] for each in columns]
+        return list(zip(self.learner.normalizers, columns, sums, strict=True))
+
+    def _update(self) -> None:
+        """All updates of an iteration."""
+        self._loss_sums.zero_()
+        for number, (rows, noise) in enumerate(zip(self._all_rows, self._all_noise, strict=True), start=1):
+            improves = number % self.config.policy_delay == 0
+            self._rows.copy_(rows)
+            self._noise.copy_(noise)
+            self._run["all gradients" if improves else "critic gradients"]()
+            self.gang.sum(self.learner.shared(improves))
+            self._run["all steps" if improves else "critic step"]()
+        torch.div(self._loss_sums, self._counts, out=self._means)
+
+    def _compute(self, improves: bool) -> None:
+        self.learner.compute(self.replay.sample(self._rows), self._noise, improves)
+
+    def _apply(self, improves: bool) -> None:
+        self._loss_sums.add_(self.learner.losses)
+        self.learner.apply(improves)
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    def policy(self) -> SquashedPolicy:
+        """What was learnt so far, live."""
+        return SquashedPolicy(self.learner.actor)
+
+    @classmethod
+    def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedPolicy:
+        """A policy that can take over the ``policy`` of a :meth:`state_dict`."""
+        check_spaces(spaces, (POLICY,))
+        return SquashedPolicy(Actor(config, size_of(spaces, POLICY), spaces.actions).to(device))
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """Networks, normalisers, temperature, optimizers, and how many updates were done."""
+        return {**self.learner.state_dict(), "updates": self._updates}
+
+    def load_state_dict(
+        self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
+    ) -> list[str]:
+        """Go on from :meth:`state_dict`. The replay, which is part of :meth:`world_state`, stays as it is.
+
+        Rates and decays are always this job's, whatever the checkpoint's were.
+        """
+        self._updates = int(state["updates"])
+        self.learner.load_state_dict(state, weights_only=weights_only)
+        for recording in self.recordings:
+            recording.release()
+        self._make_recordings()  # the old ones would go on with the optimizers' old moments
+        rates = [name for name in changed if name.endswith("_rate")]
+        return [f"{name} set to {getattr(self.config, name):g}" for name in rates]
+
+    def world_state(self) -> Mapping[str, torch.Tensor]:
+        """The replay, where it is to be saved."""
+        return self.replay.world_state() if self.config.save_replay else {}
+
+    def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on with the replay of :meth:`world_state`; where none was saved, with an empty one."""
+        if state:
+            self.replay.load_world_state(state)
+        else:
+            self.replay.clear()
