@@ -8,32 +8,11 @@ import time
 from typing import Any
 
 import torch
-from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
-from tensordict import TensorDict
 
 from worker.learning.ppo.settings import PPOConfig
+from worker.tasks.rsl_rl_env import TaskVecEnv
 from worker.tasks.task import Task
-
-
-class StockEnv(VecEnv):
-    """A task as rsl-rl wants it. Its simulation step stays the captured one."""
-
-    def __init__(self, task: Task) -> None:
-        self.task, self.cfg = task, {}
-        self.num_envs, self.num_actions, self.device = task.world_count, task.action_size, task.device
-        self.max_episode_length, self.episode_length_buf = task.max_episode_length, task.episode_length
-
-    def get_observations(self) -> TensorDict:
-        # a copy: rsl-rl keeps what it was given until after the next step. Its convolutions take floats.
-        seen = self.task.observations
-        seen = seen.float() / 255.0 - 0.5 if seen.dtype == torch.uint8 else seen.clone()
-        return TensorDict({"policy": seen}, [self.num_envs], device=self.device)
-
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        self.task.step(actions)
-        extras = {"time_outs": self.task.time_outs.float()}
-        return self.get_observations(), self.task.rewards.clone(), self.task.dones.long(), extras
 
 
 def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
@@ -72,7 +51,7 @@ def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
         },
     }
     with contextlib.redirect_stdout(io.StringIO()):
-        return OnPolicyRunner(StockEnv(task), config, None, task.device)
+        return OnPolicyRunner(TaskVecEnv(task), config, None, task.device)
 
 
 def _wait() -> None:

@@ -404,7 +404,7 @@ def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
     if kind == "extra_forbidden":
         valid, algorithm = _keys_at(path[:-1]), ALGORITHMS.get(str(path[-2])) if len(path) == 3 else None
         if other := getattr(algorithm, "elsewhere", {}).get(str(path[-1])):
-            return f"{path[-2]} has no such setting; algorithm {other} has"
+            return f"{path[-2]} has no such setting; {other}"
         nearest = difflib.get_close_matches(str(path[-1]), valid, 1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}?" if nearest else f"valid here: {', '.join(valid)}"
         return f"unknown key; {hint}"

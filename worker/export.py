@@ -18,6 +18,7 @@ import shutil
 import time
 import uuid
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
     from worker.learning.algorithm import ExportedPolicy
 
+STEPS = 3
+"""Steps in which an exported policy with a memory is compared."""
 TOLERANCE = 1e-5
 """Greatest absolute difference between the exported and the trained policy's actions."""
 
@@ -41,16 +44,15 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
 
     Raises TrainingError where the exported file computes something else than the policy; nothing is published then.
     """
-    import torch
-
     from worker.learning.trained import load_policy
 
     policy = load_policy(checkpoint)
     facts, exported = checkpoint.manifest, policy.module()
-    observations = exported.sample["policy"]
-    with torch.no_grad():
-        actions = policy.act(exported.sample)  # as it was trained, not as it is exported
-    few = 8 if observations.ndim == 2 else 1
+    steps = STEPS if exported.states else 1
+    # as it was trained, not as it is exported
+    actions = [policy.act(exported.sample).numpy() for _ in range(steps)]
+    fed = {name: tensor.numpy() for name, tensor in exported.observed().items()}
+    few = 8 if all(tensor.ndim == 2 for tensor in fed.values()) else 1
     metadata = {
         "format": 1,
         "task": facts["task"],
@@ -61,10 +63,15 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
         **facts["policy"],
         "input": "obs",
         "output": "actions",
-        "self_test": {"obs": observations[:few].tolist(), "actions": actions[:few].tolist(), "tolerance": TOLERANCE},
+        **({"state": {name: list(exported.inputs[name].shape) for name in exported.states}} if exported.states else {}),
+        "self_test": {
+            **{name: tensor[:few].tolist() for name, tensor in fed.items()},
+            "actions": actions[0][:few].tolist(),
+            "tolerance": TOLERANCE,
+        },
     }
     model = to_onnx(exported, metadata)
-    metadata["max_difference"] = check(model, observations.numpy(), actions.numpy())
+    metadata["max_difference"] = check(model, exported, fed, actions)
     metadata["sha256"] = hashlib.sha256(model).hexdigest()
     metadata["created"] = time.time()
     target = run.exports / checkpoint.name
@@ -109,14 +116,26 @@ def to_onnx(policy: ExportedPolicy, metadata: dict[str, Any]) -> bytes:
     return model.SerializeToString()
 
 
-def check(model: bytes, observations: np.ndarray, actions: np.ndarray) -> float:
-    """Run ``model`` with ONNX's reference evaluator; the greatest difference to ``actions``. Raises TrainingError above the tolerance."""
+def check(
+    model: bytes, exported: ExportedPolicy, fed: Mapping[str, np.ndarray], actions: Sequence[np.ndarray]
+) -> float:
+    """Run ``model`` with ONNX's reference evaluator; the greatest difference to ``actions``. Raises TrainingError above the tolerance.
+
+    Args:
+        fed: The observations, the same in each step; a recurrent policy begins with a state of zeros.
+        actions: What the policy does in each step, shape (n, actions).
+    """
     import numpy as np
     import onnx
     from onnx.reference import ReferenceEvaluator
 
-    (found,) = ReferenceEvaluator(onnx.load_from_string(model)).run(None, {"obs": observations})
-    difference = float(np.abs(found - actions).max())
+    evaluator, count = ReferenceEvaluator(onnx.load_from_string(model)), len(actions[0])
+    states = {name: np.zeros((count, *exported.inputs[name].shape[1:]), dtype=np.float32) for name in exported.states}
+    difference = 0.0
+    for wanted in actions:
+        found, *after = evaluator.run(None, {**fed, **states})
+        states = dict(zip(states, after, strict=True))
+        difference = max(difference, float(np.abs(found - wanted).max()))
     if not difference <= TOLERANCE:
         raise TrainingError(
             f"the exported policy differs from the trained one by {difference:g} (at most {TOLERANCE:g} is allowed); not published"

@@ -125,7 +125,17 @@ class ExportedPolicy:
     outputs: Sequence[str]
     """Names: ``actions``, then the recurrent state, if any, as ``<input>_out``."""
     sample: TensorDict
-    """Observations as the policy has met them, batch size (n,): those on which what was exported is compared."""
+    """Observations as the policy has met them, batch size (n,), in the order of the inputs: those on which what was exported is
+    compared."""
+
+    @property
+    def states(self) -> list[str]:
+        """Names of the inputs that are the recurrent state."""
+        return list(self.inputs)[len(self.sample.keys()) :]
+
+    def observed(self) -> dict[str, torch.Tensor]:
+        """The sample by the names of the inputs."""
+        return dict(zip(self.inputs, self.sample.values(), strict=False))
 
 
 class Algorithm(Protocol):

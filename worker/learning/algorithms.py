@@ -91,7 +91,7 @@ def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
     import difflib
 
     if key in elsewhere:
-        return f"there is no such setting; set algorithm: {elsewhere[key]}, which has it"
+        return f"there is no such setting; {elsewhere[key]}"
     near = difflib.get_close_matches(key, known, n=1)
     return (
         f"there is no such setting; {f'did you mean {near[0]}?' if near else 'there are ' + ', '.join(sorted(known))}"

@@ -20,7 +20,7 @@ from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.evaluation import evaluate
 from worker.learning.faults import die, kill_at
-from worker.learning.job import Job, StopRequest, configure, end_startup
+from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.recording import HostCopy, Recorded
 from worker.learning.replay import Replay
@@ -29,6 +29,7 @@ from worker.learning.reporter import Fence, Reporter
 from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
 from worker.learning.state import TrainingState
 from worker.learning.totals import Totals
+from worker.learning.trained import choose_checkpoint, load_learner
 from worker.tasks.config import value_at
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ class Loop:
         settings = algorithms.settings(chosen, self.algorithm_name, self.config, job.section)
         self.share = share
         self.algorithm = build_algorithm(chosen, settings, self.task, share, gang, self.seed)
+        if teacher := getattr(settings, "teacher_checkpoint", None):
+            with user_errors("train"):
+                self.algorithm.load_teacher(self._weights_of(teacher))  # type: ignore[attr-defined]
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
         self.replay = Replay(self.task, share, self.algorithm.steps, job.section, self.seed)
@@ -109,6 +113,13 @@ class Loop:
         self.beacon = Beacon()
         self.state.saver.start()
         end_startup()
+
+    def _weights_of(self, reference: str) -> dict[str, Any]:
+        """What the algorithm of another run has learnt, ``RUN`` or ``RUN@ITERATION``. All ranks call it."""
+        name, _, iteration = reference.partition("@")
+        checkpoint = choose_checkpoint(self.gang, self.job.store.run(name), iteration or None)
+        learnt: dict[str, Any] = load_learner(checkpoint, self.gang.device)["algorithm"]
+        return learnt
 
     def train(self) -> int:
         """Train to the end; returns the exit code: 0 done, 75 left on request with a checkpoint.

@@ -223,7 +223,7 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
     ("section", "message"),
     [
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
-        ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; set algorithm: rsl_rl, which has it"),
+        ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
         ({"config": {"ppo": {}}}, "config.ppo: PointConfig has no such key"),
         ({"ppo": {"steps": 1.5}}, "ppo.steps: Input should be a valid integer, got 1.5"),
         ({"ppo": {"normalize_observations": 1}}, "ppo.normalize_observations: Input should be a valid boolean"),

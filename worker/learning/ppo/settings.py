@@ -83,11 +83,12 @@ class PPOConfig:
     """What a resumed run can't change: checkpoints hold what became of it."""
     elsewhere: ClassVar[dict[str, str]] = {
         **dict.fromkeys(
-            ("rnd_cfg", "symmetry_cfg", "rnn_type", "rnn_hidden_dim", "class_name", "distribution_cfg"), "rsl_rl"
+            ("rnd_cfg", "symmetry_cfg", "rnn_type", "rnn_hidden_dim", "class_name", "distribution_cfg"),
+            "algorithm rsl_rl has it",
         ),
-        **dict.fromkeys(("replay", "capacity", "batch_size", "tau", "updates"), "sac"),
+        **dict.fromkeys(("replay", "capacity", "batch_size", "tau", "updates"), "algorithm sac has it"),
     }
-    """Settings that people look for here, and the algorithm that has them."""
+    """Settings that people look for here, and where they are."""
 
     @model_validator(mode="after")
     def _agree(self) -> PPOConfig:

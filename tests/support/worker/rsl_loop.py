@@ -1,0 +1,149 @@
+"""A small loop for rsl_rl's algorithms: what Muster's own does with them, without files, logs and graphs."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from tests.support.worker.point_task import Point, PointConfig
+from worker.distributed import Gang, Placement
+from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.randomness import generator_state, restore_generators
+from worker.learning.rsl.algorithm import RslRl
+from worker.learning.rsl.settings import read_settings
+
+
+class GroupedPoint(Point):
+    """The point, with observation groups: the policy may see less than the critic."""
+
+    def __init__(self, config: PointConfig | None = None, world_count: int = 8, **arguments: Any) -> None:
+        super().__init__(config or PointConfig(), world_count, **arguments)
+        self.groups = {"policy": self.observations, "critic": self.observations, "place": self.observations[:, :1]}
+        self.terminal_groups = {"policy": self.terminal_observations, "critic": self.terminal_observations}
+
+
+def alone() -> Gang:
+    """A gang of one rank on the CPU."""
+    return Gang(Placement(), "cpu", None, ["here"])
+
+
+def spaces_of(task: Any) -> Spaces:
+    """What goes into a policy for ``task``, and what comes out of it."""
+    return Spaces({name: tuple(group.shape[1:]) for name, group in task.groups.items()}, task.action_size)
+
+
+def build(task: Any, section: dict[str, Any], gang: Gang | None = None, share: Share | None = None) -> RslRl:
+    """The algorithm that a job's ``rsl_rl`` section describes, for ``task``."""
+    gang, count = gang or alone(), task.world_count
+    share = share or Share(0, count, count)
+    setting = Setting(spaces_of(task), share, gang, seed=1, control_seconds=1.0 / task.config.control_hz)
+    return RslRl(read_settings(section), setting)
+
+
+def seen(task: Any) -> TensorDict:
+    """The task's observations: its own buffers."""
+    return TensorDict(dict(task.groups), batch_size=[task.world_count])
+
+
+def train(algorithm: RslRl, task: Any, iterations: int, done: int = 0) -> list[dict[str, float]]:
+    """Iterations ``done``, ``done + 1``, …; the metrics of each, with the ``reward`` of a step."""
+    records = []
+    for iteration in range(done, done + iterations):
+        algorithm.begin(iteration)
+        rewards = 0.0
+        for _ in range(algorithm.steps):
+            task.step(algorithm.act(seen(task)))
+            ended = TensorDict(dict(task.terminal_groups), batch_size=[task.world_count])
+            algorithm.record(Transition(seen(task), ended, task.rewards, task.dones, task.time_outs))
+            rewards += float(task.rewards.mean()) / algorithm.steps
+        metrics = algorithm.learn(seen(task))
+        records.append({"reward": rewards, **{name: float(value) for name, value in metrics.items()}})
+    return records
+
+
+def evaluate(policy: Any, task: Any) -> tuple[float, float]:
+    """Mean return and mean length of each world's first episode after a reset, with the policy's best actions."""
+    task.reset()
+    policy.reset()
+    running = torch.ones(task.world_count)
+    returns, lengths = torch.zeros(task.world_count), torch.zeros(task.world_count)
+    for _ in range(task.max_episode_length):
+        task.step(policy.act(seen(task)))
+        policy.reset(task.dones)
+        returns += running * task.rewards
+        lengths += running
+        running *= ~task.dones
+    return float(returns.mean()), float(lengths.mean())
+
+
+def save(algorithm: RslRl, task: Any) -> bytes:
+    """All that a checkpoint has."""
+    buffer = io.BytesIO()
+    state = {"learner": dict(algorithm.state_dict()), "worlds": dict(algorithm.world_state())}
+    torch.save({**state, "task": task.state_dict(), "generators": generator_state()}, buffer)
+    return buffer.getvalue()
+
+
+def restore(algorithm: RslRl, task: Any, saved: bytes) -> None:
+    """Go on from :func:`save`."""
+    state = torch.load(io.BytesIO(saved), weights_only=True)
+    algorithm.load_state_dict(state["learner"])
+    algorithm.load_world_state(state["worlds"])
+    task.load_state_dict(state["task"])
+    restore_generators(state["generators"])
+
+
+class Seen(GroupedPoint):
+    """The point with an image beside its numbers: a bright column where it stands."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(PointConfig(episode_seconds=0.5), 8, **arguments)
+        self.groups["image"] = torch.zeros(8, 2, 9, 9, dtype=torch.uint8)
+        self._draw_image()
+
+    def step(self, actions: torch.Tensor) -> None:
+        super().step(actions)
+        self._draw_image()
+
+    def _draw_image(self) -> None:
+        columns = (self.place * 1.5 + 4.5).long().clamp(0, 8)
+        self.groups["image"].zero_()[torch.arange(8), :, :, columns] = 255
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        return {**super().state_tensors(), "image": self.groups["image"]}
+
+
+class Recall(GroupedPoint):
+    """Only an episode's first observation says which way to push in all of its 20 steps: without memory the mean reward is 0.05 at most."""
+
+    def __init__(self, world_count: int, *, seed: int = 0) -> None:
+        super().__init__(PointConfig(), world_count, seed=seed)
+        self.cue = self.place.sign()
+        self.told = self.cue.clone().unsqueeze(1)
+        self.groups = {"policy": self.told, "critic": self.cue.view(-1, 1)}
+        self.terminal_groups = {}
+
+    def reset(self) -> None:
+        super().reset()
+        if hasattr(self, "cue"):
+            self._tell()
+
+    def step(self, actions: torch.Tensor) -> None:
+        reward = actions[:, 0].clamp(-1.0, 1.0) * self.cue
+        super().step(torch.zeros_like(actions))
+        self.rewards.copy_(reward)
+        self._tell()
+
+    def _tell(self) -> None:
+        """The point stands still, and where it stands is drawn anew at a reset."""
+        self.cue.copy_(self.place.sign())
+        self.told[:, 0] = torch.where(self.episode_length == 0, self.cue, 0.0)
+
+
+def mirror(env: Any, obs: TensorDict | None, actions: torch.Tensor | None) -> tuple[Any, Any]:
+    """A symmetry function: left and right of the cart-pole, and of the point, are the same but for the sign."""
+    both = None if obs is None else TensorDict({k: torch.cat((v, -v)) for k, v in obs.items()}, [2 * obs.batch_size[0]])
+    return both, None if actions is None else torch.cat((actions, -actions))

@@ -1,0 +1,382 @@
+"""rsl_rl as an algorithm of Muster: what is refused, the same weights as its own runner, exact resumption, policies and their export."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from onnx import load_from_string
+from onnx.reference import ReferenceEvaluator
+from rsl_rl.models import MLPModel
+from rsl_rl.runners import DistillationRunner, OnPolicyRunner
+from torch import nn
+
+from tests.support.worker.rsl_loop import Seen, alone, build, restore, save, seen, spaces_of, train
+from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.rsl.algorithm import RslRl
+from worker.learning.rsl.settings import read_settings
+from worker.tasks.rsl_rl_env import TaskVecEnv
+
+torch.set_num_threads(1)
+
+GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.5}
+GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "hidden_dims": [8], "obs_normalization": True}
+LSTM = {**GRU, "rnn_type": "lstm", "rnn_num_layers": 2}
+CNN = {
+    "class_name": "CNNModel",
+    "hidden_dims": [8],
+    "cnn_cfg": {"output_channels": [4], "kernel_size": 3, "stride": 2, "norm": "batch"},
+}
+RND = {
+    "num_outputs": 4,
+    "predictor_hidden_dims": [8],
+    "target_hidden_dims": [8],
+    "weight": 5.0,
+    "weight_schedule": {"mode": "linear", "initial_step": 10, "final_step": 60, "final_value": 0.0},
+    "state_normalization": True,
+    "reward_normalization": True,
+}
+SYMMETRY = {
+    "data_augmentation_func": "tests.support.worker.rsl_loop:mirror",
+    "use_data_augmentation": True,
+    "use_mirror_loss": True,
+    "mirror_loss_coeff": 0.5,
+}
+DISTILLATION = {"class_name": "Distillation", "gradient_length": 4}
+IMAGES = {"actor": ["image", "policy"], "critic": ["image"]}
+
+CASES: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "fixed rate": {"algorithm": {"schedule": "fixed", "optimizer": "adamw"}},
+    "GRU": {"actor": {**GRU, "distribution_cfg": GAUSSIAN}, "critic": GRU},
+    "LSTM of the critic alone": {"critic": LSTM},
+    "RND": {"algorithm": {"rnd_cfg": RND}},
+    "symmetry": {"algorithm": {"symmetry_cfg": SYMMETRY}},
+    "Beta": {"actor": {"distribution_cfg": {"class_name": "BetaDistribution"}}},
+    "heteroscedastic": {"actor": {"distribution_cfg": {"class_name": "HeteroscedasticGaussianDistribution"}}},
+    "shared convolutions": {
+        "obs_groups": {"actor": ["image"], "critic": ["image"]},
+        "algorithm": {"share_cnn_encoders": True},
+        "actor": {**CNN, "distribution_cfg": GAUSSIAN},
+        "critic": {"class_name": "CNNModel", "hidden_dims": [8]},
+    },
+    "images and numbers": {
+        "obs_groups": IMAGES,
+        "actor": {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN},
+        "critic": CNN,
+    },
+    "a class of one's own": {
+        "actor": {"class_name": "tests.unit.worker.test_rsl_rl:Tanh", "distribution_cfg": GAUSSIAN}
+    },
+    "distillation": {
+        "algorithm": DISTILLATION,
+        "student": {**GRU, "distribution_cfg": GAUSSIAN},
+        "obs_groups": {"student": ["place"]},
+        "teacher_checkpoint": "taught",
+    },
+    "distillation of a GRU by an LSTM": {
+        "algorithm": DISTILLATION,
+        "student": {**GRU, "distribution_cfg": GAUSSIAN},
+        "teacher": {**LSTM, "distribution_cfg": GAUSSIAN},
+        "teacher_checkpoint": "taught",
+    },
+}
+
+
+class Tanh(MLPModel):
+    """A network that is not rsl_rl's."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.mlp = nn.Sequential(self.mlp, nn.Tanh())
+
+
+def made(name: str, seed: int = 4) -> tuple[RslRl, Seen]:
+    """An algorithm on a new task, with weights drawn from ``seed``; a teacher has those that it began with."""
+    task = Seen(seed=3)
+    torch.manual_seed(seed)
+    algorithm = build(task, {"num_steps_per_env": 8, **CASES[name]})
+    if CASES[name].get("teacher_checkpoint"):
+        algorithm.load_teacher({"policy": copy.deepcopy(algorithm.algorithm.teacher.state_dict())})
+    return algorithm, task
+
+
+def assert_same(one: Any, other: Any, where: str = "") -> None:
+    """Bit for bit, through mappings and lists."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), where
+        for key in one:
+            assert_same(one[key], other[key], f"{where}.{key}")
+    elif isinstance(one, list | tuple):
+        for index, pair in enumerate(zip(one, other, strict=True)):
+            assert_same(*pair, f"{where}.{index}")
+    else:
+        assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other, where
+
+
+# -- what is refused --------------------------------------------------------------------------------------------------
+
+
+TAUGHT = {"teacher_checkpoint": "taught"}
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"algorithm": {"class_name": "PPOO"}}, r"algorithm\.class_name: Could not resolve 'PPOO'"),
+        ({"algorithm": {"class_name": "torch:nn"}}, r"algorithm\.class_name: torch:nn is not an algorithm"),
+        ({"algorithm": {"clip": 0.1}}, r"algorithm: .* unexpected keyword argument 'clip'"),
+        ({"algorithm": {"gamma": "99e-2"}}, r"algorithm\.gamma: expected a number, got the text '99e-2'; in YAML"),
+        ({"algorithm": {"num_mini_batches": 0}}, r"algorithm\.num_mini_batches: expected at least 1, got 0$"),
+        ({"algorithm": {"optimizer": "adamm"}}, r"algorithm: Invalid optimizer 'adamm'"),
+        ({"algorithm": {"num_mini_batches": 65}}, r"algorithm\.num_mini_batches: 65 .* samples; a rank has 64"),
+        (
+            {"critic": GRU, "algorithm": {"num_mini_batches": 9}},
+            r"algorithm\.num_mini_batches: 9 .* worlds, .* recurrent; a rank has 8",
+        ),
+        ({"actor": {"class_name": "nowhere:Net"}}, r"actor\.class_name: No module named 'nowhere'"),
+        ({"critic": {"hiden_dims": [8]}}, r"critic: .* unexpected keyword argument 'hiden_dims'"),
+        ({"critic": {"hidden_dims": []}}, r"critic: IndexError: "),
+        ({"actor": {"distribution_cfg": {"init_sd": 1.0}}}, r"actor: .* unexpected keyword argument 'init_sd'"),
+        ({"actor": {"class_name": "MLPModel"}}, r"actor\.distribution_cfg: PPO needs a distribution"),
+        ({"actor": CNN}, r"actor: No 2D observations are provided"),
+        ({"obs_groups": {"actor": ["image"]}}, r"actor: The MLP model only supports 1D observations"),
+        ({"obs_groups": {"actor": ["polcy"]}}, r"obs_groups: Observation 'polcy' in observation set 'actor' not found"),
+        (
+            {
+                **CASES["shared convolutions"],
+                "actor": {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN},
+            },
+            r"actor\.obs_normalization: it sees images alone",
+        ),
+        (
+            {"critic": GRU, "algorithm": {"symmetry_cfg": SYMMETRY}},
+            r"algorithm: Symmetry augmentation is not supported for recurrent",
+        ),
+        ({"algorithm": {"symmetry_cfg": {"data_augmentation_func": "nowhere:f"}}}, r"algorithm: No module named"),
+        ({"algorithm": {"rnd_cfg": {"weight": 1.0}}}, r"algorithm: .* missing 3 required positional arguments"),
+        ({"student": GRU}, r"student: PPO has the networks actor and critic$"),
+        (TAUGHT, r"teacher_checkpoint: PPO has no teacher"),
+        ({"algorithm": DISTILLATION}, r"teacher_checkpoint: name the run that trained the teacher"),
+        ({"algorithm": {**DISTILLATION, "rnd_cfg": RND}, **TAUGHT}, r"algorithm: The RND extension is not compatible"),
+        (
+            {"algorithm": {**DISTILLATION, "gradient_length": 9}, **TAUGHT},
+            r"algorithm\.gradient_length: .* 8 steps .*, 9 are needed",
+        ),
+        ({"torch_compile_mode": "reduce-overhead"}, r"algorithm: torch_compile_mode='reduce-overhead'"),
+    ],
+)
+def test_what_rsl_rl_refuses_is_told_in_one_line_with_its_place(section: dict[str, Any], message: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(ValueError, match=rf"^rsl_rl\.{message}") as refusal:
+            build(Seen(seed=3), {"num_steps_per_env": 8, **section})
+    assert "\n" not in str(refusal.value)
+
+
+def test_choices_are_refused() -> None:
+    setting = Setting(Spaces({"policy": (2,)}, 3, discrete=True), Share(0, 8, 8), alone(), 1)
+    with pytest.raises(ValueError, match=r"^rsl_rl: .* actions of this task are choices$"):
+        RslRl(read_settings({}), setting)
+
+
+# -- learning ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
+    algorithm, task = made(name)
+    records = train(algorithm, task, 3)
+    weights = copy.deepcopy(dict(algorithm.algorithm.save()))
+
+    own = Seen(seed=3)
+    config = read_settings({"num_steps_per_env": 8, **CASES[name]})
+    distils = "teacher_checkpoint" in CASES[name]
+    names = ("student", "teacher") if distils else ("actor", "critic")
+    stock: dict[str, Any] = {each: config.section(each) for each in ("algorithm", *names)}
+    torch.manual_seed(4)
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        stock |= {"num_steps_per_env": 8, "save_interval": 100, "obs_groups": copy.deepcopy(config.obs_groups)}
+        runner = (DistillationRunner if distils else OnPolicyRunner)(TaskVecEnv(own), stock, None, "cpu")  # type: ignore[arg-type]
+        if distils:
+            runner.alg.teacher_loaded = True
+        runner.learn(3)
+    assert_same(weights, dict(runner.alg.save()))
+    assert records[-1]["learning_rate"] == runner.alg.optimizer.param_groups[0]["lr"]
+    assert torch.equal(task.place, own.place)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_run_that_goes_on_from_its_checkpoint_ends_with_the_same_bits(name: str) -> None:
+    algorithm, task = made(name)
+    train(algorithm, task, 2)
+    saved = save(algorithm, task)
+    expected = train(algorithm, task, 2, done=2)
+    again, fresh = made(name, seed=77)
+    train(again, fresh, 1)
+    restore(again, fresh, saved)
+    assert_same(train(again, fresh, 2, done=2), expected)
+    assert_same(dict(again.state_dict()), dict(algorithm.state_dict()))
+    assert_same(dict(again.world_state()), dict(algorithm.world_state()))
+    assert_same(fresh.state_dict(), task.state_dict())
+
+
+def test_what_is_kept_of_worlds_begins_with_their_index() -> None:
+    kept = {
+        "nothing": {},
+        "GRU": {"actor.0": (8, 1, 8), "critic.0": (8, 1, 8)},
+        "LSTM of the critic alone": {"critic.0": (8, 2, 8), "critic.1": (8, 2, 8)},
+        "RND": {"rnd": (8,)},
+        "distillation of a GRU by an LSTM": {"student.0": (8, 1, 8)},
+    }
+    for name, shapes in kept.items():
+        algorithm, _ = made(name)
+        assert {key: tuple(tensor.shape) for key, tensor in algorithm.world_state().items()} == shapes
+    with pytest.raises(ValueError, match=r"student\.0 is not of shape \(8, 1, 8\)"):
+        algorithm.load_world_state({"student.0": torch.zeros(7, 1, 8)})
+
+
+def test_the_recurrent_state_of_a_world_is_forgotten_where_its_episode_ended() -> None:
+    algorithm, task = made("GRU")
+    algorithm.begin(0)
+    ended = False
+    for _ in range(algorithm.steps):
+        task.step(algorithm.act(seen(task)))
+        algorithm.record(Transition(seen(task), seen(task), task.rewards, task.dones, task.time_outs))
+        state = algorithm.world_state()["actor.0"]
+        assert torch.equal((state == 0).all(dim=(1, 2)), task.dones)
+        ended |= bool(task.dones.any())
+    assert ended
+
+
+def test_weights_alone_leave_the_optimizer_as_it_was() -> None:
+    trained, task = made("RND")
+    train(trained, task, 3)
+    state = copy.deepcopy(dict(trained.state_dict()))
+    fresh, _ = made("RND", seed=5)
+    fresh.load_state_dict(state, weights_only=True)
+    assert_same(dict(fresh.policy().state_dict()), state["policy"])
+    now = fresh.state_dict()
+    assert_same(now["rnd_state_dict"], state["rnd_state_dict"])
+    assert not now["optimizer_state_dict"]["state"] and now["rnd_steps"] == 0 and fresh.learning_rate == 1e-3
+    fresh.learning_rate = 2e-4
+    assert fresh.algorithm.learning_rate == 2e-4 and fresh.learning_rate == 2e-4
+
+
+def test_counts_of_steps_come_to_the_host() -> None:
+    trained, task = made("nothing")
+    train(trained, task, 1)
+    state = copy.deepcopy(dict(trained.state_dict()))
+    fresh, _ = made("nothing")
+    for each in state["optimizer_state_dict"]["state"].values():
+        assert each["step"].device.type == "cpu"
+        each["step"] = Elsewhere(each["step"])
+    fresh.load_state_dict(state)
+    kept = fresh.algorithm.optimizer.state.values()
+    assert kept and all(type(each["step"]) is torch.Tensor for each in kept)
+
+
+class Elsewhere(torch.Tensor):
+    """Stands for a tensor on a GPU."""
+
+    def cpu(self) -> torch.Tensor:  # type: ignore[override]
+        return self.as_subclass(torch.Tensor).clone()
+
+
+def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:
+    teaching, task = made("GRU")
+    train(teaching, task, 1)
+    section = {"algorithm": DISTILLATION, "student": GRU, "num_steps_per_env": 8, **TAUGHT}
+    pupil = build(task, {**section, "teacher": CASES["GRU"]["actor"]})
+    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher_checkpoint: the teacher's weights were not loaded$"):
+        pupil.begin(0)
+    pupil.load_teacher(teaching.state_dict())
+    pupil.begin(0)
+    assert_same(pupil.algorithm.teacher.state_dict(), dict(teaching.policy().state_dict()))
+    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; give .*") as refusal:
+        build(task, section).load_teacher(teaching.state_dict())
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher_checkpoint: only Distillation has a teacher"):
+        teaching.load_teacher(teaching.state_dict())
+
+
+# -- policies ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_policy_acts_like_the_one_that_is_trained_and_like_its_export(name: str) -> None:
+    algorithm, task = made(name)
+    train(algorithm, task, 1)
+    before = copy.deepcopy(dict(algorithm.world_state()))
+    config = read_settings({"num_steps_per_env": 8, **CASES[name]})
+    policy = RslRl.build_policy(config, spaces_of(task), "cpu")
+    policy.load_state_dict(algorithm.policy().state_dict())
+    exported = policy.module()
+    run = to_onnx(exported)
+    sample = {key: value.numpy() for key, value in exported.sample.items()}
+    count = len(exported.sample)
+    inputs = dict(zip(exported.inputs, sample.values(), strict=False))
+    state = {
+        name: np.repeat(value.numpy(), count, axis=0) for name, value in list(exported.inputs.items())[len(sample) :]
+    }
+    forgotten = torch.arange(count) % 2 == 0
+    for _ in range(3):
+        expected = policy.act(exported.sample)
+        assert torch.equal(expected, algorithm.policy().act(exported.sample))
+        actions, *after = run.run(None, {**inputs, **state})
+        assert np.abs(actions - expected.numpy()).max() < 1e-5
+        state = dict(zip(state, after, strict=True))
+        for part in state.values():
+            part[forgotten.numpy()] = 0.0
+        policy.reset(forgotten)
+        algorithm.policy().reset(forgotten)
+    policy.reset()
+    algorithm.policy().reset()
+    assert torch.equal(policy.act(exported.sample), algorithm.policy().act(exported.sample))
+    assert_same(dict(algorithm.world_state()), before)  # training goes on with its own memory
+    assert algorithm.algorithm.get_policy().training
+
+
+def test_names_of_an_export() -> None:
+    names = {
+        "nothing": (["obs"], ["actions"]),
+        "GRU": (["obs", "h"], ["actions", "h_out"]),
+        "images and numbers": (["obs", "policy"], ["actions"]),
+    }
+    for name, expected in names.items():
+        exported = made(name)[0].policy().module()
+        assert (list(exported.inputs), exported.outputs) == expected
+    assert exported.inputs["obs"].dtype == torch.uint8 and exported.inputs["obs"].shape == (1, 2, 9, 9)
+
+
+def to_onnx(exported: Any) -> ReferenceEvaluator:
+    """The module as ONNX's own evaluator reads it, with any batch size."""
+    buffer, names = io.BytesIO(), [*exported.inputs, *exported.outputs]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            exported.network,
+            tuple(exported.inputs.values()),
+            buffer,
+            dynamo=False,
+            opset_version=18,
+            input_names=list(exported.inputs),
+            output_names=list(exported.outputs),
+            dynamic_axes={name: {0: "batch"} for name in names},
+        )
+    return ReferenceEvaluator(load_from_string(buffer.getvalue()))
+
+
+def test_a_batch_norm_is_frozen_while_a_policy_acts() -> None:
+    algorithm, task = made("images and numbers")
+    norm = next(each for each in algorithm.algorithm.actor.modules() if isinstance(each, nn.BatchNorm2d))
+    before = norm.running_mean.clone()
+    algorithm.policy().act(seen(task))
+    assert torch.equal(norm.running_mean, before)

@@ -1,0 +1,264 @@
+"""rsl_rl's PPO, its Distillation, or a class of one's own of their kind, as an algorithm of Muster.
+
+What rsl_rl computes, it computes as in its own runner, with the same draws from torch's generators: on one rank the weights are the
+same, bit for bit. Over several ranks it averages gradients and adapts the learning rate with the KL of all; advantages are normalised on
+each rank by itself. A time-out is valued by the observation before the step. Nothing of it is recorded as a graph, and it asks the
+device for numbers after each minibatch.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from rsl_rl.algorithms import Distillation
+from rsl_rl.modules import EmpiricalNormalization
+from tensordict import TensorDict
+
+from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transition
+from worker.learning.recording import Recorded
+from worker.learning.rsl import building
+from worker.learning.rsl.policy import RslRlPolicy
+from worker.learning.rsl.settings import RslRlConfig
+from worker.tasks.rsl_rl_env import as_floats
+
+
+class RslRl:
+    """See :class:`worker.learning.algorithm.Algorithm`.
+
+    Attributes:
+        algorithm: rsl_rl's own object.
+    """
+
+    config_type: ClassVar[Any] = RslRlConfig
+    captures_rollout: ClassVar[bool] = False
+
+    def __init__(self, config: RslRlConfig, setting: Setting) -> None:
+        """Build what ``config`` names. Raises ValueError, in one line that says where, for what rsl_rl refuses."""
+        self.steps = config.num_steps_per_env
+        self.recordings: Sequence[Recorded] = ()
+        self.algorithm, seen, self._groups = building.build_algorithm(config, setting)
+        self._gang, self._worlds = setting.gang, setting.share.count
+        self._networks = {
+            name: getattr(self.algorithm, f"_raw_{name}", getattr(self.algorithm, name))
+            for name in building.NETWORKS
+            if hasattr(self.algorithm, name)
+        }
+        self._distils = isinstance(self.algorithm, Distillation)
+        self._acting = f"{'student' if self._distils else 'actor'}_state_dict"
+        self._curiosity = getattr(self.algorithm, "rnd", None)
+        self._asked_rate: float | None = config.algorithm.get("learning_rate")
+        self._intrinsic = torch.zeros((), device=setting.gang.device)
+        self._policy = RslRlPolicy(self.algorithm.get_policy(), seen, setting.spaces)
+        if setting.gang.size > 1:
+            self.algorithm.broadcast_parameters()
+        self._begin_memories(building.example_of(setting.spaces, self._worlds, setting.gang.device))
+        self.algorithm.train_mode()
+
+    # -- an iteration -------------------------------------------------------------------------------------------------
+
+    def begin(self, iteration: int) -> None:
+        """Raises ValueError where there is a teacher to imitate whose weights nobody has given."""
+        if not getattr(self.algorithm, "teacher_loaded", True):
+            raise ValueError("rsl_rl.teacher_checkpoint: the teacher's weights were not loaded")
+        self._intrinsic.zero_()
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """Draw actions, shape (worlds, actions), from torch's generator."""
+        actions: torch.Tensor = self.algorithm.act(as_floats(observations, self._groups))
+        return actions
+
+    @torch.no_grad()
+    def record(self, step: Transition) -> None:
+        """Copy what the step did."""
+        self.algorithm.process_env_step(
+            as_floats(step.observations, self._groups),
+            step.rewards.clone(),
+            step.dones.long(),
+            {"time_outs": step.time_outs.float()},
+        )
+        if self._curiosity:
+            self._intrinsic += self.algorithm.intrinsic_rewards.mean()
+
+    def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
+        """What rsl_rl's ``update`` gives, as means over the ranks, ``learning_rate``, and ``action_std`` where the policy draws its actions.
+
+        With RND also ``intrinsic_reward``, a mean over the steps, and ``rnd_weight``.
+        """
+        with torch.no_grad():
+            self.algorithm.compute_returns(as_floats(observations, self._groups))
+        losses = {name: float(value) for name, value in self.algorithm.update().items()}
+        device = self._gang.device
+        numbers = torch.tensor(list(losses.values()), device=device, dtype=torch.float64)
+        names, parts = list(losses), [numbers]
+        if self._curiosity:
+            names.append("intrinsic_reward")
+            parts.append(self._intrinsic.double().view(1) / self.steps)
+        if getattr(self.algorithm.get_policy(), "distribution", None) is not None:
+            names.append("action_std")
+            parts.append(self.algorithm.get_policy().output_std.detach().double().mean().view(1))
+        means = self._gang.sum(torch.cat(parts)) / self._gang.size
+        self._share_statistics()
+        metrics = dict(zip(names, means, strict=True))
+        if self._curiosity:
+            metrics["rnd_weight"] = torch.tensor(self._curiosity.weight, device=device, dtype=torch.float64)
+        metrics["learning_rate"] = torch.tensor(self.learning_rate, device=device, dtype=torch.float64)
+        return metrics
+
+    def _share_statistics(self) -> None:
+        """Give all ranks the same running statistics.
+
+        rsl_rl's normalisers add up their moments over the ranks themselves; of others, such as a ``BatchNorm2d``, the mean is taken.
+        """
+        if self._gang.size == 1:
+            return
+        modules = itertools.chain(*(network.modules() for network in self._networks.values()))
+        for module in dict.fromkeys(modules):  # convolutions may be two networks'
+            if isinstance(module, EmpiricalNormalization):
+                continue
+            for statistic in module.buffers(recurse=False):
+                if statistic.is_floating_point():
+                    self._gang.sum(statistic).div_(self._gang.size)
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate now."""
+        return float(self.algorithm.optimizer.param_groups[0]["lr"])
+
+    @learning_rate.setter
+    def learning_rate(self, value: float) -> None:
+        self.algorithm.learning_rate = value
+        for group in self.algorithm.optimizer.param_groups:
+            group["lr"] = value
+
+    # -- the teacher --------------------------------------------------------------------------------------------------
+
+    def load_teacher(self, state: Mapping[str, Any]) -> None:
+        """Take the teacher's weights from the :meth:`state_dict` of the run that trained it; before the first :meth:`begin`, on all ranks.
+
+        A run that is resumed has them in its checkpoint. Raises ValueError where there is no teacher, or the weights are not its.
+        """
+        if not self._distils:
+            raise ValueError("rsl_rl.teacher_checkpoint: only Distillation has a teacher")
+        try:
+            self.algorithm.load({"actor_state_dict": state[POLICY]}, {"teacher": True}, True)
+        except (RuntimeError, KeyError) as error:
+            raise ValueError(
+                "rsl_rl.teacher: the weights do not fit; give teacher and obs_groups.teacher what actor and obs_groups.actor are in "
+                f"the teacher's run: {' '.join(str(error).split())}"
+            ) from error
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    def policy(self) -> Policy:
+        """The actor, or the student: a live view."""
+        return self._policy
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """What rsl_rl's ``save`` gives, with the weights of the policy under ``policy``, and how far RND's schedule is."""
+        saved = dict(self.algorithm.save())
+        saved.pop(self._acting, None)
+        curious = {"rnd_steps": self._curiosity.update_counter} if self._curiosity else {}
+        return {POLICY: self.algorithm.get_policy().state_dict(), **saved, **curious, "asked_rate": self._asked_rate}
+
+    def load_state_dict(
+        self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
+    ) -> list[str]:
+        """Go on from :meth:`state_dict`; ``weights_only``: from the networks that it has, with a fresh optimizer.
+
+        A rate that the job gives otherwise than the job before it counts; else the saved one, which may have adapted itself, does.
+        Raises RuntimeError, ValueError or KeyError where it does not fit.
+        """
+        asked = self._asked_rate
+        saved = {name: value for name, value in state.items() if name not in (POLICY, "rnd_steps", "asked_rate")}
+        saved[self._acting] = state[POLICY]
+        if weights_only:
+            self.algorithm.load(saved, {name: f"{name}_state_dict" in saved for name in self._networks}, True)
+            if self._curiosity and "rnd_state_dict" in saved:
+                self._curiosity.load_state_dict(saved["rnd_state_dict"])
+            return []
+        self.algorithm.load(saved, None, True)
+        _count_on_host(self.algorithm.optimizer)
+        if self._curiosity:
+            _count_on_host(self._curiosity.optimizer)
+            self._curiosity.update_counter = int(state["rnd_steps"])
+        if asked is None or asked == state["asked_rate"]:
+            return []
+        self.learning_rate = asked
+        return [f"learning rate set to {asked:g}"]
+
+    def _begin_memories(self, example: TensorDict) -> None:
+        """Make what rsl_rl remembers of each world, zeros, at once; it would in the first step.
+
+        A teacher is not among it: rsl_rl lets it begin each iteration without a memory.
+        """
+        self._recurrent = {
+            name: network for name, network in self._networks.items() if network.is_recurrent and name != "teacher"
+        }
+        for network in self._recurrent.values():
+            network.eval()
+            with torch.no_grad():
+                network(example)
+            _set_hidden(network, [torch.zeros_like(part) for part in _hidden(network)])
+        normalizer = getattr(self._curiosity, "reward_normalizer", None)
+        self._averages = getattr(normalizer, "disc_avg", None)
+        if self._averages:
+            self._averages.avg = torch.zeros(self._worlds, device=self._gang.device)
+
+    def world_state(self) -> Mapping[str, torch.Tensor]:
+        """Recurrent states, shape (worlds, layers, size), and RND's discounted sums of its rewards, shape (worlds,), float32."""
+        state = {
+            f"{name}.{index}": part.detach().transpose(0, 1)
+            for name, network in self._recurrent.items()
+            for index, part in enumerate(_hidden(network))
+        }
+        return {**state, "rnd": self._averages.avg} if self._averages else state
+
+    def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on from :meth:`world_state`. Raises ValueError where something is missing or has another shape."""
+        expected = self.world_state()
+        for name, tensor in expected.items():
+            if name not in state or state[name].shape != tensor.shape:
+                raise ValueError(
+                    f"the saved state of rsl_rl does not fit: {name} is not of shape {tuple(tensor.shape)}"
+                )
+        copies = {name: state[name].to(tensor.device, copy=True) for name, tensor in expected.items()}
+        for name, network in self._recurrent.items():
+            parts = [copies[f"{name}.{index}"] for index, _ in enumerate(_hidden(network))]
+            _set_hidden(network, [part.transpose(0, 1).contiguous() for part in parts])
+        if "student" in self._recurrent:
+            # an iteration is learnt from the state that the student had at its beginning
+            self.algorithm.last_hidden_states = (self._recurrent["student"].get_hidden_state(), None)
+        if self._averages:
+            self._averages.avg = copies["rnd"]
+
+    @classmethod
+    def build_policy(cls, config: RslRlConfig, spaces: Spaces, device: str) -> Policy:
+        """The actor, or the student, alone."""
+        _, names = building.algorithm_type(config)
+        example = building.example_of(spaces, 1, device)
+        sets = building.observation_sets(config, names, example)
+        model = building.build_network(config, names[0], sets, example, spaces.actions).to(device).eval()
+        return RslRlPolicy(model, sets[names[0]], spaces)
+
+
+def _count_on_host(optimizer: torch.optim.Optimizer) -> None:
+    """Bring the counts of steps to the host, where an optimizer makes them: it reads them in each step, and takes over what is loaded."""
+    if any(optimizer.defaults.get(name) for name in ("fused", "capturable")):
+        return
+    for state in optimizer.state.values():
+        if isinstance(state.get("step"), torch.Tensor):
+            state["step"] = state["step"].cpu()
+
+
+def _hidden(network: Any) -> tuple[torch.Tensor, ...]:
+    """The recurrent state, each part of shape (layers, worlds, size): one of a GRU, two of an LSTM."""
+    state = network.get_hidden_state()
+    return state if isinstance(state, tuple) else (state,)
+
+
+def _set_hidden(network: Any, parts: Sequence[torch.Tensor]) -> None:
+    network.reset(hidden_state=tuple(parts) if len(parts) > 1 else parts[0])

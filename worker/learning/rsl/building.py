@@ -1,0 +1,203 @@
+"""Building what a configuration names with rsl_rl's own means, and saying in one line where that can't be done."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import inspect
+import io
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO, Distillation
+from rsl_rl.env import VecEnv
+from rsl_rl.utils import resolve_callable, resolve_class, resolve_obs_groups
+from tensordict import TensorDict
+from torch import nn
+
+from worker.learning.algorithm import Setting, Share, Spaces
+from worker.learning.rsl.settings import RslRlConfig
+from worker.tasks.rsl_rl_env import as_floats
+
+NETWORKS = ("actor", "critic", "student", "teacher")
+"""Names of networks, of configuration sections and of observation sets alike."""
+
+
+class Surroundings(VecEnv):
+    """What rsl_rl asks of an environment while it builds an algorithm. A symmetry function is given it as ``env``."""
+
+    def __init__(self, setting: Setting, example: TensorDict) -> None:
+        self.num_envs, self.num_actions = setting.share.count, setting.spaces.actions
+        self.device, self.step_dt = setting.gang.device, setting.control_seconds
+        self.cfg: dict[str, Any] = {}
+        self._example = example
+
+    @property
+    def unwrapped(self) -> Surroundings:
+        """This object: rsl_rl looks for ``step_dt`` behind wrappers."""
+        return self
+
+    def get_observations(self) -> TensorDict:
+        """Zeros, batch size (worlds,)."""
+        return self._example
+
+    def step(self, actions: torch.Tensor) -> Any:
+        """Not for rsl_rl: Muster steps the worlds."""
+        raise RuntimeError("rsl_rl's algorithms do not step Muster's worlds")
+
+
+def example_of(spaces: Spaces, worlds: int, device: str) -> TensorDict:
+    """Zeros as rsl_rl sees the task's observations, batch size (worlds,)."""
+    return as_floats(spaces.example(worlds, device), spaces.observations)
+
+
+def algorithm_type(config: RslRlConfig) -> tuple[Any, tuple[str, str]]:
+    """The algorithm's class and its two networks' names, that of the policy first. Raises ValueError where it can't be found."""
+    name = config.section("algorithm")["class_name"]
+    with _refused("algorithm.class_name"):
+        found = _find(name)
+        if not hasattr(found, "construct_algorithm"):
+            raise ValueError(f"{name} is not an algorithm: it has no construct_algorithm")
+    distils = isinstance(found, type) and issubclass(found, Distillation)
+    names = ("student", "teacher") if distils else ("actor", "critic")
+    for other in NETWORKS:
+        if other not in names and getattr(config, other) is not None:
+            raise ValueError(f"rsl_rl.{other}: {name} has the networks {' and '.join(names)}")
+    if bool(config.teacher_checkpoint) != distils:
+        text = "name the run that trained the teacher" if distils else f"{name} has no teacher; leave it out"
+        raise ValueError(f"rsl_rl.teacher_checkpoint: {text}")
+    return found, names
+
+
+def observation_sets(config: RslRlConfig, names: tuple[str, str], example: TensorDict) -> dict[str, list[str]]:
+    """The observation groups of each set. Raises ValueError for a group that the task does not have."""
+    curious = ["rnd_state"] if config.algorithm.get("rnd_cfg") else []
+    with _refused("obs_groups"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of sets that are missing: what then holds is in the settings' description
+        sets: dict[str, list[str]] = resolve_obs_groups(example, copy.deepcopy(config.obs_groups), [*names, *curious])
+    return sets
+
+
+def build_network(
+    config: RslRlConfig, name: str, sets: dict[str, list[str]], example: TensorDict, outputs: int
+) -> nn.Module:
+    """One network. Raises ValueError for what it refuses."""
+    section = config.section(name)
+    with _refused(f"{name}.class_name"):
+        _find(section["class_name"])
+    with _refused(name):
+        built, arguments = resolve_class(section)
+        network: nn.Module = built(example, sets, name, outputs, **arguments)
+    return network
+
+
+def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[str], list[str]]:
+    """rsl_rl's algorithm, the observation groups that its policy sees, and all that it needs. Raises ValueError for what can't be."""
+    spaces, gang = setting.spaces, setting.gang
+    if spaces.discrete:
+        raise ValueError("rsl_rl: its distributions are of numbers, and the actions of this task are choices")
+    found, names = algorithm_type(config)
+    _check_numbers(found, config.section("algorithm"))
+    example = example_of(spaces, setting.share.count, gang.device)
+    sets = observation_sets(config, names, example)
+    groups = list(spaces.observations)
+    if found.construct_algorithm in (PPO.construct_algorithm, Distillation.construct_algorithm):
+        # what no set has need not be stored; a class that builds itself otherwise may look for more
+        groups = [group for group in groups if any(group in each for each in sets.values())]
+    example = example.select(*groups)
+    place = {"global_rank": gang.rank, "local_rank": gang.placement.local_rank, "world_size": gang.size}
+    complete = {
+        "num_steps_per_env": config.num_steps_per_env,
+        "obs_groups": sets,
+        "algorithm": config.section("algorithm"),
+        **{name: config.section(name) for name in names},
+        "torch_compile_mode": config.torch_compile_mode,
+        "multi_gpu": place if gang.size > 1 else None,
+    }
+    try:
+        with _quiet():
+            built = found.construct_algorithm(example, Surroundings(setting, example), complete, gang.device)
+    except Exception as error:
+        for name in names if not _out_of_memory(error) else ():  # was it one of them?
+            try:
+                build_network(config, name, sets, example, 1 if name == "critic" else spaces.actions)
+            except ValueError as refusal:
+                if str(refusal.__cause__) == str(error):
+                    raise refusal from error
+        with _refused("algorithm"):
+            raise
+    _check(built, names, setting, config.num_steps_per_env)
+    return built, sets[names[0]], groups
+
+
+def _check_numbers(found: Any, section: dict[str, Any]) -> None:
+    """Refuse a text in the place of a number, which rsl_rl would only notice when it reckons with it."""
+    for name, parameter in inspect.signature(found).parameters.items():
+        number = isinstance(parameter.default, int | float) and not isinstance(parameter.default, bool)
+        if number and isinstance(section.get(name), str):
+            raise ValueError(
+                f"rsl_rl.algorithm.{name}: expected a number, got the text {section[name]!r}; in YAML 1e-3 is written 1.0e-3"
+            )
+
+
+def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> None:
+    """Refuse what rsl_rl would only stumble over while it learns."""
+    networks = [getattr(built, name) for name in names if hasattr(built, name)]
+    for name, network in zip(names, networks, strict=False):
+        if getattr(network, "obs_normalization", False) and not network.obs_groups:
+            raise ValueError(
+                f"rsl_rl.{name}.obs_normalization: it sees images alone, which are not normalised; set false"
+            )
+    worlds = min(Share.of(rank, setting.gang.size, setting.share.total).count for rank in range(setting.gang.size))
+    if isinstance(built, PPO):
+        if networks[0].distribution is None:
+            raise ValueError("rsl_rl.actor.distribution_cfg: PPO needs a distribution to draw actions from")
+        if built.num_mini_batches < 1:
+            raise ValueError(f"rsl_rl.algorithm.num_mini_batches: expected at least 1, got {built.num_mini_batches}")
+        recurrent = any(network.is_recurrent for network in networks)
+        parts, there = built.num_mini_batches, worlds if recurrent else worlds * steps
+        if parts > there:
+            what = "worlds, since a network is recurrent" if recurrent else "samples"
+            raise ValueError(
+                f"rsl_rl.algorithm.num_mini_batches: {parts} minibatches need as many {what}; a rank has {there}"
+            )
+    if isinstance(built, Distillation) and built.gradient_length > (whole := built.num_learning_epochs * steps):
+        raise ValueError(
+            f"rsl_rl.algorithm.gradient_length: nothing is learnt in {whole} steps an iteration, {built.gradient_length} are needed"
+        )
+
+
+def _find(name: Any) -> Any:
+    """What ``name`` names, in rsl_rl's ways; a module may lie where the job was submitted, and never hides one of ours."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    return resolve_callable(name)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """rsl_rl prints what it builds; and convolutions that two networks share are theirs twice, which torch's optimizers warn of."""
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "optimizer contains a parameter group with duplicate parameters")
+        yield
+
+
+@contextlib.contextmanager
+def _refused(where: str) -> Iterator[None]:
+    """In here whatever is raised becomes a ValueError in one line that begins with ``where``; except that memory is short."""
+    try:
+        with _quiet():
+            yield
+    except Exception as error:
+        if _out_of_memory(error):
+            raise
+        kind = f"{type(error).__name__}: " if isinstance(error, LookupError | AssertionError) else ""
+        raise ValueError(f"rsl_rl.{where}: {kind}{' '.join(str(error).split())}") from error
+
+
+def _out_of_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or "memory" in str(error)

@@ -1,0 +1,135 @@
+"""A policy of rsl_rl without what learning needs: acting, and the function of tensors that is exported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from rsl_rl.modules import EmpiricalNormalization
+from tensordict import TensorDict
+from torch import nn
+
+from worker.learning.algorithm import ExportedPolicy, Spaces
+from worker.learning.ppo.models import to_numbers
+from worker.tasks.rsl_rl_env import as_floats
+
+SAMPLES, IMAGES = 1024, 16
+"""Observations on which an export is compared: of numbers alone, or with images."""
+
+
+class RslRlPolicy:
+    """rsl_rl's model as a policy; it may be one that is being trained, which is left as it was found.
+
+    Args:
+        model: ``MLPModel`` or one of its kind.
+        groups: The observation groups that it sees, in its order.
+        spaces: Of the task.
+    """
+
+    def __init__(self, model: Any, groups: Sequence[str], spaces: Spaces) -> None:
+        self._model, self._groups, self._spaces = model, list(groups), spaces
+        self._memory: Any = None
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """The deterministic output (of a normal distribution its mean), shape (n, actions), float32."""
+        with self._remembering() as model:
+            actions: torch.Tensor = model(as_floats(observations, self._groups))
+        return actions
+
+    @torch.no_grad()
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """Forget the recurrent state of all worlds, or where ``worlds``, shape (n,), bool, is true."""
+        if worlds is None:
+            self._memory = None
+            return
+        with self._remembering() as model:
+            model.reset(worlds.long())
+
+    @contextmanager
+    def _remembering(self) -> Iterator[Any]:
+        """The model for evaluation with this policy's own recurrent state; that of the training comes back afterwards."""
+        model, training, state = self._model, self._model.training, self._model.get_hidden_state()
+        if training:
+            model.eval()
+        model.reset(hidden_state=self._memory)
+        try:
+            yield model
+            self._memory = model.get_hidden_state()
+        finally:
+            model.reset(hidden_state=state)
+            if training:
+                model.train()
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """The model's weights and normaliser."""
+        weights: Mapping[str, Any] = self._model.state_dict()
+        return weights
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Any:
+        """Take over what :meth:`state_dict` gave. Raises RuntimeError where it does not fit."""
+        return self._model.load_state_dict(state)
+
+    def module(self) -> ExportedPolicy:
+        """rsl_rl's own export of the model, with one input for each observation group, as the task gives it.
+
+        The recurrent state is ``h`` (and ``c`` of an LSTM), shape (batch, layers, size), and comes out as ``h_out`` (and ``c_out``);
+        an episode begins with zeros.
+        """
+        network = self._model.as_onnx(verbose=False).to("cpu").eval()
+        example = self._spaces.example(1, "cpu")
+        inputs = {"obs" if group == self._groups[0] else group: example[group] for group in self._groups}
+        vectors = [index for index, group in enumerate(self._groups) if len(self._spaces.observations[group]) == 1]
+        images = [index for index in range(len(self._groups)) if index not in vectors]
+        states = list(zip(network.input_names, network.get_dummy_inputs(), strict=True))[1 + len(images) :]
+        remembered = {name.removesuffix("_in"): state.transpose(0, 1).contiguous() for name, state in states}
+        return ExportedPolicy(
+            network=_Exported(network, vectors, images).eval(),
+            inputs={**inputs, **remembered},
+            outputs=["actions", *(f"{name}_out" for name in remembered)],
+            sample=self._sample(IMAGES if images else SAMPLES),
+        )
+
+    def _sample(self, count: int) -> TensorDict:
+        """Observations as the policy has met them (its normaliser's moments), a few far outside; images of any bytes."""
+        generator = torch.Generator().manual_seed(0)
+        shapes = {group: self._spaces.observations[group] for group in self._groups}
+        sizes = [shape[0] for shape in shapes.values() if len(shape) == 1]
+        numbers = torch.randn(count, sum(sizes), generator=generator)
+        numbers[-count // 8 :] *= 5.0
+        normalizer = self._model.obs_normalizer
+        if isinstance(normalizer, EmpiricalNormalization):
+            mean, deviation = normalizer.mean.cpu(), normalizer.std.cpu()
+            numbers = numbers * (deviation + normalizer.eps) + mean
+        parts = iter(numbers.split(sizes, dim=1) if sizes else ())
+        sample = {
+            group: next(parts)
+            if len(shape) == 1
+            else torch.randint(0, 256, (count, *shape), dtype=torch.uint8, generator=generator)
+            for group, shape in shapes.items()
+        }
+        return TensorDict(sample, batch_size=[count])
+
+
+class _Exported(nn.Module):
+    """rsl_rl's module for ONNX, which takes all vectors as one, then images of floats, then the recurrent state, layers first."""
+
+    def __init__(self, network: nn.Module, vectors: Sequence[int], images: Sequence[int]) -> None:
+        super().__init__()
+        self._network, self._vectors, self._images = network, list(vectors), list(images)
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
+        """Actions; of a recurrent policy, actions and the new state."""
+        images = [to_numbers(inputs[index]) for index in self._images]
+        states = [state.transpose(0, 1) for state in inputs[len(images) + len(self._vectors) :]]
+        vectors = [inputs[index] for index in self._vectors]
+        # of images alone, rsl_rl still joins a vector, of no numbers
+        numbers = torch.cat(vectors, dim=-1) if vectors else images[0].flatten(1)[:, :0]
+        outputs: Any = self._network(numbers, *images, *states)
+        if not states:
+            actions: torch.Tensor = outputs
+            return actions
+        actions, *states = [each for each in outputs if each is not None]
+        return (actions, *(state.transpose(0, 1) for state in states))

@@ -1,0 +1,133 @@
+"""Settings of rsl_rl's algorithms, in rsl_rl's own keys."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import field, fields
+from typing import Annotated, Any, ClassVar
+
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
+
+_NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu", "obs_normalization": True}
+_ACTOR = {**_NETWORK, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
+
+DEFAULTS: Mapping[str, dict[str, Any]] = {
+    "algorithm": {"class_name": "PPO"},
+    "actor": _ACTOR,
+    "critic": _NETWORK,
+    "student": {**_NETWORK, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.1}},
+    "teacher": _ACTOR,
+}
+"""The sections that a job does not give. What is not in them is as in rsl_rl."""
+
+_LOGS = "every run writes metrics.jsonl and TensorBoard's files by itself"
+_RESUME = "a run goes on from its checkpoint with `muster resume RUN`"
+_NAMED = "use the job's name and run"
+REFUSED: Mapping[str, str] = {
+    "max_iterations": "use train.iterations",
+    "num_envs": "use train.worlds",
+    "seed": "use train.seed",
+    "device": "use resources.gpus",
+    "multi_gpu": "use nodes and resources.gpus",
+    "save_interval": "use checkpoint.every",
+    "resume": _RESUME,
+    "load_run": _RESUME,
+    "load_checkpoint": _RESUME,
+    "run_name": _NAMED,
+    "experiment_name": _NAMED,
+    "log_dir": _NAMED,
+    "logger": _LOGS,
+    "wandb_project": _LOGS,
+    "neptune_project": _LOGS,
+    "check_for_nan": "a value that is not finite always ends training; use config.nan_limit for worlds that fail",
+    "init_at_random_ep_len": "it is always so at the beginning of a run",
+    "clip_actions": "tasks clip actions themselves",
+    "class_name": "use algorithm.class_name: there is no runner to choose",
+    "runner_class_name": "use algorithm.class_name: there is no runner to choose",
+    "policy": "since version 5 rsl_rl has the sections actor and critic",
+    "empirical_normalization": "use obs_normalization in actor and critic",
+}
+"""Keys of rsl_rl's runners for what Muster does itself, and what to use instead."""
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class RslRlConfig:
+    """What rsl_rl's runner takes as its configuration, without what Muster does in the runner's place.
+
+    A section with a ``class_name`` is taken as it is, as in rsl_rl. One without changes :data:`DEFAULTS`, key by key, and so does a
+    ``distribution_cfg`` in it. Sections may have any key that the class which they name knows.
+
+    Raises:
+        ValidationError: A key is unknown or not for here, or a value has the wrong type; :func:`read_settings` makes it one line.
+    """
+
+    num_steps_per_env: Annotated[int, Field(strict=True, ge=1)] = 24
+    """Control steps of every world in one iteration."""
+    obs_groups: dict[str, list[str]] = field(default_factory=dict)
+    """Which of the task's observation groups each set has: ``actor``, ``critic``, ``rnd_state``, ``student``, ``teacher``. A set that is
+    missing is the group of the same name, or else ``policy``, which is rsl_rl's rule: the critic sees the group ``critic``."""
+    algorithm: dict[str, Any] = field(default_factory=dict)
+    """``PPO``, ``Distillation`` or ``module:Class``, with ``rnd_cfg``, ``symmetry_cfg`` and the rest."""
+    actor: dict[str, Any] | None = None
+    """The policy's network, of PPO."""
+    critic: dict[str, Any] | None = None
+    """The value's network, of PPO."""
+    student: dict[str, Any] | None = None
+    """The network that learns, of Distillation."""
+    teacher: dict[str, Any] | None = None
+    """The network that is imitated, of Distillation: the ``actor`` of the run that trained it."""
+    teacher_checkpoint: str | None = None
+    """Where the teacher's weights come from, of Distillation: ``RUN`` or ``RUN@ITERATION``. A key of Muster's, not of rsl_rl's."""
+    torch_compile_mode: str | None = None
+    """Compile the networks with ``torch.compile``: ``default`` or ``max-autotune-no-cudagraphs``."""
+
+    fixed: ClassVar[tuple[str, ...]] = ("obs_groups", "actor", "critic", "student", "teacher")
+    """What a resumed run can't change: checkpoints hold what became of it."""
+    elsewhere: ClassVar[Mapping[str, str]] = REFUSED
+    """What people look for here, and what to use instead."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, given: Any) -> Any:
+        """Name each key that is refused, and each that is unknown, with what to write instead."""
+        values = (given.kwargs or {}) if isinstance(given, ArgsKwargs) else given
+        known = [item.name for item in fields(cls)]
+        for key in values if isinstance(values, Mapping) else ():
+            if key in REFUSED:
+                raise ValueError(f"{key}: Muster does what rsl_rl's runner needs this for; {REFUSED[key]}")
+            if key not in known:
+                near = difflib.get_close_matches(str(key), known, n=1)
+                hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+                raise ValueError(f"{key}: there is no such key; {hint}")
+        return given
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Section ``name`` as rsl_rl takes it: with its ``class_name``. Nothing of it is shared with these settings."""
+        return _changed(DEFAULTS[name], getattr(self, name) or {})
+
+
+def read_settings(section: Mapping[str, Any]) -> RslRlConfig:
+    """The settings of a job's ``rsl_rl`` section. Raises ValueError, in one line with the name of the key."""
+    try:
+        return RslRlConfig(**section)
+    except ValidationError as error:
+        first = error.errors()[0]
+        text = first["msg"].removeprefix("Value error, ")
+        if where := ".".join(map(str, first["loc"])):
+            text = f"{where}: {text[:1].lower()}{text[1:]}"
+        raise ValueError(f"rsl_rl.{text}") from error
+
+
+def _changed(default: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of ``given``, or, where it names no class, of ``default`` with what it changes."""
+    known: Mapping[str, Any] = {} if "class_name" in given else default
+    return {key: _copy(value, known.get(key)) for key, value in {**known, **given}.items()}
+
+
+def _copy(value: Any, default: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _changed(default if isinstance(default, Mapping) else {}, value)
+    return list(value) if isinstance(value, list) else value
