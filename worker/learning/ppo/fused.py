@@ -292,7 +292,7 @@ class PPO:
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate  # the optimizer goes on reading the one tensor
-            if "weight_decay" in group:
+            if self.config.optimizer == "adamw":
                 group["weight_decay"] = self.config.weight_decay
         saved, asked = float(state["learning_rate"]), self.config.learning_rate
         keeps = self.config.schedule == "adaptive" and "learning_rate" not in changed
