@@ -1,0 +1,250 @@
+"""PPO in one file, to be read from top to bottom: what algorithm ``ppo`` computes, one thing after the other.
+
+It is here to be read, copied and changed, and ``ppo`` is tested against it. It is slower, most of all on a GPU, which it waits for at
+every minibatch. In a job: ``algorithm: worker.learning.plain_ppo:PlainPPO``, with the settings of ``ppo`` under ``settings``.
+In comments, S steps of the W worlds of this rank are a rollout, and N = S · W its samples: step s of world w is row s · W + w.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from rsl_rl.utils import resolve_nn_activation
+from tensordict import TensorDict
+from torch import nn
+from torch.distributions import Normal, kl_divergence
+
+from worker.learning.algorithm import POLICY, ExportedPolicy, Setting, Spaces, Transition
+from worker.learning.ppo.draws import Draws
+from worker.learning.ppo.settings import PPOConfig
+
+
+class Network(nn.Module):
+    """A multi-layer perceptron behind a normaliser: numbers of any size come in, about one standard deviation of them goes on."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, config: PPOConfig) -> None:
+        super().__init__()
+        self.normalizes = config.normalize_observations
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("variance", torch.ones(inputs))
+        self.register_buffer("count", torch.tensor(0))
+        layers: list[nn.Module] = []
+        for size, following in itertools.pairwise([inputs, *hidden]):
+            layers += [nn.Linear(size, following), resolve_nn_activation(config.activation)]
+        self.layers = nn.Sequential(*layers, nn.Linear(hidden[-1], outputs))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Shape (…, outputs) for observations of shape (…, inputs)."""
+        if self.normalizes:
+            observations = (observations - self.mean) / (self.variance.sqrt() + 0.01)
+        return self.layers(observations)
+
+    @torch.no_grad()
+    def update_normalizer(self, observations: torch.Tensor, setting: Setting) -> None:
+        """Merge mean and variance of an iteration's observations, shape (N, inputs), of all ranks, into those of all before."""
+        new, gang = observations.double(), setting.gang
+        count = len(new) // setting.share.count * setting.share.total
+        mean = gang.sum(new.sum(0)) / count
+        variance = gang.sum((new - mean).square().sum(0)) / count
+        self.count += count
+        part, apart = count / self.count, mean - self.mean
+        self.variance.copy_((1 - part) * self.variance + part * variance + part * (1 - part) * apart.square())
+        self.mean.add_(part * apart)
+
+
+class Actor(Network):
+    """The policy: the network's output is the mean of the actions, and each action has a standard deviation that is learnt, too."""
+
+    def __init__(self, spaces: Spaces, config: PPOConfig) -> None:
+        if spaces.discrete or len(spaces.observations[POLICY]) != 1:
+            raise ValueError("task: plain PPO has neither choices nor images; algorithm ppo has both")
+        super().__init__(spaces.observations[POLICY][0], config.hidden_sizes, spaces.actions, config)
+        self.std = nn.Parameter(torch.full((spaces.actions,), config.init_std))
+
+    def deviation(self) -> torch.Tensor:
+        """Shape (actions,)."""
+        return self.std.clamp(1e-6, 1e6)
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """The best action is the mean: shape (worlds, actions)."""
+        return self(observations[POLICY])
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """Nothing is remembered of an episode."""
+
+    def module(self) -> ExportedPolicy:
+        """The network as it is, with observations such as it has met to compare the exported file on."""
+        network = copy.deepcopy(self).cpu().eval()
+        seen = torch.randn(256, len(network.mean), generator=torch.Generator().manual_seed(0))
+        seen.mul_(network.variance.sqrt()).add_(network.mean)
+        return ExportedPolicy(network, {"obs": seen[:1]}, ["actions"], TensorDict({POLICY: seen}, [len(seen)]))
+
+
+class PlainPPO:
+    """See :class:`worker.learning.algorithm.Algorithm`."""
+
+    config_type: ClassVar[type[PPOConfig]] = PPOConfig
+    captures_rollout: ClassVar[bool] = False
+    recordings: Sequence[Any] = ()
+
+    def __init__(self, config: PPOConfig, setting: Setting) -> None:
+        group, groups = config.critic_observations, setting.spaces.observations
+        if group not in groups or len(groups[group]) != 1:
+            raise ValueError(f"critic_observations: the task has no numbers {group!r}; see algorithm ppo")
+        if config.minibatches > config.steps:
+            raise ValueError(f"minibatches: {config.minibatches} are more than the {config.steps} steps of a world")
+        if config.optimizer != "adam":
+            raise ValueError(f"optimizer: plain PPO has adam alone; algorithm ppo has {config.optimizer}")
+        self.config, self.setting, self.gang, self.steps = config, setting, setting.gang, config.steps
+        device = setting.gang.device
+        self.actor = Actor(setting.spaces, config)
+        self.critic = Network(groups[group][0], config.critic_hidden_sizes or config.hidden_sizes, 1, config)
+        self.parameters = [*self.actor.to(device).parameters(), *self.critic.to(device).parameters()]
+        for parameter in self.parameters:
+            self.gang.broadcast(parameter.data)  # every rank begins with the main rank's weights
+        self.rate = config.learning_rate
+        self.optimizer = torch.optim.Adam(self.parameters, self.rate, foreach=False)
+        self._draws = Draws(setting.seed, setting.share.first, device)
+        self._rollout: list[dict[str, torch.Tensor]] = []
+
+    def begin(self, iteration: int) -> None:
+        """Random numbers depend on the seed, the iteration and the world, and on nothing else."""
+        self._draws.begin(iteration)
+        self._rollout.clear()
+
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """Draw actions around the policy's mean: shape (W, actions)."""
+        seen, judged = observations[POLICY].clone(), observations[self.config.critic_observations].clone()
+        means = self.actor(seen)
+        actions = self._draws.normal(len(self._rollout), means, self.actor.deviation(), torch.empty_like(means))
+        self._rollout.append({"seen": seen, "judged": judged, "means": means, "actions": actions})
+        return actions
+
+    def record(self, step: Transition) -> None:
+        """Keep what came of the actions. The tensors are the task's own, and change in the next step: hence copies."""
+        ends = step.terminal_observations[self.config.critic_observations]
+        came = {"rewards": step.rewards, "dones": step.dones, "time_outs": step.time_outs, "ends": ends}
+        self._rollout[-1] |= {name: tensor.clone() for name, tensor in came.items()}
+
+    def learn(self, observations: TensorDict) -> dict[str, torch.Tensor]:
+        """Several passes over the rollout, each in minibatches of its own. ``observations`` are those after the last step."""
+        config, worlds, device = self.config, self.setting.share.count, self.gang.device
+        samples, old_deviation = self._estimate(observations), self.actor.deviation().detach().clone()
+        # which samples each minibatch has: equally many steps of every world, shape (epochs · minibatches, steps, W)
+        shape = config.epochs * config.minibatches, self.steps // config.minibatches, worlds
+        orders = torch.zeros(shape, dtype=torch.long, device=device)
+        scratch = torch.zeros(config.epochs, worlds, self.steps, dtype=torch.int32, device=device)
+        self._draws.order(orders, scratch)
+        # a rank's mean counts as much as it has worlds, so that the sum over the ranks is the mean over all samples
+        weight = worlds / self.setting.share.total
+        sums = torch.zeros(4, device=device)
+        for rows in orders.flatten(1):
+            loss, told = self._loss({name: tensor[rows] for name, tensor in samples.items()}, old_deviation)
+            self.optimizer.zero_grad()
+            (weight * loss).backward()
+            for parameter in self.parameters:
+                self.gang.sum(parameter.grad)
+            told = self.gang.sum(weight * told)
+            sums += told
+            if config.schedule == "adaptive":
+                self.rate = self._adapted_rate(kl=float(told[3]))
+            for network in (self.actor, self.critic):
+                nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
+            self.optimizer.param_groups[0]["lr"] = self.rate
+            self.optimizer.step()
+        if config.normalize_observations:
+            self.actor.update_normalizer(samples["seen"], self.setting)
+            self.critic.update_normalizer(samples["judged"], self.setting)
+        numbers = (*(sums / len(orders)), torch.tensor(self.rate, device=device), old_deviation.mean())
+        names = ("surrogate_loss", "value_loss", "entropy", "kl", "learning_rate", "action_std")
+        return dict(zip(names, numbers, strict=True))
+
+    @torch.no_grad()
+    def _estimate(self, observations: TensorDict) -> dict[str, torch.Tensor]:
+        """How good was each action? Generalised advantage estimation (arXiv:1506.02438). Gives the samples, shape (N, …) by name."""
+        config = self.config
+        rollout = {name: torch.stack([step[name] for step in self._rollout]) for name in self._rollout[0]}  # (S, W, …)
+        values = self.critic(rollout["judged"]).squeeze(-1)
+        # the clock ended an episode that would have gone on: what it would have brought belongs to the last reward
+        future = self.critic(rollout["ends"]).squeeze(-1)  # means nothing, and may be NaN, where no episode ended
+        rewards = rollout["rewards"] + config.gamma * torch.where(rollout["time_outs"], future, 0.0)
+        next_values = self.critic(observations[config.critic_observations]).squeeze(-1)
+        advantages, advantage = torch.zeros_like(values), torch.zeros_like(next_values)
+        for step in reversed(range(self.steps)):
+            going_on = (~rollout["dones"][step]).float()
+            surprise = rewards[step] + config.gamma * going_on * next_values - values[step]
+            advantage = surprise + config.gamma * config.lam * going_on * advantage
+            advantages[step], next_values = advantage, values[step]
+        returns = advantages + values
+        # an advantage is only better or worse than the others: mean 0 and deviation 1 over the samples of all ranks
+        count = self.setting.share.total * self.steps
+        mean = self.gang.sum(advantages.double().sum()) / count
+        variance = self.gang.sum((advantages - mean).square().sum()) / (count - 1)
+        advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
+        policy = Normal(rollout["means"], self.actor.deviation(), validate_args=False)
+        log_probs = policy.log_prob(rollout["actions"]).sum(-1)
+        known = {**rollout, "values": values, "returns": returns, "advantages": advantages, "log_probs": log_probs}
+        return {name: tensor.flatten(0, 1) for name, tensor in known.items()}
+
+    def _loss(self, batch: dict[str, torch.Tensor], old_deviation: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and what is told of it, shape (4,)."""
+        config, clip = self.config, self.config.clip
+        policy = Normal(self.actor(batch["seen"]), self.actor.deviation(), validate_args=False)
+        # how much likelier is the action than when it was taken? What lies beyond the clip range is no reason to go further
+        ratio = (policy.log_prob(batch["actions"]).sum(-1) - batch["log_probs"]).exp()
+        gain, clipped_gain = batch["advantages"] * ratio, batch["advantages"] * ratio.clamp(1.0 - clip, 1.0 + clip)
+        surrogate = -torch.minimum(gain, clipped_gain).mean()
+        values = self.critic(batch["judged"]).squeeze(-1)
+        error = (values - batch["returns"]).square()
+        if config.clip_values:
+            near = batch["values"] + (values - batch["values"]).clamp(-clip, clip)
+            error = torch.maximum(error, (near - batch["returns"]).square())
+        entropy = policy.entropy().sum(-1).mean()
+        kl = kl_divergence(Normal(batch["means"], old_deviation, validate_args=False), policy).sum(-1).mean()
+        loss = surrogate + config.value_loss_coef * error.mean() - config.entropy_coef * entropy
+        return loss, torch.stack((surrogate, error.mean(), entropy, kl)).detach()
+
+    def _adapted_rate(self, kl: float) -> float:
+        """Smaller steps where the policy has gone too far from the old one, greater ones where it has hardly moved (rsl-rl's rule)."""
+        (least, greatest), desired = self.config.learning_rate_limits, self.config.desired_kl
+        if kl > 2.0 * desired:
+            return max(self.rate / 1.5, least)
+        return min(self.rate * 1.5, greatest) if 0.0 < kl < desired / 2.0 else self.rate
+
+    def policy(self) -> Actor:
+        """The actor is the policy."""
+        return self.actor
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks with their normalisers, optimizer and learning rate."""
+        parts = {"policy": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        return {**{name: part.state_dict() for name, part in parts.items()}, "learning_rate": self.rate}
+
+    def load_state_dict(self, state: Any, *, weights_only: bool = False, changed: Collection[str] = ()) -> list[str]:
+        """Go on from :meth:`state_dict`: with the saved learning rate where the schedule adapts it, unless the job sets another one."""
+        self.actor.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        if weights_only:
+            return []
+        self.optimizer.load_state_dict(state["optimizer"])
+        keeps = self.config.schedule == "adaptive" and "learning_rate" not in changed
+        self.rate = float(state["learning_rate"]) if keeps else self.config.learning_rate
+        return [] if self.rate == state["learning_rate"] else [f"learning rate set to {self.rate:g}"]
+
+    def world_state(self) -> dict[str, torch.Tensor]:
+        """Nothing is kept for a world from iteration to iteration."""
+        return {}
+
+    def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Nothing to go on from."""
+
+    @classmethod
+    def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> Actor:
+        """The actor alone."""
+        return Actor(spaces, config).to(device).eval()
