@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,6 +36,8 @@ def find_algorithm(name: str) -> type[Algorithm]:
         raise UserError(
             f"train.algorithm: there is no {name!r}; there are {', '.join(BUILT_IN)}, and module:Class of your own"
         )
+    if place == name and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # as a task of the user's own is found (worker.tasks)
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
