@@ -101,13 +101,12 @@ class PlainPPO:
         if config.optimizer != "adam":
             raise ValueError(f"optimizer: plain PPO has adam alone; algorithm ppo has {config.optimizer}")
         self.config, self.setting, self.gang, self.steps = config, setting, setting.gang, config.steps
-        device = setting.gang.device
+        device, self.rate = setting.gang.device, config.learning_rate
         self.actor = Actor(setting.spaces, config)
         self.critic = Network(groups[group][0], config.critic_hidden_sizes or config.hidden_sizes, 1, config)
         self.parameters = [*self.actor.to(device).parameters(), *self.critic.to(device).parameters()]
         for parameter in self.parameters:
             self.gang.broadcast(parameter.data)  # every rank begins with the main rank's weights
-        self.rate = config.learning_rate
         self.optimizer = torch.optim.Adam(self.parameters, self.rate, foreach=False)
         self._draws = Draws(setting.seed, setting.share.first, device)
         self._rollout: list[dict[str, torch.Tensor]] = []
