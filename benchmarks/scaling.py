@@ -49,7 +49,7 @@ def rank(task: str, worlds: int, store: Path, result: Path) -> None:
             "learn": record["learn_seconds"],
             "excess": statistics.median(slowest),
             "rate": runner.gang.size * worlds * runner.config.ppo.steps / seconds,
-            "captured": [part.name for part in runner.algorithm.recordings if part.captured],
+            "captured": [part.name for part in runner.algorithm.graphs if part.captured],
         }
         result.write_text(json.dumps(found))
     runner.close()

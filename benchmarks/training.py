@@ -29,9 +29,9 @@ from benchmarks.stock import stock_runner, stock_seconds
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from worker.distributed import Placement, connect
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
-from worker.learning.recording import Recorded
 from worker.learning.setup import build_task
 from worker.tasks import find_task
 
@@ -137,7 +137,7 @@ def measure(task: str, worlds: int, store: Path, *, stock: bool, profile: bool) 
         for _ in range(runner.config.ppo.steps):
             own.step(actions)
 
-    found["simulation"] = rate(Recorded(simulate, own.device, "simulation"), steps)
+    found["simulation"] = rate(CudaGraphFunction(simulate, own.device, "simulation"), steps)
     if stock:
         fresh = build_task(type(own), runner.config, runner.share, runner.gang, 1)
         iterations = max(3, round((3e6 if CUDA else 3e3) / steps))

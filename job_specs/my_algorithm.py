@@ -74,8 +74,10 @@ class Mine:
     """The algorithm; `algorithm: job_specs.my_algorithm:Mine` in a job names it."""
 
     config_type = Settings
-    captures_rollout = False  # True promises that act and record can become a CUDA graph (worker/learning/recording.py)
-    recordings = ()  # what learn replays as CUDA graphs: nothing
+    captures_rollout = (
+        False  # True promises that act and record can become a CUDA graph (worker/learning/cuda_graph.py)
+    )
+    graphs = ()  # what learn replays as CUDA graphs: nothing
 
     def __init__(self, config, setting):
         self.config, self.gang, self.steps = config, setting.gang, config.steps

@@ -48,8 +48,8 @@ class Run:
         return self.path / "evaluations"
 
     @property
-    def replays(self) -> Path:
-        return self.path / "replays"
+    def incidents(self) -> Path:
+        return self.path / "incidents"
 
     @property
     def exports(self) -> Path:

@@ -123,7 +123,7 @@ def _compare(client: Client, spec: Spec, source: str, first: str, second: str) -
         queue=spec.queue,
         image=spec.image,
         resources=Resources(cpus=min(1.0, spec.resources.cpus), memory=spec.resources.memory),
-        command=["python", "-P", "-m", "worker.compare", first, second],
+        command=["python", "-P", "-m", "worker.bitwise_diff", first, second],
         retry=Retry(attempts=1),
     )
     job = submit_spec(client, comparison, source)["jobId"]

@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.waiting import wait_for
 
-_ROLES = {"worker.supervisor": "supervisor", "worker.saver": "writer", "worker.train": "rank"}
+_ROLES = {"worker.supervisor": "supervisor", "worker.checkpoint_writer": "writer", "worker.train": "rank"}
 _START = 19
 """Which field of :func:`_stat` is the start time."""
 

@@ -2,7 +2,7 @@
 
 An iteration calls, in this order: :meth:`Algorithm.begin`; then, ``steps`` times, :meth:`Algorithm.act`, the task's step and
 :meth:`Algorithm.record`; then :meth:`Algorithm.learn`. On CUDA the steps of an iteration become one graph where the algorithm allows
-it, and :meth:`Algorithm.learn` may replay graphs of its own (:class:`worker.learning.recording.Recorded`).
+it, and :meth:`Algorithm.learn` may replay graphs of its own (:class:`worker.learning.cuda_graph.CudaGraphFunction`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.distributed import Gang
-from worker.learning.recording import Recorded
+from worker.learning.cuda_graph import CudaGraphFunction
 
 POLICY = "policy"
 """Name of the observation group that every task has: what the policy sees."""
@@ -149,11 +149,11 @@ class Algorithm(Protocol):
     """Its settings: a pydantic dataclass that is imported without torch. ``fixed``, where it has that, names those that a resumed run
     can't change."""
     captures_rollout: ClassVar[bool]
-    """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.recording.Recorded`."""
+    """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.cuda_graph.CudaGraphFunction`."""
 
     steps: int
     """Control steps of every world in one iteration."""
-    recordings: Sequence[Recorded]
+    graphs: Sequence[CudaGraphFunction]
     """What :meth:`learn` replays as graphs, for the run's log; the loop releases them in the end."""
 
     def __init__(self, config: Any, setting: Setting) -> None:

@@ -18,12 +18,12 @@ from worker.learning import algorithms
 from worker.learning.algorithm import Share
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
+from worker.learning.cuda_graph import CudaGraphFunction, HostCopy
 from worker.learning.evaluation import evaluate
 from worker.learning.faults import die, kill_at
+from worker.learning.incident import Incident
 from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.recording import HostCopy, Recorded
-from worker.learning.replay import Replay
 from worker.learning.report import Report, Stopwatch
 from worker.learning.reporter import Fence, Reporter
 from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
@@ -73,7 +73,7 @@ class Loop:
                 self.algorithm.load_teacher(self._weights_of(teacher))  # type: ignore[attr-defined]
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
-        self.replay = Replay(self.task, share, self.algorithm.steps, job.section, self.seed)
+        self.incident = Incident(self.task, share, self.algorithm.steps, job.section, self.seed)
         seed_generators(self.seed, gang.rank)
         self.iterated = 0
         """Iterations that this process has done."""
@@ -92,7 +92,7 @@ class Loop:
         self.task.clear_statistics()
         self._stopwatch = Stopwatch(gang.device)
         captured = gang.device if self.algorithm.captures_rollout else "cpu"
-        self._collecting = Recorded(self._collect, captured, "rollout")
+        self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._numbers = HostCopy(gang.device)
         self._totals = Totals(
             {
@@ -153,13 +153,13 @@ class Loop:
 
     def close(self) -> None:
         """Leave the gang; nothing can be trained afterwards."""
-        for part in (self._collecting, *self.algorithm.recordings):
+        for part in (self._collecting, *self.algorithm.graphs):
             part.release()
         self.gang.close()
 
     def _tell_captured(self) -> None:
         """Say once, when it has come to that, which parts of an iteration the device replays by itself."""
-        parts = [self._collecting, *self.algorithm.recordings]
+        parts = [self._collecting, *self.algorithm.graphs]
         if (
             not self._told_captured
             and all(part.captured or not part.can_be_captured for part in parts)
@@ -262,24 +262,24 @@ class Loop:
                 more = "; from now on only counted" if self._warnings == WARNINGS else ""
                 self._say(f"warning: iteration {iteration}: {resets} resets of worlds, among them {first}{more}")
             return
-        files = [self.job.run.replays / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
+        files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
         if found[self.gang.rank]:
             try:
-                self.replay.write(files[self.gang.rank], iteration)
+                self.incident.write(files[self.gang.rank], iteration)
             except OSError as error:
                 problem = f" (it could not be written: {error.strerror})"
         self.gang.greatest(0)  # nobody ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
             f"{resets} resets of worlds, among them {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
-            f"See it happen again: python -m worker.replay {files[rank]}{where}{problem}",
+            f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
         )
 
     def _begin_iteration(self, iteration: int) -> None:
         """Tell the task, whose curriculum may depend on it."""
         told = iteration, self.state.progress.reward, self.state.progress.episode_length
-        self.replay.begin(*told)
+        self.incident.begin(*told)
         self.task.begin_iteration(*told)
 
     def _signals(self) -> tuple[float, ...]:
@@ -290,10 +290,10 @@ class Loop:
         return float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds
 
     def _collect(self) -> None:
-        self.replay.keep()
+        self.incident.keep()
         for step in range(self.algorithm.steps):
             actions = self.algorithm.act(self._observations)
-            self.replay.note(step, actions)
+            self.incident.note(step, actions)
             self.task.step(actions)
             self.algorithm.record(self._step)
 

@@ -90,7 +90,7 @@ class PlainPPO:
 
     config_type: ClassVar[type[PPOConfig]] = PPOConfig
     captures_rollout: ClassVar[bool] = False
-    recordings: Sequence[Any] = ()
+    graphs: Sequence[Any] = ()
 
     def __init__(self, config: PPOConfig, setting: Setting) -> None:
         group, groups = config.critic_observations, setting.spaces.observations

@@ -51,7 +51,7 @@ class HostCopies:
 
 
 class Saver:
-    """Hands snapshots to the writer process of this rank (:mod:`worker.saver`), in order, and tells how they ended."""
+    """Hands snapshots to the writer process of this rank (:mod:`worker.checkpoint_writer`), in order, and tells how they ended."""
 
     def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None) -> None:
         self.run, self.epoch, self.rank, self.ranks, self.keep = run, epoch, rank, ranks, keep
@@ -164,7 +164,7 @@ class Saver:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
         try:
             self._process = subprocess.Popen(
-                tied([sys.executable, "-P", "-m", "worker.saver"], ignoring=[signal.SIGTERM]),
+                tied([sys.executable, "-P", "-m", "worker.checkpoint_writer"], ignoring=[signal.SIGTERM]),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=self._memory,

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from worker.tasks.config import reward_weights
-from worker.tasks.running import RunnerConfig, Running, observation_names
+from worker.tasks.running import Running, RunningConfig, observation_names
 
 JOINT_NAMES = tuple(f"{part}_{leg}" for leg in range(1, 5) for part in ("hip", "ankle"))
 """The model file's hinges in the order of the joint coordinates."""
 
 
 @dataclass(frozen=True)
-class AntConfig(RunnerConfig):
-    """Run fast, straight and upright; do not drop the torso. What the rewards are: :class:`RunnerConfig`."""
+class AntConfig(RunningConfig):
+    """Run fast, straight and upright; do not drop the torso. What the rewards are: :class:`RunningConfig`."""
 
     fall_height: float = 0.31
     """Height of the torso under which the episode ends [m]."""

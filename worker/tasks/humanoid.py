@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from worker.tasks.config import reward_weights
-from worker.tasks.running import RunnerConfig, Running, observation_names
+from worker.tasks.running import Running, RunningConfig, observation_names
 
 JOINT_NAMES = (
     *("abdomen_z", "abdomen_y", "abdomen_x"),
@@ -20,8 +20,8 @@ JOINT_NAMES = (
 
 
 @dataclass(frozen=True)
-class HumanoidConfig(RunnerConfig):
-    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunnerConfig`."""
+class HumanoidConfig(RunningConfig):
+    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunningConfig`."""
 
     fall_height: float = 0.8
     """Height of the torso under which the episode ends [m]."""

@@ -34,7 +34,7 @@ TORSO = wp.constant(11)
 
 
 @dataclass(frozen=True)
-class RunnerConfig(TaskConfig):
+class RunningConfig(TaskConfig):
     """Run fast, straight and upright; do not fall.
 
     ``rewards`` weighs: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion below);
@@ -80,7 +80,7 @@ class RunnerConfig(TaskConfig):
 
 @wp.struct
 class RunnerParameters:
-    """The fields of :class:`RunnerConfig` that the kernels use, and what the model says of each joint."""
+    """The fields of :class:`RunningConfig` that the kernels use, and what the model says of each joint."""
 
     fall_height: float
     start_height: float

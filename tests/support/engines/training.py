@@ -33,9 +33,9 @@ def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str)
 
 
 def same_bits(store: Path, first: str, second: str) -> str:
-    """What ``worker.compare`` says of two runs, which must be equal."""
+    """What ``worker.bitwise_diff`` says of two runs, which must be equal."""
     compared = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.compare", first, second],
+        [sys.executable, "-P", "-m", "worker.bitwise_diff", first, second],
         env={**os.environ, "MUSTER_STORE": str(store)},
         capture_output=True,
         text=True,

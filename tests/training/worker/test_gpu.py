@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from worker.learning.recording import Recorded
+from worker.learning.cuda_graph import CudaGraphFunction
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -24,7 +24,7 @@ def test_an_iteration_is_two_graphs_and_never_waits_for_the_device(tmp_path: Pat
     training = runner(tmp_path, task)
     for _ in range(3):
         training._iterate()
-    parts = [training._collecting, *training.ppo.recordings]
+    parts = [training._collecting, *training.algorithm.graphs]
     assert all(part.captured for part in parts) and training.task.captured
     torch.cuda.set_sync_debug_mode("error")
     try:
@@ -40,10 +40,10 @@ def test_a_graph_computes_what_the_same_code_computes_eagerly(tmp_path: Path) ->
     for eager in (False, True):
         training = runner(tmp_path / str(eager), "Cartpole")
         if eager:
-            for part in (training._collecting, *training.ppo.recordings):
+            for part in (training._collecting, *training.algorithm.graphs):
                 part._cuda = False
         records = [training._iterate()[0] for _ in range(5)]
-        weights = torch.cat([p.detach().flatten() for p in training.ppo.actor.parameters()])
+        weights = torch.cat([p.detach().flatten() for p in training.algorithm.actor.parameters()])
         found.append((torch.tensor([[r["surrogate_loss"], r["value_loss"], r["kl"]] for r in records]), weights))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=2e-3, atol=1e-5)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=2e-3, atol=1e-4)
@@ -51,7 +51,7 @@ def test_a_graph_computes_what_the_same_code_computes_eagerly(tmp_path: Path) ->
 
 def test_no_garbage_is_collected_while_a_graph_is_recorded() -> None:
     found = []
-    part = Recorded(lambda: found.append(gc.isenabled()), "cuda:0", "part")
+    part = CudaGraphFunction(lambda: found.append(gc.isenabled()), "cuda:0", "part")
     for _ in range(3):
         part()
     assert found == [True, False] and part.captured and gc.isenabled()

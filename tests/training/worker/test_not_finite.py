@@ -82,18 +82,22 @@ def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pyte
     assert "nan_worlds" in output and "error" not in output
 
 
-def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay(tmp_path: Path) -> None:
+def test_past_the_limit_it_stops_with_the_state_and_it_happens_again(tmp_path: Path) -> None:
     with pytest.raises(TrainingError) as stop:
         runner(tmp_path, 0.0).train()
     found = re.fullmatch(
         r"iteration (\d): (\d+) resets of worlds, among them (world \d+: its observation slider_velocity was not finite); that is more "
-        r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.replay (\S+)",
+        r"than nan_limit, 0 times 16 worlds; there is no checkpoint yet. See it happen again: python -m worker.repeat_incident (\S+)",
         str(stop.value),
     )
     assert found, stop.value
-    assert [str(path) for path in Store(tmp_path).run("run").replays.iterdir()] == [found[4]]
+    assert [str(path) for path in Store(tmp_path).run("run").incidents.iterdir()] == [found[4]]
     again = subprocess.run(
-        [sys.executable, "-m", "worker.replay", found[4]], cwd=ROOT, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "worker.repeat_incident", found[4]],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert again.returncode == 0, again.stderr
     assert again.stdout.startswith(
@@ -104,12 +108,15 @@ def test_past_the_limit_it_stops_with_the_state_and_it_happens_again_in_a_replay
     assert angle and float(angle[1]) < -0.2, "the pole leant to the left"
 
 
-def test_what_is_no_replay_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_incident_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "nonsense").write_text("x")
     (tmp_path / "empty").touch()
-    for name in ("nonsense", "missing", "empty"):
+    for name, says in {"nonsense": "holds no", "missing": "can't be read (", "empty": "holds no"}.items():
         refused = subprocess.run(
-            [sys.executable, "-m", "worker.replay", str(tmp_path / name)], cwd=ROOT, capture_output=True, text=True
+            [sys.executable, "-m", "worker.repeat_incident", str(tmp_path / name)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
         )
         assert refused.returncode == 2 and refused.stderr.count("\n") == 1, refused.stderr
-        assert refused.stderr.startswith(f"error: {tmp_path / name}: no replay can be read from it (")
+        assert refused.stderr.startswith(f"error: {tmp_path / name} {says}")

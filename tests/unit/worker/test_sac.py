@@ -680,8 +680,8 @@ def test_what_is_recorded_asks_the_device_for_nothing_and_draws_nothing(settings
         for _ in range(sac.steps):
             sac.act(task_step.observations)
             sac.record(task_step)
-        for recording in sac.recordings:
-            recording()
+        for graph in sac.graphs:
+            graph()
     assert watch.found == []
 
 

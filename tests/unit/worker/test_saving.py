@@ -15,10 +15,10 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Run, Store
 from tests.support.shared_store.operations import durable_operations
+from worker.checkpoint_writer import Orders, save
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.saving import Saver
-from worker.saver import Orders, save
 
 
 @pytest.fixture

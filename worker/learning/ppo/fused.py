@@ -25,6 +25,7 @@ import torch
 from tensordict import TensorDict
 
 from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.ppo import linear, moments
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.heads import Categorical, Gaussian, Head
@@ -32,7 +33,6 @@ from worker.learning.ppo.loss import LOSSES, Clipping
 from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.learning.ppo.rollout import Rollout, View
 from worker.learning.ppo.settings import PPOConfig
-from worker.learning.recording import Recorded
 
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within its limits."""
@@ -78,7 +78,7 @@ class PPO:
             self._head = Gaussian(
                 *(self.actor, spaces.actions, samples, self.device), weight=weight, settings=clipping, plain=plain
             )
-        self.recordings = self._record()
+        self.graphs = self._record()
         for parameter in self._parameters:
             self.gang.broadcast(parameter.data)
 
@@ -122,13 +122,13 @@ class PPO:
         self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
         self._metrics = torch.zeros(len(METRICS), device=self.device)
 
-    def _record(self) -> list[Recorded]:
+    def _record(self) -> list[CudaGraphFunction]:
         """What of learning the device replays as graphs: all of it, or in a gang the parts between the collectives."""
         parts = (self._estimate, self._normalize, self._compute_gradients, self._apply_gradients, self._close)
         if self.gang.size == 1:
             self._parts: tuple[Callable[[], None], ...] = parts
-            return [Recorded(self._learn, self.device, "learning")]
-        recorded = [Recorded(part, self.device, part.__name__.strip("_").replace("_", " ")) for part in parts]
+            return [CudaGraphFunction(self._learn, self.device, "learning")]
+        recorded = [CudaGraphFunction(part, self.device, part.__name__.strip("_").replace("_", " ")) for part in parts]
         self._parts = tuple(recorded)
         return recorded
 
@@ -162,7 +162,7 @@ class PPO:
         for view in self.rollout.views:
             view.last.copy_(observations[view.group])
         if self.gang.size == 1:
-            self.recordings[0]()
+            self.graphs[0]()
         else:
             self._learn()
         return dict(zip(METRICS, self._metrics, strict=True))

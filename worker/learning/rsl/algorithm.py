@@ -18,7 +18,7 @@ from rsl_rl.modules import EmpiricalNormalization
 from tensordict import TensorDict
 
 from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transition
-from worker.learning.recording import Recorded
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.rsl import building
 from worker.learning.rsl.policy import RslRlPolicy
 from worker.learning.rsl.settings import RslRlConfig
@@ -38,7 +38,7 @@ class RslRl:
     def __init__(self, config: RslRlConfig, setting: Setting) -> None:
         """Build what ``config`` names. Raises ValueError, in one line that says where, for what rsl_rl refuses."""
         self.steps = config.num_steps_per_env
-        self.recordings: Sequence[Recorded] = ()
+        self.graphs: Sequence[CudaGraphFunction] = ()
         self.algorithm, seen, self._groups = building.build_algorithm(config, setting)
         self._gang, self._worlds = setting.gang, setting.share.count
         self._networks = {

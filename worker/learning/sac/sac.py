@@ -22,9 +22,9 @@ import torch
 from tensordict import TensorDict
 
 from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.ppo import moments
 from worker.learning.randomness import mix_seed
-from worker.learning.recording import Recorded
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
 from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, size_of
@@ -58,7 +58,7 @@ class SAC:
         self._updates = 0
         self._learns = False
         self._allocate(width, spaces.actions)
-        self._make_recordings()
+        self._make_graphs()
 
     def _allocate(self, width: int, actions: int) -> None:
         config, device, samples = self.config, self.device, self.learner.samples
@@ -79,7 +79,7 @@ class SAC:
         self._means = torch.zeros(len(LOSSES), device=device)
         self._rate = torch.tensor(config.critic_learning_rate, device=device)
 
-    def _make_recordings(self) -> None:
+    def _make_graphs(self) -> None:
         """What the device replays as graphs: in a gang of one two of them, else the parts between which the collectives stand."""
         parts: dict[str, Callable[[], None]] = {
             "gather moments": self._gather_moments,
@@ -91,8 +91,8 @@ class SAC:
         }
         wholes: dict[str, Callable[[], None]] = {"moments": self._observe, "updates": self._update}
         graphs = wholes if self.gang.size == 1 else parts
-        recorded = {name: Recorded(function, self.device, name) for name, function in graphs.items()}
-        self.recordings: Sequence[Recorded] = [*recorded.values()]
+        recorded = {name: CudaGraphFunction(function, self.device, name) for name, function in graphs.items()}
+        self.graphs: Sequence[CudaGraphFunction] = [*recorded.values()]
         self._run: dict[str, Callable[[], None]] = {**wholes, **parts, **recorded}
 
     # -- collecting ---------------------------------------------------------------------------------------------------
@@ -222,9 +222,9 @@ class SAC:
         """
         self._updates = int(state["updates"])
         self.learner.load_state_dict(state, weights_only=weights_only)
-        for recording in self.recordings:
-            recording.release()
-        self._make_recordings()  # the old ones would go on with the optimizers' old moments
+        for graph in self.graphs:
+            graph.release()
+        self._make_graphs()  # the old ones would go on with the optimizers' old moments
         rates = [name for name in changed if name.endswith("_rate")]
         return [f"{name} set to {getattr(self.config, name):g}" for name in rates]
 

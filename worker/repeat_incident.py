@@ -1,6 +1,6 @@
-"""``python -m worker.replay FILE [--device cuda:0]``: do an iteration again in which worlds failed.
+"""``python -m worker.repeat_incident FILE [--device cuda:0]``: do an iteration again in which worlds failed.
 
-A run that stops for that reason leaves ``FILE`` in its ``replays`` directory: the worlds as they were when the iteration began, and
+A run that stops for that reason leaves ``FILE`` in its ``incidents/`` directory: the worlds as they were when the iteration began, and
 every action. Shown are the first worlds that go wrong, the step, what was wrong, and the joint state before that step. Exits 0
 where it happened again, 1 where it did not, 2 where the file can't be read.
 """
@@ -33,9 +33,9 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
         content = torch.load(path, weights_only=True)
         section = content["train"]
     except OSError as error:
-        raise UserError(f"{path}: no replay can be read from it ({error.strerror})") from error
+        raise UserError(f"{path} can't be read ({error.strerror})") from error
     except (EOFError, pickle.UnpicklingError, RuntimeError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: no replay can be read from it (it is none)") from error
+        raise UserError(f"{path} holds no incident of a training") from error
     if Path(content["directory"]).is_dir():
         sys.path.append(content["directory"])  # where a task of the user's own was found
     with user_errors(str(path)):
@@ -58,7 +58,7 @@ def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
     return task, content
 
 
-def replay(path: Path, device: str) -> int:
+def repeat(path: Path, device: str) -> int:
     """Step through the iteration; the exit code."""
     task, content = load(path, device)
     actions = content["actions"].to(task.device)
@@ -94,7 +94,7 @@ def main() -> int:
     parser.add_argument("file", type=Path)
     parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:<n>"')
     options = parser.parse_args()
-    return replay(options.file, options.device)
+    return repeat(options.file, options.device)
 
 
 if __name__ == "__main__":

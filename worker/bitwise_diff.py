@@ -1,4 +1,4 @@
-"""``python -P -m worker.compare RUN_A RUN_B``: whether two runs ended with the same bits.
+"""``python -P -m worker.bitwise_diff RUN_A RUN_B``: whether two runs ended with the same bits.
 
 A run is the name of one in ``$MUSTER_STORE``, or its directory. Compared are the newest checkpoints (every tensor and value of
 ``learner.pt``, every world by its global index, the ranks' generators where there are equally many, what the manifest says of the
@@ -143,7 +143,7 @@ def find_run(name: str) -> Run:
 def main() -> int:
     """Compare; returns the exit code: 0 equal, 1 different, 2 wrong use."""
     if len(sys.argv) != 3:
-        print("usage: python -P -m worker.compare RUN_A RUN_B", file=sys.stderr)
+        print("usage: python -P -m worker.bitwise_diff RUN_A RUN_B", file=sys.stderr)
         return EX_USAGE
     first, second = (find_run(name) for name in sys.argv[1:])
     try:

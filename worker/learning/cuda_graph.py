@@ -10,7 +10,7 @@ import torch
 from worker.simulation.capture import garbage_collection_paused
 
 
-class Recorded:
+class CudaGraphFunction:
     """A function without arguments that a CUDA device replays as one graph.
 
     The first call runs it as it is (kernels are loaded, lazy buffers made, and the work is done), the second one records it, and

@@ -1,4 +1,4 @@
-"""The worlds as they were when an iteration began, so that an iteration that went wrong can be done again: ``worker.replay``."""
+"""The worlds as they were when an iteration began, so that an iteration that went wrong can be done again: ``worker.repeat_incident``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
-class Replay:
+class Incident:
     """Keeps, on the device, what :meth:`write` needs. Costs a copy of the worlds' state an iteration, in the rollout's own graph."""
 
     def __init__(self, task: Task, share: Share, steps: int, section: dict[str, Any], seed: int) -> None:

@@ -17,7 +17,7 @@ from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
-from worker import compare
+from worker import bitwise_diff
 from worker.errors import UserError
 from worker.learning.shards import Shards
 
@@ -44,8 +44,8 @@ def run(store: Path, name: str) -> Run:
 def say(store: Path, first: str, second: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
     """Exit code and output of the command."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["compare", *(str(run(store, name).path) for name in (first, second))])
-        return compare.main(), capsys.readouterr().out
+        patch.setattr(sys, "argv", ["bitwise_diff", *(str(run(store, name).path) for name in (first, second))])
+        return bitwise_diff.main(), capsys.readouterr().out
 
 
 def test_twins_are_equal_and_another_seed_is_not(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,7 +61,7 @@ def test_twins_are_equal_and_another_seed_is_not(trained: Path, capsys: pytest.C
 def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = list_checkpoints(run(store, "twin"))[-1].path / name
     content = torch.load(path, weights_only=True)
-    tensors = {key: value for key, value in compare._flatten(content) if isinstance(value, torch.Tensor)}
+    tensors = {key: value for key, value in bitwise_diff._flatten(content) if isinstance(value, torch.Tensor)}
     key, victim = next(
         (key, tensor) for key, tensor in tensors.items() if tensor.dtype == torch.float32 and tensor.dim()
     )
@@ -90,13 +90,13 @@ def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.
     ],
 )
 def test_what_counts_as_different(one: Any, two: Any, difference: str) -> None:
-    with pytest.raises(compare.Difference, match=re.escape(difference)):
-        compare._compare_values("file", one, two)
+    with pytest.raises(bitwise_diff.Difference, match=re.escape(difference)):
+        bitwise_diff._compare_values("file", one, two)
 
 
 def test_not_a_number_equals_itself() -> None:
     values = {"a": torch.tensor([float("nan")]), "b": float("nan"), "c": None, "d": []}
-    assert compare._compare_values("file", values, {**values, "a": values["a"].clone(), "b": float("nan")}) == 1
+    assert bitwise_diff._compare_values("file", values, {**values, "a": values["a"].clone(), "b": float("nan")}) == 1
 
 
 def test_metrics_are_compared_but_not_times(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,10 +137,10 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
 def test_what_can_not_be_compared_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUSTER_STORE", raising=False)
     with pytest.raises(UserError, match="run some: set MUSTER_STORE"):
-        compare.find_run("some")
+        bitwise_diff.find_run("some")
     monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
     with pytest.raises(UserError, match="run some does not exist"):
-        compare.find_run("some")
+        bitwise_diff.find_run("some")
     (tmp_path / "runs" / "some" / "checkpoints").mkdir(parents=True)
     with pytest.raises(UserError, match="run some has no checkpoint in"):
-        compare.compare(compare.find_run("some"), compare.find_run(str(tmp_path / "runs" / "some")))
+        bitwise_diff.compare(bitwise_diff.find_run("some"), bitwise_diff.find_run(str(tmp_path / "runs" / "some")))

@@ -1,6 +1,6 @@
 """The writer of one rank's checkpoint files: a process of its own, so that the training loop, its GIL and its collectives stay free.
 
-``python -m worker.saver`` is started by :class:`worker.learning.saving.Saver`. It reads one JSON order a line on standard input,
+``python -m worker.checkpoint_writer`` is started by :class:`worker.learning.saving.Saver`. It reads one JSON order a line on standard input,
 takes the files' content from a memory file (inherited descriptor), writes, fsyncs and digests them, and answers one JSON line an
 order on standard output. The main rank's writer then waits until every rank's files are durable, and commits. Orders are carried
 out one after the other: a later save never overtakes an earlier one. Imports no torch.
