@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco_warp
@@ -90,13 +91,23 @@ _CAPACITY_BITS = wp.constant(
 
 @wp.kernel
 def _gather_overflow(solver_overflow: wp.array(dtype=wp.int32), overflow: wp.array(dtype=wp.int32)):
-    """The solver clears its bits at every physics step: keep them for the whole control step."""
+    """The solver clears its bits before each control step: keep them until they are counted."""
     world = wp.tid()
     overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)
 
 
 _SET_HERE = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
 """Options of the solver that are not a task's to choose: neither sensors nor such roots are used, and both cost time in every step."""
+
+
+class _Solver(SolverMuJoCo):
+    """Takes all substeps between one push of Newton's state to MuJoCo and one pull of it: none of them needs the other's coordinates."""
+
+    substeps = 1
+
+    def _mujoco_warp_step(self) -> None:
+        for _ in range(self.substeps):
+            super()._mujoco_warp_step()
 
 
 class Worlds:
@@ -135,7 +146,8 @@ class Worlds:
         if ground:
             scene.add_ground_plane()
         self.model = scene.finalize(device=device)
-        self.solver = SolverMuJoCo(self.model, **_SET_HERE, **solver_options)
+        self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
+        self.solver.substeps = substeps
         # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
         options = self.solver.mjw_model.opt
         options.warn_overflow = 0
@@ -144,7 +156,6 @@ class Worlds:
         if device.startswith("cuda") and options.iterations <= FEW_ITERATIONS:
             options.graph_conditional = False
         self.state = self.model.state()
-        self._other_state = self.model.state()
         self.control = self.model.control()
         _check_controls(self.model, self.solver, self.control)
         self.world_count = world_count
@@ -161,33 +172,40 @@ class Worlds:
         self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
 
     def simulate(self) -> None:
-        """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured."""
-        current, following = self.state, self._other_state
-        for _ in range(self.substeps):
-            self.solver.step(current, following, self.control, None, self.timestep)
-            wp.launch(
-                _gather_overflow,
-                dim=self.world_count,
-                inputs=[self.solver.mjw_data.overflow],
-                outputs=[self.arrays.overflow],
-                device=self.model.device,
-            )
-            current, following = following, current
-        if current is not self.state:
-            # An odd number of swaps. A graph keeps addresses, so the result has to come back to where it started.
-            self.state.assign(current)
+        """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured.
+
+        Joint coordinates follow; body poses don't (:meth:`update_bodies`): they would cost 2 to 3 % of a training, and no kernel of a
+        task that reads joints alone needs them.
+        """
+        with self._joints_alone():
+            self.solver.step(self.state, self.state, self.control, None, self.timestep)
+        wp.launch(
+            _gather_overflow,
+            dim=self.world_count,
+            inputs=[self.solver.mjw_data.overflow],
+            outputs=[self.arrays.overflow],
+            device=self.model.device,
+        )
+
+    @contextlib.contextmanager
+    def _joints_alone(self) -> Iterator[None]:
+        """The solver ends each step with the kinematics of all articulations: in here there are none."""
+        count, self.model.articulation_count = self.model.articulation_count, 0
+        try:
+            yield
+        finally:
+            self.model.articulation_count = count
 
     def restore_defaults(self) -> None:
         """Put every world in the model's own pose, at rest, with a cold solver."""
-        for state in (self.state, self._other_state):
-            state.joint_q.assign(self.model.joint_q)
-            state.joint_qd.assign(self.model.joint_qd)
+        self.state.joint_q.assign(self.model.joint_q)
+        self.state.joint_qd.assign(self.model.joint_qd)
         self.arrays.controls.zero_()
         self.arrays.warm_start.zero_()
         self.arrays.overflow.zero_()
 
     def update_bodies(self) -> None:
-        """Recompute body poses from joint coordinates, for who looks at ``state.body_q`` right after a reset."""
+        """Compute body poses and velocities (``state.body_q``, ``state.body_qd``) from joint coordinates, which alone are kept up to date."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
 

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.ppo import linear
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -55,3 +57,24 @@ def test_no_garbage_is_collected_while_a_graph_is_recorded() -> None:
     for _ in range(3):
         part()
     assert found == [True, False] and part.captured and gc.isenabled()
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(35, 8), (40, 1)])
+def test_padded_products_and_their_gradients_are_those_of_the_network(inputs: int, outputs: int) -> None:
+    torch.manual_seed(0)
+    mlp = nn.Sequential(nn.Linear(inputs, 64), nn.ELU(), nn.Linear(64, outputs)).to("cuda:0", torch.float64)
+    x = torch.randn(512, inputs, device="cuda:0", dtype=torch.float64)
+    wide = torch.zeros(512, linear.padded(inputs, "cuda:0"), device="cuda:0", dtype=torch.float64)
+    wide[:, :inputs] = x
+    weights = torch.randn(512, outputs, device="cuda:0", dtype=torch.float64)
+    expected = mlp(x)
+    (expected * weights).sum().backward()
+    gradients = [parameter.grad for parameter in mlp.parameters()]
+    for parameter in mlp.parameters():
+        parameter.grad = torch.full_like(parameter, 7.0)  # what was there is written over
+    found = linear.forward(mlp, wide, torch.ones(512, device="cuda:0", dtype=torch.float64))
+    (found * weights).sum().backward()
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(linear.forward(mlp, wide), expected)
+    for parameter, gradient in zip(mlp.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)

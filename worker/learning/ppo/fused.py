@@ -119,6 +119,7 @@ class PPO:
         self._orders = torch.zeros(count, share, worlds, dtype=torch.long, device=self.device)
         self._scratch = torch.zeros(config.epochs, worlds, self.steps, dtype=torch.int32, device=self.device)
         self._rows = torch.zeros(share * worlds, dtype=torch.long, device=self.device)
+        self._ones = torch.ones(share * worlds, device=self.device)
         self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
         self._metrics = torch.zeros(len(METRICS), device=self.device)
 
@@ -184,7 +185,7 @@ class PPO:
         """Values and advantages of this rank's samples, the moments of all that is shared, and the minibatches."""
         rollout = self.rollout
         critic = rollout.critic
-        rollout.values.copy_(self.critic.mlp(critic.latents).squeeze(-1))
+        rollout.values.copy_(linear.forward(self.critic.mlp, critic.padded).squeeze(-1))
         last = self.critic.mlp(critic.latent(critic.last)).squeeze(-1)
         rollout.add_future(self.config.gamma, self.critic.mlp)
         rollout.log_prob.copy_(self._head.log_prob(rollout))
@@ -214,8 +215,8 @@ class PPO:
         latents = rollout.actor.batch(self._rows)
         judged = latents if rollout.critic is rollout.actor else rollout.critic.batch(self._rows)
         with self._beside() as join:
-            values = linear.forward(self.critic.mlp, judged)
-        outputs = linear.forward(self.actor.mlp, latents)
+            values = linear.forward(self.critic.mlp, judged, self._ones)
+        outputs = linear.forward(self.actor.mlp, latents, self._ones)
         join()
         self._losses.copy_(self._head.backward(self._rows, rollout, outputs, values))
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import Transition
+from worker.learning.ppo import linear
 from worker.learning.ppo.models import MLPModel, PixelModel
 
 
@@ -18,6 +19,7 @@ class View:
     Attributes:
         observations: Shape (steps, worlds, *shape), float32, or uint8 of images.
         latents: What the network's last part reads: normalised observations, or features; shape (steps, worlds, features).
+        padded: The same with columns of zeros behind them, see :func:`worker.learning.ppo.linear.padded`.
         last: The observation after the last step, shape (worlds, *shape).
     """
 
@@ -27,7 +29,9 @@ class View:
         self.model, self.group, self.is_image = model, group, len(shape) > 1
         dtype = torch.uint8 if self.is_image else torch.float32
         self.observations = torch.zeros(steps, worlds, *shape, device=device, dtype=dtype)
-        self.latents = torch.zeros(steps, worlds, model._get_latent_dim(), device=device)
+        features = model._get_latent_dim()
+        self.padded = torch.zeros(steps, worlds, linear.padded(features, device), device=device)
+        self.latents = self.padded[..., :features]
         self.last = torch.zeros(worlds, *shape, device=device, dtype=dtype)
 
     def see(self, step: int, observations: TensorDict) -> torch.Tensor:
@@ -40,10 +44,10 @@ class View:
         return self.model.get_latent({self.group: observations})
 
     def batch(self, rows: torch.Tensor) -> torch.Tensor:
-        """Latents of the samples ``rows`` of the flattened rollout; of images with the gradient of what makes them."""
+        """Padded latents of the samples ``rows`` of the flattened rollout; of images with the gradient of what makes them."""
         if self.is_image:
             return self.latent(self.observations.flatten(0, 1)[rows])
-        return self.latents.flatten(0, 1)[rows]
+        return self.padded.flatten(0, 1)[rows]
 
 
 class Rollout:
