@@ -1,8 +1,9 @@
-"""Several GPUs of one host: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives between the graphs.
+"""Several GPUs: the same worlds a GPU on 1, 2, 4 … of them (weak scaling), collectives between the graphs.
 
     python -m benchmarks.scaling [--task Ant] [--worlds 4096] [--gpus 1 2 4] [--out DIRECTORY]
 
-Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun and meet as under Muster's supervisor.
+Writes ``scaling.md`` and ``scaling.json``. The ranks are started by torchrun and meet as under Muster's supervisor. The last row has
+all GPUs on two "hosts", half of them each: network namespaces, between which NCCL has nothing but TCP over a virtual cable.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.load import Watch, add_option, told
+from tests.support.hosts import start_ranks, two_hosts
 
 ITERATIONS = 60
 
@@ -69,6 +71,21 @@ def launch(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
         return {"gpus": gpus, **json.loads(result.read_text())}
 
 
+def launch_hosts(gpus: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Train on ``gpus`` GPUs of two hosts. Raises OSError where there can be none."""
+    with tempfile.TemporaryDirectory() as directory, two_hosts():
+        arguments = ["-m", "benchmarks.scaling", "--rank", directory, "--task", options.task]
+        ranks = start_ranks([*arguments, "--worlds", str(options.worlds)], gpus, {})
+        try:
+            for process in ranks:
+                if code := process.wait(150):
+                    raise subprocess.CalledProcessError(code, process.args)
+        finally:
+            for process in ranks:
+                process.kill()
+        return {"gpus": gpus, "hosts": 2, **json.loads((Path(directory) / "result.json").read_text())}
+
+
 def _counts() -> list[int]:
     """1, 2, 4 … as far as there are GPUs."""
     import torch
@@ -89,9 +106,11 @@ def main() -> None:
         rank(options.task, options.worlds, options.rank / "store", options.rank / "result.json")
     watch = Watch(options.loaded_anyway)
     rows = []
-    for gpus in options.gpus:
+    most = max(options.gpus)
+    cases = [(gpus, launch) for gpus in options.gpus] + ([(most, launch_hosts)] if most > 1 else [])
+    for gpus, start in cases:
         try:
-            rows.append(launch(gpus, options) | watch.check(f"while {gpus} GPUs were measured"))
+            rows.append(start(gpus, options) | watch.check(f"while {gpus} GPUs were measured"))
         except (subprocess.SubprocessError, OSError) as error:
             rows.append({"gpus": gpus, "error": str(error)[:300]})
         print(rows[-1], flush=True)
@@ -116,8 +135,9 @@ def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
         if "error" in row:
             lines.append(f"| {row['gpus']} | failed | | | | | |")
             continue
+        where = " on two hosts, TCP" if "hosts" in row else ""
         lines.append(
-            f"| {row['gpus']} | **{row['rate'] / 1e6:.2f}** | {100 * row['rate'] / row['gpus'] / single:.1f} % | "
+            f"| {row['gpus']}{where} | **{row['rate'] / 1e6:.2f}** | {100 * row['rate'] / row['gpus'] / single:.1f} % | "
             f"{1000 * row['seconds']:.1f} ms | {1000 * row['collect']:.1f} ms | {1000 * row['learn']:.1f} ms | "
             f"+{100 * row['excess']:.1f} % |"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +11,13 @@ from typing import Any
 
 import pytest
 
+from shared_store.checkpoints import list_checkpoints
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.support.engines.ray_cluster import RayCluster
+from tests.support.hosts import start_ranks, two_hosts
+from tests.support.worker.ranks import ROOT, training
 
 
 def count_gpus() -> int:
@@ -83,6 +89,37 @@ def test_a_training_on_two_nodes_of_gpus(serving: Serving) -> None:
     job = submit(serving, "job_specs/cartpole.yaml", *(argument for each in settings for argument in ("--set", each)))
     assert any("captured as CUDA graphs" in line for line in serving.log(job))
     assert [len(node["gpus"]) for node in nodes(serving, job)] == [EACH, EACH]
+
+
+@needs_two
+def test_two_hosts_train_over_tcp_lose_a_rank_and_resume(tmp_path: Path) -> None:
+    settings = {"task": "Cartpole", "worlds": 512, "iterations": 60, "every": 20}
+
+    def start(epoch: int, **env: str) -> list[subprocess.Popen[str]]:
+        given = {**training(tmp_path, epoch=epoch, **settings), "NCCL_DEBUG": "INFO", "PYTHONPATH": str(ROOT), **env}
+        arguments = ["-m", "worker.train"]
+        return start_ranks(arguments, 2 * EACH, given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+    try:
+        with two_hosts():
+            run = Store(tmp_path).open().run("run")
+            run.create({"run": "run"})
+            raise_epoch(run, 1)
+            first = start(1, MUSTER_KILL_AT="30")
+            said = [process.communicate(timeout=200)[0] for process in first]
+            codes = [process.returncode for process in first]
+            assert codes[0] == -signal.SIGKILL, said[0][-2000:]
+            assert codes[1] not in (0, -signal.SIGKILL), "the other host's rank noticed"
+            assert "via NET/Socket" in said[0] and "P2P" not in said[0], said[0][-2000:]
+            assert [checkpoint.iteration for checkpoint in list_checkpoints(run)] == [20]
+            raise_epoch(run, 2)
+            second = start(2)
+            said = [process.communicate(timeout=200)[0] for process in second]
+            assert [process.returncode for process in second] == [0] * len(second), said[0][-2000:]
+            assert "resumed from checkpoint 00000020" in said[0]
+            assert list_checkpoints(run)[-1].iteration == 60
+    except OSError as error:
+        pytest.skip(f"no network namespaces here: {error}")
 
 
 def submit(serving: Serving, *arguments: str) -> str:
