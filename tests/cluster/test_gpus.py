@@ -17,7 +17,7 @@ from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.hosts import start_ranks, two_hosts
-from tests.support.worker.ranks import ROOT, training
+from tests.support.worker.ranks import training
 
 
 def count_gpus() -> int:
@@ -96,7 +96,7 @@ def test_two_hosts_train_over_tcp_lose_a_rank_and_resume(tmp_path: Path) -> None
     settings = {"task": "Cartpole", "worlds": 512, "iterations": 60, "every": 20}
 
     def start(epoch: int, **env: str) -> list[subprocess.Popen[str]]:
-        given = {**training(tmp_path, epoch=epoch, **settings), "NCCL_DEBUG": "INFO", "PYTHONPATH": str(ROOT), **env}
+        given = {**training(tmp_path, epoch=epoch, **settings), "NCCL_DEBUG": "INFO", **env}
         arguments = ["-m", "worker.train"]
         return start_ranks(arguments, 2 * EACH, given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 
+from tests.support.worker.ranks import ROOT
+
 NAMES = ("muster-host-0", "muster-host-1")
 ADDRESSES = ("10.177.0.1", "10.177.0.2")
 
@@ -51,6 +53,7 @@ def start_ranks(
             "CUDA_VISIBLE_DEVICES": ",".join(str(host * each + gpu) for gpu in range(each)),
             "NCCL_HOSTID": NAMES[host],
             "NCCL_SOCKET_IFNAME": "eth0",
+            "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
             "NCCL_IB_DISABLE": "1",
             "TORCH_NCCL_ASYNC_ERROR_HANDLING": "1",
         }
