@@ -104,7 +104,10 @@ def test_scenes_differ_as_asked_and_belong_to_the_world_not_to_the_rank() -> Non
         ({"camera": {"target": [0.0, math.nan, 1.0]}}, "camera.target: expected [x, y, z], found [0.0, nan, 1.0]"),
         ({"camera": {"witdh": 32}}, "train.config.camera.witdh: CameraConfig has no such key; did you mean width?"),
         ({"randomize": {"light": [1.0]}}, "light: expected [least, greatest]"),
-        ({"randomize": {"colors": -1.0}}, "train.config.randomize.colors: expected a value greater than or equal to 0, found -1.0"),
+        (
+            {"randomize": {"colors": -1.0}},
+            "train.config.randomize.colors: expected a value greater than or equal to 0, found -1.0",
+        ),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_in_one_line(config: dict, message: str) -> None:

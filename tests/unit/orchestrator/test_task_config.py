@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from orchestrator.errors import SpecError
 from orchestrator.settings import task_config
@@ -18,6 +20,7 @@ from orchestrator.specfile import load
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks import find_task
+from worker.tasks.overrides import configured
 
 TWO_FACTORS = "expected [least, greatest], two factors"
 WRONG = [
@@ -121,6 +124,35 @@ def test_no_simulation_is_imported_to_check() -> None:
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "worker.tasks.configs.running" in loaded
     assert not {"torch", "warp", "newton", "numpy", "mujoco", "gymnasium"} & set(loaded)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-3, 2**63) | st.floats() | st.text(max_size=6),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["mass", "up", "level", "width", "target", "*"]) | st.integers(0, 3), inner)
+    ),
+    max_leaves=8,
+)
+
+
+@given(
+    st.sampled_from(["Ant", "CartpolePixels", "Quadruped"]),
+    st.dictionaries(
+        st.sampled_from(
+            ["rewards", "randomize", "curriculum", "camera", "command_turn", "substeps", "ppo", "nan_limit"]
+        ),
+        VALUES,
+        max_size=3,
+    ),
+)
+def test_any_configuration_is_taken_or_refused_in_one_line(task: str, config: dict[str, object]) -> None:
+    problem = task_config(task).problem_with(config)  # type: ignore[union-attr]
+    if problem is None:
+        assert isinstance(configured(find_task(task).config_type, config), find_task(task).config_type)
+    else:
+        path, words = problem
+        assert (not path or path[0] in config) and "\n" not in words and len(words) < 500
 
 
 def submit(task: str, config: dict[str, object]) -> None:
