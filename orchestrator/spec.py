@@ -256,7 +256,10 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
 def _problem_of(train: _Train) -> tuple[tuple[str | int, ...], str] | None:
     """What is wrong with the overrides of a task's configuration: the key path and the words; a task that is not installed says it on its rank."""
     kind = task_config(train.task) if train.config else None
-    return kind.problem_with(train.config) if kind else None
+    try:
+        return kind.problem_with(train.config) if kind else None
+    except Exception:  # a defect of somebody's class: its rank shows the traceback
+        return None
 
 
 def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import PydanticUserError, TypeAdapter
 
 from orchestrator.settings import task_config
 from orchestrator.spec import ALGORITHMS, Spec
@@ -33,8 +33,12 @@ def _add_tasks(definitions: dict[str, Any]) -> None:
     """What ``train.config`` may hold of each installed task that says so."""
     definitions["Train"]["allOf"] = []
     for task in known_tasks():
-        if kind := task_config(task):
+        if (kind := task_config(task)) is None:
+            continue
+        try:
             config = TypeAdapter(kind).json_schema(ref_template=f"#/$defs/{task}_{{model}}")
-            definitions |= {f"{task}_{name}": each for name, each in config.pop("$defs", {}).items()}
-            condition = {"properties": {"task": {"const": task}}, "required": ["task"]}
-            definitions["Train"]["allOf"].append({"if": condition, "then": {"properties": {"config": config}}})
+        except PydanticUserError:  # a type of somebody's class that JSON does not have
+            continue
+        definitions |= {f"{task}_{name}": each for name, each in config.pop("$defs", {}).items()}
+        condition = {"properties": {"task": {"const": task}}, "required": ["task"]}
+        definitions["Train"]["allOf"].append({"if": condition, "then": {"properties": {"config": config}}})

@@ -9,7 +9,7 @@ from dataclasses import field, fields
 from types import MappingProxyType
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, Field, WrapValidator
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, WrapValidator
 from pydantic.dataclasses import dataclass
 
 from shared_store.wording import shown
@@ -223,15 +223,12 @@ class TaskConfig(_Common):
         properties, known = document["properties"], default_rewards(cls)
         for name in TRAINING:
             properties.pop(name, None)
-        weight, points = (properties[name].pop("additionalProperties") for name in ("rewards", "curriculum"))
-        properties["rewards"] |= {
-            "properties": {term: {**weight, "default": value} for term, value in known.items()},
-            "additionalProperties": False,
-        }
-        properties["curriculum"] |= {
-            "properties": {name: points for name in ("level", *known)},
-            "additionalProperties": False,
-        }
+        points = TypeAdapter(Points).json_schema()
+        for name, terms in (
+            ("rewards", {term: {"type": "number", "default": weight} for term, weight in known.items()}),
+            ("curriculum", dict.fromkeys(("level", *known), points)),
+        ):
+            properties[name] = {"type": "object", "properties": terms, "additionalProperties": False}
         return document
 
     def __post_init__(self) -> None:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from orchestrator.errors import SpecError
 from orchestrator.settings import task_config
 from orchestrator.spec import validate
+from orchestrator.spec_schema import schema
 from orchestrator.spec_values import known_tasks
 from orchestrator.specfile import load
 from worker.errors import UserError
@@ -168,18 +169,30 @@ from worker.tasks.config import TaskConfig, reward_weights
 class ReachConfig(TaskConfig):
     reach: float = 0.5
     rewards: Mapping[str, float] = reward_weights(near=1.0)
+
+class Thing: ...
+
+@dataclass(frozen=True)
+class CarelessConfig(ReachConfig):
+    thing: Thing = Thing()
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.reach > 1.0:
+            raise KeyError("reach")
 """
 
 
 @pytest.fixture
 def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An installed package with two tasks, of which one has a configuration that can't be imported."""
+    """An installed package with three tasks: one is fine, one's configuration can't be imported, one's has a defect."""
     (tmp_path / "reach_config.py").write_text(REACH)
     (tmp_path / "reach-1.0.dist-info").mkdir()
     (tmp_path / "reach-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: reach\nVersion: 1.0\n")
     (tmp_path / "reach-1.0.dist-info" / "entry_points.txt").write_text(
-        "[muster.tasks]\nReach = reach_task:Reach\nBroken = reach_task:Broken\n"
+        "[muster.tasks]\nReach = reach_task:Reach\nBroken = reach_task:Broken\nCareless = reach_task:Careless\n"
         "[muster.task_settings]\nReach = reach_config:ReachConfig\nBroken = no_such_module:BrokenConfig\n"
+        "Careless = reach_config:CarelessConfig\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
 
@@ -200,5 +213,12 @@ def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() 
 @pytest.mark.usefixtures("reach")
 def test_what_can_not_be_checked_here_is_left_to_the_rank() -> None:
     submit("Broken", {"anything": 1})
+    submit("Careless", {"reach": 2})
     submit("job_specs.my_task:Pendulum", {"anything": 1})
     submit("Ant", {})
+
+
+@pytest.mark.usefixtures("reach")
+def test_the_json_schema_has_the_installed_tasks_that_json_can_describe() -> None:
+    described = {each["if"]["properties"]["task"]["const"] for each in schema()["$defs"]["Train"]["allOf"]}
+    assert described == {"Ant", "Cartpole", "CartpolePixels", "Humanoid", "Quadruped", "Reach"}
