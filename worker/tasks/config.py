@@ -239,7 +239,9 @@ class TaskConfig(_Common):
         known = default_rewards(type(self))
         for name in self.rewards:
             if name not in known:
-                raise Refused(("rewards", name), f"{type(self).__name__} has no term {name!r}; {nearest(name, known)}")
+                raise Refused(
+                    ("rewards", name), f"{type(self).__name__} has no term {shown(name)}; {nearest(name, known)}"
+                )
         for name, points in self.curriculum.items():
             if name != "level" and name not in known:
                 raise Refused(("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}")
