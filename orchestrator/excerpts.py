@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import reprlib
+from shared_store.wording import shown as shown
 
 LONGEST_REASON = 1024
 """Characters of a status reason."""
@@ -17,11 +17,3 @@ def excerpt(text: str, most: int) -> str:
         return text
     kept = max(0, most - len(_LEFT_OUT.format(len(text))))
     return text[:kept] + _LEFT_OUT.format(len(text) - kept)
-
-
-def shown(value: object, most: int = 60) -> str:
-    """``repr(value)`` in about ``most`` characters, at a cost that does not grow with the value."""
-    brief = reprlib.Repr()
-    brief.maxlevel, brief.maxstring, brief.maxother, brief.maxlong = 3, most, most, most
-    text = repr(value[:most]) if isinstance(value, str) else brief.repr(value)
-    return text if len(text) <= most else text[: most - 3] + "…"

@@ -1,7 +1,10 @@
-"""What the installed algorithms accept: their settings classes, which the installation names (entry-point group ``muster.settings``).
+"""What the installed algorithms and tasks accept: classes that the installation names and that are imported without torch.
 
-They are pydantic dataclasses that are imported without torch. A job's YAML gives some of the fields; the others are the task's own,
-which only the rank knows. So each field is checked by itself here, and all of them together by the rank.
+Algorithms (entry-point group ``muster.settings``): pydantic dataclasses. A job's YAML gives some of the fields; the others are the
+task's own, which only the rank knows. So each field is checked by itself here, and all of them together by the rank.
+
+Tasks (entry-point group ``muster.task_settings``): the class of a task's whole configuration, by the name of the task. It has all
+defaults, so that it is made here as the rank will make it.
 """
 
 from __future__ import annotations
@@ -25,6 +28,21 @@ def settings_classes() -> dict[str, Any]:
         if isinstance(loaded, type) and is_pydantic_dataclass(loaded):
             found[entry.name] = loaded
     return found
+
+
+def task_config(task: str) -> Any | None:
+    """The class of an installed task's configuration (``worker.tasks.config.TaskConfig``), imported when it is asked for.
+
+    None of a task that names none, that is not installed (``module:Class``), or whose class can't be imported: its rank checks.
+    """
+    for entry in entry_points(group="muster.task_settings", name=task):
+        try:
+            loaded = entry.load()
+        except Exception:
+            continue
+        if hasattr(loaded, "problem_with"):
+            return loaded
+    return None
 
 
 def section_of(name: str, settings: Any, base: type[BaseModel]) -> type[BaseModel]:

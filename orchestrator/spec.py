@@ -7,16 +7,13 @@ job model. It is carried whole in the definition's environment, so that a run ca
 from __future__ import annotations
 
 import difflib
-import math
 import re
 from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
@@ -27,128 +24,26 @@ from pydantic import (
 
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
-from orchestrator.settings import section_of, settings_classes, train_section
-from shared_store.layout import NAME
+from orchestrator.settings import section_of, settings_classes, task_config, train_section
+from orchestrator.spec_values import (
+    Argument,
+    Duration,
+    Environment,
+    JobName,
+    Memory,
+    RunName,
+    Settings,
+    Size,
+    TaskName,
+)
 from shared_store.log_files import LEAST_LIMIT, LIMIT
+from shared_store.wording import explain, kind_of
 
 KINDS = ("train", "evaluate", "export", "command")
 """What a job can do: exactly one of these keys is in a spec."""
 
-_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
-_BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-
-
 LONGEST_CHANGES = 24 << 10
 """Characters of all ``--set`` assignments together: as many as a job definition has."""
-
-
-def _duration(value: object) -> object:
-    """``90s``, ``45m``, ``2h``, ``1d`` or a number of seconds → seconds."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd])", value.strip())
-        if not match:
-            raise ValueError("expected a duration such as 90s, 45m, 2h or 1d")
-        return float(match[1]) * _UNITS[match[2]]
-    return value
-
-
-def seconds_of(option: str, text: str | None) -> float | None:
-    """Seconds of an option such as ``--retention 90d``. Raises SpecError."""
-    if text is None:
-        return None
-    try:
-        return float(str(_duration(text)))
-    except ValueError as error:
-        raise SpecError(f"{option} {text}: {error}") from None
-
-
-def _mebibytes(value: object) -> object:
-    """``512MiB``, ``4GiB`` or a number of MiB → whole MiB."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
-        if not match:
-            raise ValueError("expected an amount of memory such as 512MiB or 4GiB")
-        return int(float(match[1]) * _BYTES[match[2]] / 2**20)
-    return value
-
-
-def _bytes(value: object) -> object:
-    """``64MiB``, ``1GiB`` or a number of bytes → whole bytes."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
-        if not match:
-            raise ValueError("expected a size such as 64MiB or 1GiB")
-        return int(float(match[1]) * _BYTES[match[2]])
-    return value
-
-
-def _run_name(value: str) -> str:
-    if not NAME.fullmatch(value):
-        raise ValueError("expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128")
-    return value
-
-
-def _job_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}", value):
-        raise ValueError("expected letters, digits, '_' and '-', starting with a letter or digit, at most 100")
-    return value
-
-
-def _task_name(value: str) -> str:
-    known = known_tasks()
-    if ":" in value or value in known:
-        return value
-    nearest = difflib.get_close_matches(value, known, 1, cutoff=0.4)
-    hint = f"; did you mean {nearest[0]}?" if nearest else ""
-    raise ValueError(f"no task is called {shown(value)}{hint} (known: {', '.join(known)}; your own: module:Class)")
-
-
-def _environment(value: dict[str, str]) -> dict[str, str]:
-    for name, text in value.items():
-        if name.startswith(("AWS_BATCH", "MUSTER_")):
-            raise ValueError(
-                f"{excerpt(name, 60)} is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
-            )
-        if not name or "=" in name or "\0" in name + text:
-            raise ValueError(f"{shown(name)} can't be set: a name has no '=', and neither name nor value a zero byte")
-    return value
-
-
-def _argument(value: str) -> str:
-    if "\0" in value:
-        raise ValueError("expected a text without a zero byte")
-    return value
-
-
-def _finite(value: dict[str, Any]) -> dict[str, Any]:
-    """The spec travels as JSON, which has no infinity."""
-    left: list[object] = [value]
-    while left:
-        each = left.pop()
-        if isinstance(each, float) and not math.isfinite(each):
-            raise ValueError(f"expected finite numbers, found {each}")
-        left += each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
-    return value
-
-
-def _algorithm_name(value: str) -> str:
-    known = list(ALGORITHMS)
-    if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
-        return value
-    nearest = difflib.get_close_matches(value, known, 1)
-    hint = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(known)}, and module:Class of your own"
-    raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
-
-
-def known_tasks() -> list[str]:
-    """Names of the installed tasks, from the entry-point group ``muster.tasks``; nothing is imported."""
-    return sorted({entry.name for entry in entry_points(group="muster.tasks")})
-
-
-Duration = Annotated[float, BeforeValidator(_duration)]
-Memory = Annotated[int, BeforeValidator(_mebibytes)]
-Size = Annotated[int, BeforeValidator(_bytes)]
-RunName = Annotated[str, AfterValidator(_run_name)]
 
 
 class _Section(BaseModel):
@@ -189,22 +84,27 @@ ALGORITHMS = settings_classes()
 """The settings class of each installed algorithm."""
 
 
+def _algorithm_name(value: str) -> str:
+    known = list(ALGORITHMS)
+    if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
+        return value
+    nearest = difflib.get_close_matches(value, known, 1)
+    hint = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(known)}, and module:Class of your own"
+    raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
+
+
 class _Train(_Section):
     """Train a policy."""
 
-    task: Annotated[str, AfterValidator(_task_name)] = Field(description="name of a task, or module:Class")
+    task: TaskName = Field(description="name of a task, or module:Class")
     worlds: int = Field(ge=1, description="simulated worlds of each rank")
     iterations: int = Field(ge=1)
     seed: int = Field(default=1, ge=0, lt=2**31)
     algorithm: Annotated[str, AfterValidator(_algorithm_name)] = Field(
         default="ppo", description="what learns: a name, or module:Class of your own; its settings stand under its name"
     )
-    settings: Annotated[dict[str, Any], AfterValidator(_finite)] = Field(
-        default_factory=dict, description="of an algorithm of your own"
-    )
-    config: Annotated[dict[str, Any], AfterValidator(_finite)] = Field(
-        default_factory=dict, description="overrides of the task's own configuration"
-    )
+    settings: Settings = Field(default_factory=dict, description="of an algorithm of your own")
+    config: Settings = Field(default_factory=dict, description="overrides of the task's own configuration")
 
     @model_validator(mode="after")
     def _of_one_algorithm(self) -> _Train:
@@ -278,7 +178,7 @@ class Retry(_Section):
 class Spec(_Section):
     """One job."""
 
-    name: Annotated[str, AfterValidator(_job_name)]
+    name: JobName
     queue: str = "default"
     share: Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")] | None = Field(
         default=None, description="share identifier, in a queue with a fair-share policy"
@@ -292,10 +192,10 @@ class Spec(_Section):
     train: Train | None = None
     evaluate: Evaluate | None = None
     export: Export | None = None
-    command: list[Annotated[str, AfterValidator(_argument)]] | None = Field(
+    command: list[Argument] | None = Field(
         default=None, min_length=1, description="program and arguments, run on every node"
     )
-    environment: Annotated[dict[str, str], AfterValidator(_environment)] = Field(default_factory=dict)
+    environment: Environment = Field(default_factory=dict)
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
     logs: Logs = Field(default_factory=Logs)
@@ -337,19 +237,29 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
         SpecError: One line naming the file, line and key, what was expected, and the nearest valid name.
     """
     if not isinstance(value, dict):
-        raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {_kind_of(value)}")
+        raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {kind_of(value)}")
     try:
-        return Spec.model_validate(value)
+        spec = Spec.model_validate(value)
     except ValidationError as error:
         problems = error.errors(include_url=False)
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         # a misspelt key comes before the one that is missing for it: it has a line, and a nearest name
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
         path = tuple(part for part in first["loc"] if isinstance(part, str | int))
-        line = _line_of(path, lines or {})
-        where = "--set" if line == 0 else f"{source}:{line}" if line else source
-        key = ".".join(str(part) for part in path)
-        raise SpecError(f"{where}: {f'{key}: ' if key else ''}{_explain(first, path)}{more}") from None
+        raise SpecError(f"{_place(path, source, lines)}{_explain(first, path)}{more}") from None
+    if spec.train and (problem := _problem_of(spec.train)):
+        path, words = problem
+        raise SpecError(f"{_place(('train', 'config', *path), source, lines)}{words}")
+    return spec
+
+
+def _problem_of(train: _Train) -> tuple[tuple[str | int, ...], str] | None:
+    """What is wrong with the overrides of a task's configuration: the key path and the words; a task that is not installed says it on its rank."""
+    kind = task_config(train.task) if train.config else None
+    try:
+        return kind.problem_with(train.config) if kind else None
+    except Exception:  # a defect of somebody's class: its rank shows the traceback
+        return None
 
 
 def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
@@ -384,44 +294,15 @@ def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[st
     return result
 
 
-_EXPECTED = {
-    "missing": "is required",
-    "int_type": "expected a whole number",
-    "int_from_float": "expected a whole number",
-    "float_type": "expected a number",
-    "finite_number": "expected a finite number",
-    "string_type": "expected a text",
-    "list_type": "expected a list",
-    "tuple_type": "expected a list",
-    "dict_type": "expected a mapping",
-    "bool_type": "expected true or false",
-    "model_type": "expected a mapping",
-}
-
-
 def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
-    kind, found = problem["type"], problem.get("input")
-    if kind == "extra_forbidden":
+    if problem["type"] == "extra_forbidden":
         valid, algorithm = _keys_at(path[:-1]), ALGORITHMS.get(str(path[-2])) if len(path) == 3 else None
         if other := getattr(algorithm, "elsewhere", {}).get(str(path[-1])):
             return f"{path[-2]} has no such setting; {other}"
         nearest = difflib.get_close_matches(str(path[-1]), valid, 1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}?" if nearest else f"valid here: {', '.join(valid)}"
         return f"unknown key; {hint}"
-    if kind == "missing":
-        return "is required"
-    if kind == "value_error":
-        text = str(problem["ctx"]["error"])
-        return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {shown(found)}"
-    if kind == "literal_error":
-        return f"expected {problem['ctx']['expected']}, found {shown(found)}"
-    if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
-        written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
-        return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
-    if kind in _EXPECTED:
-        return f"{_EXPECTED[kind]}, found {_kind_of(found)}"
-    message = str(problem["msg"])
-    return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
+    return explain(problem)
 
 
 def _keys_at(path: tuple[str | int, ...]) -> list[str]:
@@ -436,21 +317,16 @@ def _keys_at(path: tuple[str | int, ...]) -> list[str]:
     return list(model.model_fields)
 
 
+def _place(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
+    """File, line and key of an error, with what stands between them and its words."""
+    line = _line_of(path, lines or {})
+    where = "--set" if line == 0 else f"{source}:{line}" if line else source
+    key = ".".join(str(part) for part in path)
+    return f"{where}: {key}: " if key else f"{where}: "
+
+
 def _line_of(path: tuple[str | int, ...], lines: Mapping[tuple[str | int, ...], int]) -> int | None:
     for end in range(len(path), 0, -1):
         if path[:end] in lines:
             return lines[path[:end]]
     return None
-
-
-def _kind_of(value: object) -> str:
-    names = {
-        dict: "a mapping",
-        list: "a list",
-        str: "a text",
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-    }
-    what = f" ({shown(value)})" if isinstance(value, str | int | float) else ""
-    return "nothing" if value is None else names.get(type(value), type(value).__name__) + what

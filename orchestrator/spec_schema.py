@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.spec import ALGORITHMS, Spec, known_tasks
+from pydantic import PydanticUserError, TypeAdapter
+
+from orchestrator.settings import task_config
+from orchestrator.spec import ALGORITHMS, Spec
+from orchestrator.spec_values import known_tasks
 
 
 def schema() -> dict[str, Any]:
@@ -19,6 +23,22 @@ def schema() -> dict[str, Any]:
     definitions["Logs"]["properties"]["limit"] |= {**text, "default": "1GiB"}
     document["properties"]["stall_timeout"] = {**text, "default": "5m", "description": "of one training iteration"}
     document["properties"]["timeout"] = {**text, "description": "of each attempt, such as 2h"}
+    _add_tasks(definitions)
     document["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     document["title"] = "Muster job"
     return document
+
+
+def _add_tasks(definitions: dict[str, Any]) -> None:
+    """What ``train.config`` may hold of each installed task that says so."""
+    definitions["Train"]["allOf"] = []
+    for task in known_tasks():
+        if (kind := task_config(task)) is None:
+            continue
+        try:
+            config = TypeAdapter(kind).json_schema(ref_template=f"#/$defs/{task}_{{model}}")
+        except PydanticUserError:  # a type of somebody's class that JSON does not have
+            continue
+        definitions |= {f"{task}_{name}": each for name, each in config.pop("$defs", {}).items()}
+        condition = {"properties": {"task": {"const": task}}, "required": ["task"]}
+        definitions["Train"]["allOf"].append({"if": condition, "then": {"properties": {"config": config}}})

@@ -21,7 +21,7 @@ from orchestrator.client import Client
 from orchestrator.disk import DEFAULT, MinFree
 from orchestrator.errors import NotServing, ServerError, SpecError, Unreachable
 from orchestrator.home import local_url, muster_home
-from orchestrator.spec import seconds_of
+from orchestrator.spec_values import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 EngineOption = Annotated[

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 import faulthandler
 import gc
 import json
@@ -109,60 +107,18 @@ class Job:
 def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
     """``task``'s configuration with the overrides of a ``train`` section (``config``).
 
-    Raises UserError for a key that does not exist or a value of another type, naming both.
+    Raises UserError for a key that does not exist or a value that can't be: in the words in which a submission refuses it.
     """
-    with user_errors(f"task {task.__name__}: its own configuration"):
-        config = task.config_type()
-    return _override(config, section.get("config") or {}, "config")
+    from worker.tasks.overrides import Refused, configured
 
-
-def _override(config: Any, values: Mapping[str, Any], where: str) -> Any:
-    # an algorithm's settings stand in a section of their own
-    known = {
-        f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name not in ("ppo", "sac", "rsl_rl")
-    }
-    # settings that are a number, or a number for each name
-    by_name = {f.name for f in dataclasses.fields(config) if f.metadata.get("by_name")}
-    changes: dict[str, Any] = {}
-    for key, value in values.items():
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(known))}"
-            raise UserError(f"{where}.{key}: {type(config).__name__} has no such key; {hint}")
-        if key not in by_name:
-            changes[key] = _as_type_of(known[key], value, f"{where}.{key}")
-        elif isinstance(value, Mapping):
-            changes[key] = {name: _as_type_of(0.0, each, f"{where}.{key}.{name}") for name, each in value.items()}
-        else:
-            changes[key] = _as_type_of(0.0, value, f"{where}.{key}")
-    with user_errors(where):
-        return dataclasses.replace(config, **changes)
-
-
-def _as_type_of(default: Any, value: Any, where: str) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if default is None:
-        return value
-    if isinstance(default, tuple) and isinstance(value, list | tuple):
-        return tuple(_as_type_of(default[0], item, where) for item in value) if default else tuple(value)
-    if dataclasses.is_dataclass(default):
-        if not isinstance(value, Mapping):
-            raise UserError(
-                f"{where}: expected a mapping of keys such as {dataclasses.fields(default)[0].name}; got {value!r}"
-            )
-        return _override(default, value, where)
-    if isinstance(default, Mapping):
-        if not isinstance(value, Mapping):
-            keys = f" of {', '.join(default)}" if default else ""
-            raise UserError(f"{where}: expected a mapping{keys}; got {value!r}")
-        return value
-    if isinstance(default, float) and not isinstance(default, bool) and number:
-        return float(value)
-    if type(value) is type(default):
-        return value
-    if isinstance(default, tuple):
-        raise UserError(f"{where}: expected a list, as in {list(default)}; got {value!r}")
-    raise UserError(f"{where}: expected {type(default).__name__}, as in {default!r}; got {value!r}")
+    try:
+        configured(task.config_type, {})
+    except Refused as refused:
+        raise UserError(f"task {task.__name__}: its own configuration: {refused}") from refused
+    try:
+        return configured(task.config_type, section.get("config") or {})
+    except Refused as refused:
+        raise UserError(": ".join((".".join(map(str, ("train", "config", *refused.path))), refused.words))) from refused
 
 
 def end_startup() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,6 +10,7 @@ from newton.sensors import SensorCamera
 
 from worker.simulation.episodes import STEP, EpisodeArrays, numbered_stream
 from worker.simulation.worlds import Worlds
+from worker.tasks.configs.camera import CameraConfig
 
 if TYPE_CHECKING:
     from worker.tasks.config import Randomization
@@ -22,48 +21,6 @@ _SKY = 0x00D0B090
 """What the camera sees where there is nothing: packed as alpha, blue, green, red."""
 _STREAM = wp.constant(-100)
 """The scene is drawn from this random stream and below, the physics from those above it."""
-
-
-@dataclass(frozen=True)
-class CameraConfig:
-    """Where the camera of a world stands and what an image is.
-
-    Raises:
-        ValueError: A size is not positive, or the camera stands where it looks to.
-    """
-
-    width: int = 64
-    """Width of an image [px]."""
-    height: int = 64
-    """Height of an image [px]."""
-    position: tuple[float, float, float] = (0.0, -3.0, 1.0)
-    """Where it stands in its world [m]."""
-    target: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """The point in the middle of the image [m]."""
-    fov: float = 0.9
-    """Vertical field of view [rad]."""
-    frames: int = 2
-    """Images of one observation: the present one and those of the control steps before, since one alone shows no velocity."""
-    samples: int = 1
-    """Rays of each pixel; with 4 or more, edges that move by less than a pixel are seen to move."""
-
-    def __post_init__(self) -> None:
-        for name, most in (("width", 1024), ("height", 1024), ("frames", 16), ("samples", 64)):
-            if not 1 <= getattr(self, name) <= most:
-                raise ValueError(f"camera.{name}: expected 1 to {most}, got {getattr(self, name)}")
-        if not 0.0 < self.fov < math.pi:
-            raise ValueError(f"camera.fov: expected an angle between 0 and pi [rad], got {self.fov}")
-        for name in ("position", "target"):
-            place = getattr(self, name)
-            if len(place) != 3 or not all(map(math.isfinite, place)):
-                raise ValueError(f"camera.{name}: expected [x, y, z], got {list(place)}")
-        if math.dist(self.position, self.target) < 1e-6:
-            raise ValueError(f"camera.target: the camera stands there, at {list(self.position)}; choose another point")
-
-    @property
-    def channels(self) -> int:
-        """Channels of one observation: red, green and blue of each frame, the present one first."""
-        return 3 * self.frames
 
 
 @wp.kernel

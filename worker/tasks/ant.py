@@ -3,29 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
-from worker.tasks.config import reward_weights
-from worker.tasks.running import Running, RunningConfig, observation_names
+from worker.tasks.configs.running import AntConfig
+from worker.tasks.running import Running, observation_names
 
 JOINT_NAMES = tuple(f"{part}_{leg}" for leg in range(1, 5) for part in ("hip", "ankle"))
 """The model file's hinges in the order of the joint coordinates."""
-
-
-@dataclass(frozen=True)
-class AntConfig(RunningConfig):
-    """Run fast, straight and upright; do not drop the torso. What the rewards are: :class:`RunningConfig`."""
-
-    fall_height: float = 0.31
-    """Height of the torso under which the episode ends [m]."""
-    start_height: float = 0.62
-    """Height of the torso at the start [m]: the feet touch the ground within a few steps."""
-    velocity_scale: float = 0.2
-    """Factor on joint velocities in observations and in the energy cost [s/rad]."""
-    rewards: Mapping[str, float] = reward_weights(
-        forward=1.0, heading=0.5, up=0.1, alive=0.5, action=-0.005, energy=-0.05, limits=-0.1, fall=-2.0
-    )
 
 
 class Ant(Running):

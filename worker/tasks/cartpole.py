@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
 import newton
 import warp as wp
 
-from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     STEP,
     EpisodeArrays,
@@ -22,45 +19,11 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import WorldArrays, is_sound
-from worker.tasks.config import TaskConfig, reward_weights
+from worker.tasks.configs.cartpole import CartpoleConfig
 from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 
 wp.set_module_options({"enable_backward": False})
-
-
-@dataclass(frozen=True)
-class CartpoleConfig(TaskConfig):
-    """The cart may not leave the rail and the pole may not fall past ``angle_limit``."""
-
-    control_hz: float = 60.0
-    """Control steps per simulated second [Hz]."""
-    substeps: int = 1
-    """Physics steps of one control step: without contacts one step of 1/60 s is accurate enough."""
-    episode_seconds: float = 5.0
-    """Simulated time after which the clock ends an episode [s]."""
-    cart_limit: float = 2.4
-    """Distance of the cart from the middle of the rail at which the episode ends [m]."""
-    angle_limit: float = 0.4
-    """Tilt of the pole at which the episode ends [rad]."""
-    start_position: float = 0.5
-    """A start is uniform in +- this distance from the middle [m]."""
-    start_angle: float = 0.15
-    """A start is uniform in +- this tilt [rad]."""
-    start_velocity: float = 0.3
-    """A start is uniform in +- this velocity of the cart [m/s] and of the pole [rad/s]."""
-    rewards: Mapping[str, float] = reward_weights(
-        alive=0.1, angle=-0.1, position=-0.05, velocity=-0.05, effort=-0.001, fall=-2.0
-    )
-    """Weights of: each step that does not end in a fall; the squared tilt [1/rad^2]; the squared distance from the middle
-    [1/m^2]; the cart's squared velocity [s^2/m^2] (a cart that drifts meets the end of the rail too late to learn why); the
-    squared action; leaving the rail or dropping the pole, once."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01
-        )
-    )
-    """How the task is trained: small, since the task is easy and often run on a processor."""
 
 
 @wp.struct

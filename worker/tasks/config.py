@@ -1,24 +1,64 @@
-"""What can be set of a task from its job's YAML: times, reward weights, training."""
+"""What can be set of a task from its job's YAML: times, reward weights, training. Imported without torch, Warp and Newton."""
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import field, fields
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, WrapValidator
+from pydantic.dataclasses import dataclass
+
+from shared_store.wording import shown
 from worker.learning.ppo.settings import PPOConfig
+from worker.tasks.overrides import TRAINING, Refused, configured, expecting, from_mapping, nearest
+
+STRICT = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
+"""How the classes of configurations check: no unknown field, and no value of another type."""
 
 FACTORS = ("mass", "friction", "damping", "gains", "gravity")
 """Factors on the physics of each world."""
-_SCALARS = ("push_interval", "push_velocity")
 _SCENE = ("camera_position", "camera_angle", "colors")
 
 
-@dataclass(frozen=True)
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError
+    return ends
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Range = Annotated[tuple[Finite, Finite], Field(strict=False), AfterValidator(_ordered), expecting("[least, greatest]")]
+Factors = Annotated[
+    tuple[Amount, Amount],
+    Field(strict=False),
+    AfterValidator(_ordered),
+    expecting("[least, greatest], two factors of 0 or more"),
+]
+PositiveFactors = Annotated[
+    tuple[_Factor, _Factor],
+    Field(strict=False),
+    AfterValidator(_ordered),
+    expecting("[least, greatest], two factors above 0"),
+]
+
+
+def _check_noise(value: Any, inner: Callable[[Any], Any]) -> Any:
+    for name, amount in (value if isinstance(value, Mapping) else {None: value}).items():
+        if not _is_finite(amount) or amount < 0.0:
+            where = () if name is None else (name,)
+            raise Refused(where, f"expected a number of 0 or more, found {shown(amount)}")
+    return inner(value)
+
+
+@dataclass(frozen=True, config=STRICT)
 class Randomization:
     """How the worlds of a task differ from one another. Factors are uniform in ``[least, greatest]``, one for each world.
 
@@ -26,33 +66,33 @@ class Randomization:
         ValueError: A range is no range, or a number is out of range.
     """
 
-    mass: tuple[float, float] = (1.0, 1.0)
+    mass: PositiveFactors = (1.0, 1.0)
     """Factor on masses and inertias."""
-    friction: tuple[float, float] = (1.0, 1.0)
+    friction: Factors = (1.0, 1.0)
     """Factor on the friction of everything that touches."""
-    damping: tuple[float, float] = (1.0, 1.0)
+    damping: Factors = (1.0, 1.0)
     """Factor on the damping of the joints."""
-    gains: tuple[float, float] = (1.0, 1.0)
+    gains: Factors = (1.0, 1.0)
     """Factor on the strength of the actuators: a motor's torque, a servo's stiffness and damping."""
-    gravity: tuple[float, float] = (1.0, 1.0)
+    gravity: Factors = (1.0, 1.0)
     """Factor on gravity."""
-    push_interval: float = 0.0
+    push_interval: Amount = 0.0
     """Mean simulated time between two pushes of a world, which come at random [s]; 0: none."""
-    push_velocity: float = 0.0
+    push_velocity: Amount = 0.0
     """A push adds velocities uniform in +- this to the robot's, along the world's x and y [m/s]."""
-    observation_noise: float | Mapping[str, float] = field(default=0.0, metadata={"by_name": True})
+    observation_noise: Annotated[Amount | Mapping[str, Amount], WrapValidator(_check_noise)] = 0.0
     """Standard deviation of the normal noise on what is measured; the policy's last action and its command stay exact. A number: of
     each observation, as the policy sees it. A mapping: by name of the observation, with ``*`` for any letters, in the unit of the
     measured quantity [m, rad, m/s, rad/s]; where several names fit, the last one counts, and where none does there is no noise."""
-    camera_position: float = 0.0
+    camera_position: Amount = 0.0
     """Each camera stands up to this far from its place, along each axis [m]."""
-    camera_angle: float = 0.0
+    camera_angle: Amount = 0.0
     """Each camera is turned up to this far about each of its axes [rad]."""
-    colors: float = 0.0
+    colors: Amount = 0.0
     """Red, green and blue of each shape differ by up to this from their usual value, of 1."""
-    light: tuple[float, float] = (1.0, 1.0)
+    light: Factors = (1.0, 1.0)
     """Factor on the brightness of what a camera sees."""
-    action_latency: int = 0
+    action_latency: Annotated[int, Field(ge=0, le=64)] = 0
     """Greatest number of control steps by which controls reach the actuators late; each episode draws its own, from 0."""
 
     @property
@@ -66,27 +106,6 @@ class Randomization:
         return bool(self.scene) or any(getattr(self, name) != (1.0, 1.0) for name in FACTORS)
 
     def __post_init__(self) -> None:
-        for name in (*FACTORS, "light"):
-            ends = getattr(self, name)
-            pair = isinstance(ends, list | tuple) and len(ends) == 2 and all(_is_finite(end) for end in ends)
-            if not pair or not 0.0 <= ends[0] <= ends[1] or (name == "mass" and ends[0] == 0.0):
-                least = "above 0" if name == "mass" else "of 0 or more"
-                shown = list(ends) if isinstance(ends, tuple) else ends
-                raise ValueError(f"{name}: expected [least, greatest], two factors {least}; got {shown!r}")
-            object.__setattr__(self, name, (float(ends[0]), float(ends[1])))
-        for name in (*_SCALARS, *_SCENE):
-            value = getattr(self, name)
-            if not _is_finite(value) or value < 0.0:
-                raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
-        noise = self.observation_noise
-        for name, value in (noise if isinstance(noise, Mapping) else {"": noise}).items():
-            if not _is_finite(value) or value < 0.0:
-                where = f"observation_noise.{name}" if name else "observation_noise"
-                raise ValueError(f"{where}: expected a number of 0 or more, got {value!r}")
-        if not isinstance(self.action_latency, int) or not 0 <= self.action_latency <= 64:
-            raise ValueError(
-                f"action_latency: expected a whole number of steps from 0 to 64, got {self.action_latency!r}"
-            )
         if bool(self.push_interval) != bool(self.push_velocity):
             raise ValueError("push_interval and push_velocity: give both, or none")
 
@@ -95,22 +114,21 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _check_curriculum(curriculum: Mapping[str, Any], terms: Mapping[str, float]) -> None:
-    if not isinstance(curriculum, Mapping):
-        raise ValueError(f"curriculum: expected a mapping from names to points, got {curriculum!r}")
-    for name, points in curriculum.items():
-        if name != "level" and name not in terms:
-            hint = _hint(name, ["level", *terms])
-            raise ValueError(f"curriculum: there is no {name!r}; {hint}there are level, {', '.join(terms)}")
-        shaped = isinstance(points, list | tuple) and points and all(isinstance(p, list | tuple) for p in points)
-        if not shaped or not all(len(point) == 2 and all(map(_is_finite, point)) for point in points):
-            raise ValueError(f"curriculum.{name}: expected points [iteration, value], got {points!r}")
-        if any(not float(point[0]).is_integer() or point[0] < 0 for point in points):
-            raise ValueError(f"curriculum.{name}: an iteration is a whole number from 0 up, got {points!r}")
-        if any(after[0] <= before[0] for before, after in itertools.pairwise(points)):
-            raise ValueError(f"curriculum.{name}: the iterations of its points must grow, got {points!r}")
-        if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):
-            raise ValueError(f"curriculum.level: expected levels from 0 to 1, got {points!r}")
+def _check_points(points: Any, inner: Callable[[Any], Any]) -> Any:
+    inner(points)
+    if any(not float(point[0]).is_integer() or point[0] < 0 for point in points):
+        raise Refused((), f"an iteration is a whole number from 0 up, found {shown(points)}")
+    if any(after[0] <= before[0] for before, after in itertools.pairwise(points)):
+        raise Refused((), f"the iterations of its points must grow, found {shown(points)}")
+    return points
+
+
+Points = Annotated[
+    Sequence[Annotated[tuple[Finite, Finite], Field(strict=False)]],
+    Field(min_length=1),
+    expecting("points [iteration, value]"),
+    WrapValidator(_check_points),
+]
 
 
 def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
@@ -119,11 +137,6 @@ def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
         if before[0] <= iteration < after[0]:
             return before[1] + (after[1] - before[1]) * (iteration - before[0]) / (after[0] - before[0])
     return points[0][1] if iteration < points[0][0] else points[-1][1]
-
-
-def _hint(name: object, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"did you mean {near[0]}? " if near else ""
 
 
 def nested(where: str, kind: type[Any], value: Any) -> Any:
@@ -156,48 +169,89 @@ def default_rewards(config_type: type[TaskConfig]) -> Mapping[str, float]:
     return weights
 
 
-@dataclass(frozen=True)
-class TaskConfig:
-    """What every task has; a task adds its own fields.
+@dataclass(frozen=True, config=STRICT)
+class _Common:
+    """The fields of :class:`TaskConfig`, each checked by itself."""
 
-    Raises:
-        ValueError: ``rewards`` names a term that the task does not have, a weight is not a finite number, or ``randomize``
-            is not a mapping of its fields.
-    """
-
-    control_hz: float = 60.0
+    control_hz: Positive = 60.0
     """Control steps per simulated second [Hz]."""
-    substeps: int = 2
+    substeps: Count = 2
     """Physics steps of one control step."""
-    episode_seconds: float = 10.0
+    episode_seconds: Positive = 10.0
     """Simulated time after which the clock ends an episode [s]."""
-    rewards: Mapping[str, float] = reward_weights()
+    rewards: Mapping[str, Finite] = reward_weights()
     """Weight of each reward term. Who gives some names changes those; the others keep the task's defaults."""
-    randomize: Randomization = Randomization()
+    randomize: Annotated[Randomization, from_mapping(Randomization)] = Randomization()
     """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
-    curriculum: Mapping[str, Sequence[Sequence[float]]] = field(default_factory=lambda: MappingProxyType({}))
+    curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
     """What changes in the course of training: points ``[iteration, value]`` in the order of the iterations, between which the
     value changes in proportion, and outside of which it stays. By the name of a reward term: its weight; ``level``: how hard the
     task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
-    fastest: float = 1000.0
+    fastest: Positive = 1000.0
     """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""
-    nan_limit: float = 0.1
+    nan_limit: Amount = 0.1
     """Training stops when worlds that failed had to be reset more often in one iteration than this, times the number of worlds."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How the task is trained."""
 
+
+@dataclass(frozen=True, config=STRICT)
+class TaskConfig(_Common):
+    """What every task has; a task adds its own fields.
+
+    A subclass is a dataclass of pydantic's with ``config=STRICT``, or a plain one, whose own fields are checked only where they come
+    from a job's YAML.
+
+    Raises:
+        ValueError: A value has the wrong type or is out of range, or ``rewards`` or ``curriculum`` names a term that the task does
+            not have.
+    """
+
+    @classmethod
+    def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
+        """What is wrong with a job's ``train.config``: keys to the value, and one line; None where nothing is."""
+        try:
+            configured(cls, overrides)
+        except Refused as refused:
+            return refused.path, refused.words
+        return None
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """JSON Schema of ``train.config``: the names of the terms, without what stands in sections of its own."""
+        document: dict[str, Any] = handler.resolve_ref_schema(handler(core_schema))
+        properties, known = document["properties"], default_rewards(cls)
+        for name in TRAINING:
+            properties.pop(name, None)
+        points = TypeAdapter(Points).json_schema()
+        for name, terms in (
+            ("rewards", {term: {"type": "number", "default": weight} for term, weight in known.items()}),
+            ("curriculum", dict.fromkeys(("level", *known), points)),
+        ):
+            properties[name] = {"type": "object", "properties": terms, "additionalProperties": False}
+        return document
+
     def __post_init__(self) -> None:
+        # once more, without the types that a subclass gives these fields; of a plain dataclass nothing has been checked
+        checked = _Common(**{item.name: getattr(self, item.name) for item in fields(_Common)})
+        for item in fields(_Common):
+            object.__setattr__(self, item.name, getattr(checked, item.name))
         known = default_rewards(type(self))
-        _check_curriculum(self.curriculum, known)
-        if not _is_finite(self.nan_limit) or self.nan_limit < 0.0:
-            raise ValueError(f"nan_limit: expected a share of 0 or more, got {self.nan_limit!r}")
-        for name, weight in self.rewards.items():
+        for name in self.rewards:
             if name not in known:
-                raise ValueError(
-                    f"rewards: {type(self).__name__} has no term {name!r}; {_hint(name, known)}its terms are {', '.join(known)}"
+                raise Refused(
+                    ("rewards", name), f"{type(self).__name__} has no term {shown(name)}; {nearest(name, known)}"
                 )
-            if not _is_finite(weight):
-                raise ValueError(f"rewards.{name}: expected a finite number as the weight, got {weight!r}")
+        for name, points in self.curriculum.items():
+            if name != "level" and name not in known:
+                raise Refused(("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}")
+            if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):
+                raise Refused(("curriculum", "level"), f"expected levels from 0 to 1, found {shown(points)}")
+        camera, scene = getattr(self, "camera", None), self.randomize.scene
+        if scene and camera is None:
+            raise Refused(("randomize", scene[0]), f"{type(self).__name__} has no camera that would see it")
+        if self.randomize.observation_noise and camera is not None:
+            raise Refused(("randomize", "observation_noise"), "it is for numbers, not for images; use light and colors")
         weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
-        object.__setattr__(self, "randomize", nested("randomize", Randomization, self.randomize))
+        object.__setattr__(self, "curriculum", MappingProxyType(dict(self.curriculum)))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
-from worker.tasks.config import reward_weights
-from worker.tasks.running import Running, RunningConfig, observation_names
+from worker.tasks.configs.running import HumanoidConfig
+from worker.tasks.running import Running, observation_names
 
 JOINT_NAMES = (
     *("abdomen_z", "abdomen_y", "abdomen_x"),
@@ -17,19 +15,6 @@ JOINT_NAMES = (
     *("left_shoulder1", "left_shoulder2", "left_elbow"),
 )
 """The model file's hinges in the order in which its bodies hold them, which is that of the joint coordinates."""
-
-
-@dataclass(frozen=True)
-class HumanoidConfig(RunningConfig):
-    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunningConfig`."""
-
-    fall_height: float = 0.8
-    """Height of the torso under which the episode ends [m]."""
-    start_height: float = 1.34
-    """Height of the torso at the start [m]: the feet are 5 cm above the ground."""
-    rewards: Mapping[str, float] = reward_weights(
-        forward=1.0, heading=0.5, up=0.1, alive=2.0, action=-0.01, energy=-0.05, limits=-0.25, fall=-1.0
-    )
 
 
 class Humanoid(Running):

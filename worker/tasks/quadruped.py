@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,7 +9,6 @@ import newton
 import numpy as np
 import warp as wp
 
-from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     ACTION_LIMIT,
     STEP,
@@ -25,7 +21,7 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
-from worker.tasks.config import TaskConfig, reward_weights
+from worker.tasks.configs.quadruped import QuadrupedConfig
 from worker.tasks.interface import Interface, Observation, servo
 from worker.tasks.task import Task
 
@@ -45,95 +41,6 @@ JOINT_NAMES = tuple(
     for leg in ("front_left", "front_right", "rear_left", "rear_right")
     for part in ("hip", "thigh", "knee")
 )
-
-
-@dataclass(frozen=True)
-class QuadrupedConfig(TaskConfig):
-    """Follow velocity commands, level and smoothly; do not touch the ground with the trunk.
-
-    Raises:
-        ValueError: A range of commands is no range, besides what :class:`TaskConfig` refuses.
-    """
-
-    control_hz: float = 50.0
-    """Control steps per simulated second [Hz]."""
-    substeps: int = 4
-    """Physics steps of one control step, each of 1/200 s."""
-    episode_seconds: float = 20.0
-    """Simulated time after which the clock ends an episode [s]."""
-    fastest: float = 100.0
-    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 40."""
-    action_scale: float = 0.5
-    """How far an action of 1 moves a joint's target from its standing angle [rad]."""
-    stand_hip: float = 0.0
-    """Standing angle of the hips [rad]."""
-    stand_thigh: float = 0.8
-    """Standing angle of the thighs [rad]."""
-    stand_knee: float = -1.6
-    """Standing angle of the knees [rad]: the feet are below the hips."""
-    start_height: float = 0.32
-    """Height of the trunk's middle at the start [m]: the feet are 5 mm above the ground."""
-    start_angle_noise: float = 0.1
-    """A start moves each joint uniformly within +- this angle [rad]."""
-    start_velocity_noise: float = 0.1
-    """A start gives the trunk and each joint a uniform velocity within +- this [m/s, rad/s]."""
-    tilt_limit: float = 1.0
-    """Angle between the trunk's upward axis and the vertical at which the episode ends [rad]."""
-    command_forward: tuple[float, float] = (-1.0, 1.0)
-    """Commanded velocities along the trunk's +x [m/s], uniform."""
-    command_left: tuple[float, float] = (-0.5, 0.5)
-    """Commanded velocities along the trunk's +y [m/s], uniform."""
-    command_turn: tuple[float, float] = (-1.0, 1.0)
-    """Commanded turning velocities about the trunk's +z [rad/s], uniform."""
-    command_stand: float = 0.1
-    """Share of the commands that ask to stand still instead."""
-    command_seconds: float = 5.0
-    """Simulated time for which a command holds [s]; an episode begins with a new one."""
-    velocity_scale: float = 0.05
-    """Factor on joint velocities in observations [s/rad]."""
-    rewards: Mapping[str, float] = reward_weights(
-        track_linear=2.0,
-        track_angular=1.0,
-        lin_vel_z=-2.0,
-        ang_vel_xy=-0.05,
-        orientation=-2.5,
-        torques=-1.0e-4,
-        action_rate=-0.01,
-        pose=-0.05,
-        limits=-5.0,
-        fall=-2.0,
-    )
-    """Weights of, per second: exp(-4 e^2) of the error e of the horizontal velocity [m/s]; exp(-4 e^2) of that of the turning
-    velocity [rad/s]; the squared vertical velocity [s^2/m^2]; the squared rolling and pitching velocities [s^2/rad^2]; the
-    squared horizontal part of the vertical in the trunk's frame; the sum of squared torques [1/(N m)^2]; the sum of squared
-    changes of the action; the sum of squared distances to the standing angles [1/rad^2]; the sum of distances into the last
-    twentieth at the ends of the joints' ranges [1/rad]. And, once: a fall, which must not be cheaper than the costs of the
-    first clumsy seconds."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=24,
-            hidden_sizes=(128, 128, 128),
-            activation="elu",
-            epochs=5,
-            minibatches=4,
-            learning_rate=1.0e-3,
-            desired_kl=0.01,
-            entropy_coef=0.005,
-            init_std=0.6,
-        )
-    )
-    """How the task is trained."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("command_forward", "command_left", "command_turn"):
-            ends = getattr(self, name)
-            if len(ends) != 2 or not -math.inf < ends[0] <= ends[1] < math.inf:
-                raise ValueError(f"{name}: expected [least, greatest], got {list(ends)}")
-        if not 0.0 <= self.command_stand <= 1.0:
-            raise ValueError(f"command_stand: expected a share from 0 to 1, got {self.command_stand}")
-        if self.command_seconds <= 0.0:
-            raise ValueError(f"command_seconds: expected a positive time in seconds, got {self.command_seconds}")
 
 
 @wp.struct

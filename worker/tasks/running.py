@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import newton
@@ -11,7 +10,6 @@ import newton.examples
 import numpy as np
 import warp as wp
 
-from worker.learning.ppo.settings import PPOConfig
 from worker.simulation.episodes import (
     STEP,
     EpisodeArrays,
@@ -23,7 +21,6 @@ from worker.simulation.episodes import (
     random_stream,
 )
 from worker.simulation.worlds import FIRST_COORDINATE, FIRST_DOF, WorldArrays, is_sound, root_rotation, root_velocities
-from worker.tasks.config import TaskConfig
 from worker.tasks.interface import Interface, Observation, motor
 from worker.tasks.task import Task
 
@@ -31,51 +28,6 @@ wp.set_module_options({"enable_backward": False})
 
 TORSO = wp.constant(11)
 """Observations of the torso; three of each joint follow them."""
-
-
-@dataclass(frozen=True)
-class RunningConfig(TaskConfig):
-    """Run fast, straight and upright; do not fall.
-
-    ``rewards`` weighs: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion below);
-    an upright torso (cosine to vertical above 0.93); each step that does not end in a fall; the sum of squared actions; the sum
-    over joints of |action x scaled joint velocity| x strength; the sum over joints of how far each is into the last hundredth at
-    an end of its range (0 to 1) x strength; a fall, which replaces every other term of that step. A joint's strength is its
-    motor's full torque over that of the strongest.
-    """
-
-    control_hz: float = 60.0
-    """Control steps per simulated second [Hz]."""
-    substeps: int = 2
-    """Physics steps of one control step, each of 1/120 s."""
-    episode_seconds: float = 16.0
-    """Simulated time after which the clock ends an episode [s]."""
-    fastest: float = 100.0
-    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 70."""
-    fall_height: float = 0.0
-    """Height of the torso under which the episode ends [m]."""
-    start_height: float = 1.0
-    """Height of the torso at the start [m]."""
-    start_angle_noise: float = 0.2
-    """A start moves each joint uniformly within +- this angle [rad], kept inside the joint's range."""
-    start_velocity_noise: float = 0.1
-    """A start gives each joint a uniform velocity within +- this [rad/s]."""
-    velocity_scale: float = 0.1
-    """Factor on joint velocities in observations and in the energy cost [s/rad]."""
-    angular_velocity_scale: float = 0.25
-    """Factor on the torso's angular velocity in observations [s/rad]."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=32,
-            hidden_sizes=(400, 200, 100),
-            activation="elu",
-            epochs=5,
-            minibatches=4,
-            learning_rate=5.0e-4,
-            desired_kl=0.01,
-        )
-    )
-    """How the task is trained."""
 
 
 @wp.struct

@@ -85,7 +85,8 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
     [
         ("train.task=Ant", ["train.task is 'Cartpole' and can't become 'Ant'"]),
         ("train.seed=9", ["train.seed is 1 and can't become 9"]),
-        ("train.config={force: 5.0}", ["train.config is {} and can't become {'force': 5.0}"]),
+        ("train.config={cart_limit: 5.0}", ["train.config is {} and can't become {'cart_limit': 5.0}"]),
+        ("train.config={cart_limt: 5.0}", ["train.config.cart_limt: CartpoleConfig has no such key; did you mean"]),
         ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is the task's own and can't become [8]", "has learnt"]),
         ("train.ppo.activation=relu", ["train.ppo.activation is the task's own and can't become 'relu'"]),
         ("train.ppo.init_std=0.5", ["train.ppo.init_std is the task's own and can't become 0.5", "has learnt"]),

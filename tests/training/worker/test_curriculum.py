@@ -57,15 +57,15 @@ def test_the_level_scales_the_quadrupeds_commands() -> None:
     [
         (
             {"forwards": [[0, 1.0]]},
-            "curriculum: there is no 'forwards'; did you mean forward? there are level, forward,",
+            "train.config.curriculum.forwards: there is no such term; did you mean forward?",
         ),
-        ({"forward": [[-1, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up, got [[-1, 1.0]]"),
+        ({"forward": [[-1, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up, found [[-1, 1.0]]"),
         ({"forward": [[2.5, 1.0]]}, "curriculum.forward: an iteration is a whole number from 0 up"),
-        ({"forward": 3}, "curriculum.forward: expected points [iteration, value], got 3"),
-        ({"forward": [[0, "x"]]}, "curriculum.forward: expected points [iteration, value], got [[0, 'x']]"),
+        ({"forward": 3}, "curriculum.forward: expected points [iteration, value], found 3"),
+        ({"forward": [[0, "x"]]}, "curriculum.forward: expected points [iteration, value], found [[0, 'x']]"),
         ({"forward": [[5, 1.0], [5, 2.0]]}, "curriculum.forward: the iterations of its points must grow"),
         ({"level": [[0, 2.0]]}, "curriculum.level: expected levels from 0 to 1"),
-        ([1], "config.curriculum: expected a mapping; got [1]"),
+        ([1], "train.config.curriculum: expected a mapping, found a list"),
     ],
 )
 def test_a_curriculum_that_cannot_be_is_refused_in_one_line(curriculum: Any, message: str) -> None:

@@ -224,7 +224,7 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
     [
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
         ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
-        ({"config": {"ppo": {}}}, "config.ppo: PointConfig has no such key"),
+        ({"config": {"ppo": {}}}, "train.config.ppo: not a key of PointConfig; settings of ppo stand under train.ppo"),
         ({"ppo": {"steps": 1.5}}, "ppo.steps: Input should be a valid integer, got 1.5"),
         ({"ppo": {"normalize_observations": 1}}, "ppo.normalize_observations: Input should be a valid boolean"),
         ({"ppo": {"learning_rate": "fast"}}, "ppo.learning_rate: Input should be a valid number, got 'fast'"),

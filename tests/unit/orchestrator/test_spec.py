@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.errors import SpecError
-from orchestrator.spec import Spec, known_tasks, override, validate
+from orchestrator.spec import Spec, override, validate
+from orchestrator.spec_values import known_tasks
 from orchestrator.specfile import load, read
 from worker.learning.ppo.settings import PPOConfig
 
@@ -401,7 +402,7 @@ def bomb(levels: int) -> str:
 
 
 def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> None:
-    train = "{task: Cartpole, worlds: 4, iterations: 2, config: {first: &c {size: 3}, second: {<<: *c}}}"
+    train = "{task: 'my:Task', worlds: 4, iterations: 2, config: {first: &c {size: 3}, second: {<<: *c}}}"
     (tmp_path / "job.yaml").write_text(f"name: a\ntrain: {train}\n")
     loaded = load(str(tmp_path / "job.yaml")).train
     assert loaded is not None and loaded.config == {"first": {"size": 3}, "second": {"size": 3}}

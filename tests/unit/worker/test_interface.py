@@ -209,11 +209,11 @@ def test_noise_is_given_by_name_in_the_unit_of_the_quantity() -> None:
         ({"command_turn": 0.1}, "config.randomize.observation_noise: no observation that is measured is called 'comm"),
         (
             {"*_velocity": -1.0},
-            "config.randomize: observation_noise.*_velocity: expected a number of 0 or more, got -1.0",
+            "train.config.randomize.observation_noise.*_velocity: expected a number of 0 or more, found -1.0",
         ),
         (
             {"*_velocity": "much"},
-            "config.randomize.observation_noise.*_velocity: expected float, as in 0.0; got 'much'",
+            "train.config.randomize.observation_noise.*_velocity: expected a number of 0 or more, found 'much'",
         ),
     ],
 )

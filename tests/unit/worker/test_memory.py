@@ -13,6 +13,7 @@ from worker.errors import UserError
 from worker.learning import memory
 from worker.learning.ppo.fused import PPO
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.config import Randomization
 
 HERE = Gang(Placement(), "cpu", None, ["here"])
 CONFIG = CartpoleConfig()
@@ -67,6 +68,10 @@ def test_an_allocation_that_fails_is_told_as_what_it_is(monkeypatch: pytest.Monk
 
 
 def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
-    refused = dataclasses.replace(CONFIG, substeps=0)
-    with pytest.raises(UserError, match="substeps is 0"), memory.within_memory(Cartpole, refused, LEARNER, 9000, HERE):
+    pushed = {"push_interval": 1.0, "push_velocity": 1.0}
+    refused = dataclasses.replace(CONFIG, randomize=Randomization(**pushed))
+    with (
+        pytest.raises(UserError, match="the robot is fixed"),
+        memory.within_memory(Cartpole, refused, LEARNER, 9000, HERE),
+    ):
         pytest.fail("nothing is to be built")

@@ -168,11 +168,11 @@ def test_random_ones_stay_finite_within_the_solvers_capacity(quadruped: Quadrupe
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"command_turn": [1.0, -1.0]}, "config: command_turn: expected [least, greatest], got [1.0, -1.0]"),
-        ({"command_turn": [1.0]}, "config: command_turn: expected [least, greatest], got [1.0]"),
-        ({"command_turn": [0.0, math.inf]}, "config: command_turn: expected [least, greatest], got [0.0, inf]"),
-        ({"command_stand": 2}, "config: command_stand: expected a share from 0 to 1, got 2.0"),
-        ({"command_seconds": 0}, "config: command_seconds: expected a positive time in seconds, got 0.0"),
+        ({"command_turn": [1.0, -1.0]}, "train.config.command_turn: expected [least, greatest], found [1.0, -1.0]"),
+        ({"command_turn": [1.0]}, "train.config.command_turn: expected [least, greatest], found [1.0]"),
+        ({"command_turn": [0.0, math.inf]}, "train.config.command_turn: expected [least, greatest], found [0.0, inf]"),
+        ({"command_stand": 2}, "train.config.command_stand: expected a value less than or equal to 1, found 2"),
+        ({"command_seconds": 0}, "train.config.command_seconds: expected a value greater than 0, found 0"),
     ],
 )
 def test_impossible_commands_are_refused_in_one_line(config: dict, message: str) -> None:

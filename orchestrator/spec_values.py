@@ -1,0 +1,124 @@
+"""Values of the job YAML: durations, sizes, names, and what is wrong with one."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from importlib.metadata import entry_points
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator
+
+from orchestrator.errors import SpecError
+from orchestrator.excerpts import excerpt, shown
+from shared_store.layout import NAME
+
+_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+_BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+def _duration(value: object) -> object:
+    """``90s``, ``45m``, ``2h``, ``1d`` or a number of seconds → seconds."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd])", value.strip())
+        if not match:
+            raise ValueError("expected a duration such as 90s, 45m, 2h or 1d")
+        return float(match[1]) * _UNITS[match[2]]
+    return value
+
+
+def seconds_of(option: str, text: str | None) -> float | None:
+    """Seconds of an option such as ``--retention 90d``. Raises SpecError."""
+    if text is None:
+        return None
+    try:
+        return float(str(_duration(text)))
+    except ValueError as error:
+        raise SpecError(f"{option} {text}: {error}") from None
+
+
+def _mebibytes(value: object) -> object:
+    """``512MiB``, ``4GiB`` or a number of MiB → whole MiB."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
+        if not match:
+            raise ValueError("expected an amount of memory such as 512MiB or 4GiB")
+        return int(float(match[1]) * _BYTES[match[2]] / 2**20)
+    return value
+
+
+def _bytes(value: object) -> object:
+    """``64MiB``, ``1GiB`` or a number of bytes → whole bytes."""
+    if isinstance(value, str):
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
+        if not match:
+            raise ValueError("expected a size such as 64MiB or 1GiB")
+        return int(float(match[1]) * _BYTES[match[2]])
+    return value
+
+
+def _run_name(value: str) -> str:
+    if not NAME.fullmatch(value):
+        raise ValueError("expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128")
+    return value
+
+
+def _job_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}", value):
+        raise ValueError("expected letters, digits, '_' and '-', starting with a letter or digit, at most 100")
+    return value
+
+
+def _task_name(value: str) -> str:
+    known = known_tasks()
+    if ":" in value or value in known:
+        return value
+    nearest = difflib.get_close_matches(value, known, 1, cutoff=0.4)
+    hint = f"; did you mean {nearest[0]}?" if nearest else ""
+    raise ValueError(f"no task is called {shown(value)}{hint} (known: {', '.join(known)}; your own: module:Class)")
+
+
+def _environment(value: dict[str, str]) -> dict[str, str]:
+    for name, text in value.items():
+        if name.startswith(("AWS_BATCH", "MUSTER_")):
+            raise ValueError(
+                f"{excerpt(name, 60)} is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+            )
+        if not name or "=" in name or "\0" in name + text:
+            raise ValueError(f"{shown(name)} can't be set: a name has no '=', and neither name nor value a zero byte")
+    return value
+
+
+def _argument(value: str) -> str:
+    if "\0" in value:
+        raise ValueError("expected a text without a zero byte")
+    return value
+
+
+def _finite(value: dict[str, Any]) -> dict[str, Any]:
+    """The spec travels as JSON, which has no infinity."""
+    left: list[object] = [value]
+    while left:
+        each = left.pop()
+        if isinstance(each, float) and not math.isfinite(each):
+            raise ValueError(f"expected finite numbers, found {each}")
+        left += each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
+    return value
+
+
+def known_tasks() -> list[str]:
+    """Names of the installed tasks, from the entry-point group ``muster.tasks``; nothing is imported."""
+    return sorted({entry.name for entry in entry_points(group="muster.tasks")})
+
+
+Duration = Annotated[float, BeforeValidator(_duration)]
+Memory = Annotated[int, BeforeValidator(_mebibytes)]
+Size = Annotated[int, BeforeValidator(_bytes)]
+RunName = Annotated[str, AfterValidator(_run_name)]
+JobName = Annotated[str, AfterValidator(_job_name)]
+TaskName = Annotated[str, AfterValidator(_task_name)]
+Environment = Annotated[dict[str, str], AfterValidator(_environment)]
+Argument = Annotated[str, AfterValidator(_argument)]
+Settings = Annotated[dict[str, Any], AfterValidator(_finite)]
+"""Settings that the class of an algorithm or a task checks."""

@@ -1,0 +1,70 @@
+"""What is wrong with a value of a job's YAML, in one line: the same words at the submission and from a rank."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from collections.abc import Mapping
+from typing import Any
+
+_EXPECTED = {
+    "missing": "is required",
+    "int_type": "expected a whole number",
+    "int_from_float": "expected a whole number",
+    "float_type": "expected a number",
+    "finite_number": "expected a finite number",
+    "string_type": "expected a text",
+    "list_type": "expected a list",
+    "tuple_type": "expected a list",
+    "dict_type": "expected a mapping",
+    "mapping_type": "expected a mapping",
+    "bool_type": "expected true or false",
+    "model_type": "expected a mapping",
+    "dataclass_type": "expected a mapping",
+    "dataclass_exact_type": "expected a mapping",
+}
+
+
+def explain(problem: Mapping[str, Any]) -> str:
+    """What was expected and what was found.
+
+    Args:
+        problem: One of ``pydantic.ValidationError.errors()``.
+    """
+    kind, found = problem["type"], problem.get("input")
+    if kind == "missing":
+        return "is required"
+    if kind == "value_error":
+        text = str(problem["ctx"]["error"])
+        return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {shown(found)}"
+    if kind == "literal_error":
+        return f"expected {problem['ctx']['expected']}, found {shown(found)}"
+    if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
+        written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
+        return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
+    if kind in _EXPECTED:
+        return f"{_EXPECTED[kind]}, found {kind_of(found)}"
+    message = str(problem["msg"])
+    return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
+
+
+def kind_of(value: object) -> str:
+    """What a value of a YAML document is, as people call it."""
+    names = {
+        dict: "a mapping",
+        list: "a list",
+        str: "a text",
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+    }
+    what = f" ({shown(value)})" if isinstance(value, str | int | float) else ""
+    return "nothing" if value is None else names.get(type(value), type(value).__name__) + what
+
+
+def shown(value: object, most: int = 60) -> str:
+    """``repr(value)`` in about ``most`` characters, at a cost that does not grow with the value."""
+    brief = reprlib.Repr()
+    brief.maxlevel, brief.maxstring, brief.maxother, brief.maxlong = 3, most, most, most
+    text = repr(value[:most]) if isinstance(value, str) else brief.repr(value)
+    return text if len(text) <= most else text[: most - 3] + "…"

@@ -1,0 +1,188 @@
+"""How SAC explores, and what its replay gives back, against loops."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.support.worker.loop import alone, groups, iterate
+from tests.support.worker.sac import SMALL, make, point
+from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.sac import kernels
+from worker.learning.sac.replay import Replay
+from worker.learning.sac.sac import SAC
+
+torch.set_num_threads(1)
+
+
+# -- exploring --------------------------------------------------------------------------------------------------------
+
+
+def draw(first: int, worlds: int, key: int, uniform: bool = False, actions: int = 3) -> torch.Tensor:
+    """What is explored around a mean of 0.2 with a deviation of 0.5."""
+    drawn = torch.zeros(worlds, actions)
+    mean, log_std = torch.full_like(drawn, 0.2), torch.full_like(drawn, 0.5).log()
+    keys = torch.tensor([0, key], dtype=torch.int32)
+    kernels.explore(keys, 1, first, torch.tensor([int(uniform)], dtype=torch.int32), 2.0, mean, log_std, drawn)
+    return drawn
+
+
+def test_noise_belongs_to_worlds_and_steps_not_to_ranks() -> None:
+    whole = draw(0, 8, 7)
+    assert torch.equal(whole, torch.cat((draw(0, 3, 7), draw(3, 5, 7))))
+    assert len(torch.unique(whole)) == whole.numel()
+    assert not torch.isclose(whole, draw(0, 8, 8)).any()
+
+
+def test_exploring_is_normal_noise_squashed_or_uniform() -> None:
+    noise = (torch.atanh(draw(0, 20_000, 7) / 2.0) - 0.2) / 0.5
+    assert noise.mean().abs() < 0.02 and (noise.std() - 1.0).abs() < 0.02
+    assert (noise[:, 0] * noise[:, 1]).mean().abs() < 0.02, "the components of an action are independent"
+    even = draw(0, 20_000, 7, uniform=True)
+    assert even.abs().max() < 2.0 and even.mean().abs() < 0.03 and (even.std() - 2.0 / 3.0**0.5).abs() < 0.02
+
+
+def test_actions_of_an_iteration_do_not_depend_on_the_ranks() -> None:
+    def actions(first: int, count: int) -> torch.Tensor:
+        task, drawn = point(count, first), []
+        sac = make(task, share=Share(first, count, 6), warm_up=0)
+        for iteration in range(2):
+            sac.begin(iteration)
+            for _ in range(sac.steps):
+                drawn.append(sac.act(groups(task)).clone())
+                sac.record(Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs))
+        return torch.stack(drawn)
+
+    whole = actions(0, 6)
+    torch.testing.assert_close(whole, torch.cat((actions(0, 2), actions(2, 4)), 1))
+    assert len(torch.unique(whole)) == whole.numel(), "every step has its own noise"
+
+
+def test_actions_are_random_until_the_first_update() -> None:
+    task = point(400)
+    sac = make(task, warm_up=6, init_std=0.1)
+    drawn: list[torch.Tensor] = []
+    for iteration in range(3):
+        sac.begin(iteration)
+        drawn.append(sac.act(groups(task)).clone())
+        iterate(sac, task, iteration, iteration + 1)
+    spread = [float(each.std()) for each in drawn]
+    assert spread[0] > 0.5 and spread[1] > 0.5 and spread[2] < 0.2
+    assert sac.state_dict()["updates"] == 8, "4 steps are too few for the first iteration, 8 are enough"
+
+
+# -- replay -----------------------------------------------------------------------------------------------------------
+
+
+def fill(replay: Replay, steps: int, ends: torch.Tensor | None = None, time_outs: torch.Tensor | None = None) -> None:
+    """Write ``steps`` steps whose observations, actions and rewards say which step, counted from 0, and which world they are of."""
+    slot = torch.zeros(1, dtype=torch.int64)
+    for step in range(steps):
+        replay.find_slots(slot)
+        number = torch.arange(replay.worlds).float() + 100.0 * step
+        ended = ends[step] if ends is not None else torch.zeros(replay.worlds, dtype=torch.bool)
+        after = ~ended | (time_outs[step] if time_outs is not None else False)
+        outcomes = torch.stack((number, (~ended).float(), after.float()), 1)
+        replay.write(slot, torch.stack((number, -number), 1), number.unsqueeze(1) + 0.5, outcomes)
+        replay.advance(1)
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_only_what_is_there_is_drawn_and_all_of_it(n_step: int) -> None:
+    worlds, capacity = 3, 7
+    generator = torch.Generator().manual_seed(0)
+    for recorded in range(1, 24):
+        replay = Replay(capacity, worlds, 1, 1, n_step, 0.9, "cpu")
+        fill(replay, recorded)
+        rows = torch.zeros(4000, dtype=torch.int64)
+        there = replay.draw(rows, generator)
+        assert there == (recorded >= n_step)
+        if there:
+            begun = (replay.sample(rows).before[:, 0] / 100.0).floor()
+            expected = torch.arange(max(0, recorded - capacity), recorded - n_step + 1)
+            assert torch.equal(begun.unique(), expected.float())
+            found = replay.sample(rows).before[:, 0].unique()
+            assert len(found) == len(expected) * worlds
+
+
+@pytest.mark.parametrize("n_step", [1, 2])
+def test_what_an_iteration_draws_is_there_once_its_steps_are_written(n_step: int) -> None:
+    """Rows are drawn before the steps that overwrite the oldest ones; each row is read after them."""
+    task = point(3)
+    sac = make(task, replay_steps=10, n_step=n_step, batch_size=400, warm_up=0)
+    for iteration in range(8):
+        sac.replay.before[..., 0] = float("nan")  # what is read must have been written since
+        for each in range(iteration):
+            kept = torch.arange(4 * each, 4 * each + 4)[-10:]
+            sac.replay.before[kept % 10, :, 0] = kept.float().unsqueeze(1)
+        sac.begin(iteration)
+        for step in range(4):
+            task.step(sac.act(groups(task)))
+            sac.record(Transition(groups(task), groups(task, True), task.rewards, task.dones, task.time_outs))
+            sac.replay.before[sac._slots[step], :, 0] = 4.0 * iteration + step
+        written = 4 * iteration + 4
+        begun = sac.replay.before[..., 0].flatten()[sac._all_rows]
+        assert torch.equal(begun.unique(), torch.arange(max(0, written - 10), written - n_step + 1).float())
+        sac.replay.advance(4)
+
+
+def by_loop(world: int, first: int, n: int, gamma: float, ends: torch.Tensor, time_outs: torch.Tensor) -> list[float]:
+    """Return, discount and last step of the transition that begins in step ``first``."""
+    total, worth = 0.0, 1.0
+    for step in range(first, first + n):
+        total += worth * (100.0 * step + world)
+        worth *= gamma
+        if ends[step, world]:
+            return [total, worth if time_outs[step, world] else 0.0, step]
+    return [total, worth, first + n - 1]
+
+
+@pytest.mark.parametrize("n_step", [1, 2, 5])
+def test_returns_of_n_steps_against_a_loop(n_step: int) -> None:
+    steps, worlds, capacity, gamma = 50, 4, 30, 0.9
+    generator = torch.Generator().manual_seed(1)
+    ends = torch.rand(steps, worlds, generator=generator) < 0.3
+    time_outs = ends & (torch.rand(steps, worlds, generator=generator) < 0.5)
+    replay = Replay(capacity, worlds, 1, 1, n_step, gamma, "cpu")
+    fill(replay, steps, ends, time_outs)
+    rows = torch.zeros(2000, dtype=torch.int64)
+    assert replay.draw(rows, generator)
+    batch = replay.sample(rows)
+    for i in range(len(rows)):
+        first, world = divmod(int(batch.before[i, 0]), 100)
+        total, worth, last = by_loop(world, first, n_step, gamma, ends, time_outs)
+        assert batch.returns[i].item() == pytest.approx(total, rel=1e-5)
+        assert batch.discounts[i].item() == pytest.approx(worth)
+        assert batch.after[i].item() == 100.0 * last + world + 0.5
+        assert batch.before[i, 1] == -batch.before[i, 0]
+
+
+def transition(observation: float, terminal: float, reward: float, done: bool, time_out: bool) -> Transition:
+    """Of one world with one observation."""
+    seen, ended = (TensorDict({"policy": torch.tensor([[x]])}, batch_size=[1]) for x in (observation, terminal))
+    return Transition(seen, ended, torch.tensor([reward]), torch.tensor([done]), torch.tensor([time_out]))
+
+
+def test_a_time_out_bootstraps_from_the_observation_before_the_reset_and_an_end_does_not() -> None:
+    setting = Setting(Spaces({"policy": (1,)}, 1), Share(0, 1, 1), alone(), 0)
+    sac = SAC(dataclasses.replace(SMALL, atoms=1, steps=3, warm_up=100, normalize_observations=False), setting)
+    nan = float("nan")
+    sac.begin(0)
+    taken = []
+    for observation, step in (
+        (1.0, transition(2.0, nan, 10.0, False, False)),
+        (2.0, transition(-1.0, 3.0, 20.0, True, True)),  # the clock ended it in 3, and a new episode begins in −1
+        (-1.0, transition(-2.0, -3.0, 30.0, True, False)),  # it fell
+    ):
+        taken.append(sac.act(TensorDict({"policy": torch.tensor([[observation]])}, batch_size=[1])).clone())
+        sac.record(step)
+    batch = sac.replay.sample(torch.arange(3))
+    assert batch.before[:, 0].tolist() == [1.0, 2.0, -1.0]
+    assert torch.equal(batch.before[:, 1:], torch.cat(taken))
+    assert batch.after.flatten().tolist() == [2.0, 3.0, -3.0]
+    # target critics that say 100 times what they see, and 7 for the entropy; γ = 0.9
+    target = sac.learner.target(100.0 * batch.after.expand(2, -1, -1), batch, torch.full((3,), 7.0))
+    assert target.flatten().tolist() == pytest.approx([10 + 0.9 * 207, 20 + 0.9 * 307, 30.0])

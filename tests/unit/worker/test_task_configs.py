@@ -1,0 +1,146 @@
+"""What a job's overrides make of a task's configuration, of Muster's own tasks and of users'."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import pydantic.dataclasses
+import pytest
+
+from job_specs.my_task import Pendulum, PendulumConfig
+from worker.errors import UserError
+from worker.learning.job import configure
+from worker.learning.ppo.settings import PPOConfig
+from worker.tasks.ant import Ant, AntConfig
+from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
+from worker.tasks.config import STRICT, Randomization, TaskConfig, reward_weights
+from worker.tasks.configs.camera import CameraConfig
+from worker.tasks.overrides import Refused, configured, from_mapping
+
+
+def bits(value: Any) -> Any:
+    """A configuration with the type of each number, which ``==`` does not compare."""
+    if dataclasses.is_dataclass(value):
+        return {item.name: bits(getattr(value, item.name)) for item in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {name: bits(each) for name, each in value.items()}
+    return [bits(each) for each in value] if isinstance(value, list | tuple) else repr(value)
+
+
+def test_whole_numbers_and_lists_of_a_yaml_give_the_same_bits_as_floats_and_tuples() -> None:
+    written = configured(CartpolePixelsConfig, {"episode_seconds": 4, "camera": {"position": [0, -2, 1]}})
+    camera = dataclasses.replace(CartpolePixelsConfig().camera, position=(0.0, -2.0, 1.0))
+    assert bits(written) == bits(CartpolePixelsConfig(episode_seconds=4.0, camera=camera))
+    written = configured(
+        AntConfig, {"randomize": {"mass": [1, 2], "observation_noise": {"a": 1}}, "rewards": {"up": 2}}
+    )
+    randomize = Randomization(mass=(1.0, 2.0), observation_noise={"a": 1.0})
+    assert bits(written) == bits(AntConfig(randomize=randomize, rewards={"up": 2.0}))
+    assert configured(AntConfig, {}) == AntConfig()
+
+
+def test_a_mapping_changes_the_keys_that_it_names() -> None:
+    config = configure(CartpolePixels, {"config": {"camera": {"width": 96}}})
+    assert config.camera == dataclasses.replace(CartpolePixelsConfig().camera, width=96)
+    assert config.camera.position == (0.0, -3.2, 1.4), "the task's own, not the camera's default"
+
+
+def test_rewards_and_curricula_can_not_be_changed_afterwards() -> None:
+    config = configure(Ant, {"config": {"curriculum": {"up": [[0, 1]]}}})
+    assert config.curriculum == {"up": [[0, 1]]}
+    for mapping in (config.rewards, config.curriculum, AntConfig().curriculum):
+        with pytest.raises(TypeError):
+            mapping["up"] = 3.0  # type: ignore[index]
+
+
+def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
+    config = configure(Pendulum, {"config": {"torque": 2, "randomize": {"mass": [1, 2]}, "rewards": {"effort": -1}}})
+    assert type(config) is PendulumConfig and isinstance(config.torque, float)
+    assert config == PendulumConfig(torque=2.0, randomize=Randomization(mass=(1.0, 2.0)), rewards={"effort": -1.0})
+    for overrides, said in (
+        ({"torqe": 1}, "torqe: PendulumConfig has no such key; did you mean torque?"),
+        ({"torque": "much"}, "torque: expected a number, found a text ('much')"),
+        ({"episode_seconds": -1}, "episode_seconds: expected a value greater than 0, found -1.0"),
+        ({"rewards": {"speed": float("nan")}}, "rewards.speed: expected a finite number, found a number (nan)"),
+    ):
+        with pytest.raises(UserError) as refused:
+            configure(Pendulum, {"config": overrides})
+        assert str(refused.value) == f"train.config.{said}"
+
+
+def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has() -> None:
+    assert PendulumConfig(randomize={"mass": [1, 2]}).randomize == Randomization(mass=(1.0, 2.0))  # type: ignore[arg-type]
+    for wrong in (
+        {"substeps": 0},
+        {"rewards": {"sped": 1.0}},
+        {"control_hz": "60"},
+        {"curriculum": {"level": [[0, 2]]}},
+    ):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            PendulumConfig(**wrong)  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plain(TaskConfig):
+    sizes: tuple[int, ...] = (8, 8)
+    corners: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.0, 1.0))
+    limit: float | None = None
+    camera: CameraConfig = dataclasses.field(default_factory=lambda: CameraConfig(fov=0.5))
+    rewards: Mapping[str, float] = reward_weights(near=1.0)
+    ppo: PPOConfig = dataclasses.field(default_factory=lambda: PPOConfig(steps=7))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.limit == 0.0:
+            raise ValueError("limit: 0 leaves no room")
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=STRICT)
+class Strict(TaskConfig):
+    sizes: tuple[int, ...] = (8, 8)
+    corners: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.0, 1.0))
+    limit: float | None = None
+    camera: Annotated[CameraConfig, from_mapping(CameraConfig)] = CameraConfig(fov=0.5)
+    rewards: Mapping[str, float] = reward_weights(near=1.0)
+    ppo: PPOConfig = PPOConfig(steps=7)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.limit == 0.0:
+            raise ValueError("limit: 0 leaves no room")
+
+
+@pytest.mark.parametrize("kind", [Plain, Strict])
+def test_a_configuration_of_one_s_own_may_be_a_dataclass_of_either_kind(kind: type[Any]) -> None:
+    made = configured(
+        kind, {"sizes": [4], "corners": [[1, 2]], "limit": 3, "camera": {"width": 8}, "rewards": {"near": 2}}
+    )
+    assert type(made) is kind and (made.sizes, made.corners, made.limit) == ((4,), ((1.0, 2.0),), 3.0)
+    assert (made.camera.width, made.camera.fov, made.rewards, made.ppo.steps) == (8, 0.5, {"near": 2.0}, 7)
+    for overrides, said in (
+        ({"sizes": [4, "x"]}, "sizes.1: expected a whole number, found a text ('x')"),
+        ({"limit": "low"}, "limit: expected a number, found a text ('low')"),
+        ({"limit": 0}, "limit: 0 leaves no room"),
+        ({"camera": {"fov": 4}}, "camera.fov: expected a value less than 3.141592653589793, found 4"),
+        ({"ppo": {"steps": 8}}, f"ppo: not a key of {kind.__name__}; settings of ppo stand under train.ppo"),
+    ):
+        with pytest.raises(Refused) as refused:
+            configured(kind, overrides)
+        assert str(refused.value) == said
+
+
+def test_a_task_whose_own_defaults_can_not_be_says_so() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Careless(PendulumConfig):
+        substeps: int = 0
+
+    class Task(Pendulum):
+        config_type = Careless
+
+    with pytest.raises(UserError) as refused:
+        configure(Task, {})
+    assert str(refused.value) == (
+        "task Task: its own configuration: substeps: expected a value greater than or equal to 1, found 0"
+    )

@@ -1,0 +1,84 @@
+"""The configurations of the robots that run along +x."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field
+
+from pydantic.dataclasses import dataclass
+
+from worker.learning.ppo.settings import PPOConfig
+from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weights
+
+
+@dataclass(frozen=True, config=STRICT)
+class RunningConfig(TaskConfig):
+    """Run fast, straight and upright; do not fall.
+
+    ``rewards`` weighs: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion below);
+    an upright torso (cosine to vertical above 0.93); each step that does not end in a fall; the sum of squared actions; the sum
+    over joints of |action x scaled joint velocity| x strength; the sum over joints of how far each is into the last hundredth at
+    an end of its range (0 to 1) x strength; a fall, which replaces every other term of that step. A joint's strength is its
+    motor's full torque over that of the strongest.
+    """
+
+    control_hz: Positive = 60.0
+    """Control steps per simulated second [Hz]."""
+    substeps: Count = 2
+    """Physics steps of one control step, each of 1/120 s."""
+    episode_seconds: Positive = 16.0
+    """Simulated time after which the clock ends an episode [s]."""
+    fastest: Positive = 100.0
+    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 70."""
+    fall_height: float = 0.0
+    """Height of the torso under which the episode ends [m]."""
+    start_height: float = 1.0
+    """Height of the torso at the start [m]."""
+    start_angle_noise: float = 0.2
+    """A start moves each joint uniformly within +- this angle [rad], kept inside the joint's range."""
+    start_velocity_noise: float = 0.1
+    """A start gives each joint a uniform velocity within +- this [rad/s]."""
+    velocity_scale: float = 0.1
+    """Factor on joint velocities in observations and in the energy cost [s/rad]."""
+    angular_velocity_scale: float = 0.25
+    """Factor on the torso's angular velocity in observations [s/rad]."""
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            steps=32,
+            hidden_sizes=(400, 200, 100),
+            activation="elu",
+            epochs=5,
+            minibatches=4,
+            learning_rate=5.0e-4,
+            desired_kl=0.01,
+        )
+    )
+    """How the task is trained."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class AntConfig(RunningConfig):
+    """Run fast, straight and upright; do not drop the torso. What the rewards are: :class:`RunningConfig`."""
+
+    fall_height: float = 0.31
+    """Height of the torso under which the episode ends [m]."""
+    start_height: float = 0.62
+    """Height of the torso at the start [m]: the feet touch the ground within a few steps."""
+    velocity_scale: float = 0.2
+    """Factor on joint velocities in observations and in the energy cost [s/rad]."""
+    rewards: Mapping[str, float] = reward_weights(
+        forward=1.0, heading=0.5, up=0.1, alive=0.5, action=-0.005, energy=-0.05, limits=-0.1, fall=-2.0
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class HumanoidConfig(RunningConfig):
+    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunningConfig`."""
+
+    fall_height: float = 0.8
+    """Height of the torso under which the episode ends [m]."""
+    start_height: float = 1.34
+    """Height of the torso at the start [m]: the feet are 5 cm above the ground."""
+    rewards: Mapping[str, float] = reward_weights(
+        forward=1.0, heading=0.5, up=0.1, alive=2.0, action=-0.01, energy=-0.05, limits=-0.25, fall=-1.0
+    )

@@ -1,0 +1,127 @@
+"""What a job's YAML sets of a task's configuration (``train.config``), and what is wrong with it. Imported without torch."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidator
+from pydantic.errors import PydanticUserError
+from pydantic_core import ArgsKwargs
+
+from shared_store.wording import explain
+
+C = TypeVar("C")
+Path = tuple[str | int, ...]
+
+TRAINING = ("ppo", "sac", "rsl_rl")
+"""Fields that say how a task is trained: the job's YAML changes them in sections of their own."""
+
+
+class Refused(ValueError):
+    """A value can't be used.
+
+    Args:
+        path: Keys to it, from the configuration on.
+        words: One line: what was expected, what was found.
+    """
+
+    def __init__(self, path: Path, words: str) -> None:
+        super().__init__(": ".join(filter(None, (".".join(map(str, path)), words))))
+        self.path, self.words = path, words
+
+
+def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
+    """A configuration with the overrides that a job's YAML gives, as plain values.
+
+    A mapping for a field that is a configuration itself, such as ``randomize``, changes the keys that it names.
+
+    Args:
+        kind: Its class, a dataclass with a default for each field.
+        overrides: By field.
+
+    Raises:
+        Refused: A key is unknown, or a value has the wrong type or is out of range.
+    """
+    try:
+        default = kind()
+    except ValidationError as error:
+        raise _refused(error, (), {}) from error
+    return _made(kind, default, {}, overrides, ())
+
+
+def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mapping[str, Any], where: Path) -> C:
+    known = [item.name for item in dataclasses.fields(kind) if item.init and item.name not in TRAINING]  # type: ignore[arg-type]
+    for key, value in overrides.items():
+        if key in TRAINING and not where:
+            raise Refused((key,), f"not a key of {kind.__name__}; settings of {key} stand under train.{key}")
+        if key not in known:
+            raise Refused((*where, key), f"{kind.__name__} has no such key; {nearest(key, sorted(known))}")
+        values[key] = _as(getattr(default, key), value, (*where, key))
+    try:
+        # as pydantic's own __init__ does it, which a plain dataclass that extends a pydantic one does not have
+        made = TypeAdapter(kind).validator.validate_python(ArgsKwargs((), values), self_instance=kind.__new__(kind))
+    except ValidationError as error:
+        raise _refused(error, where, overrides) from error
+    except (PydanticUserError, NameError) as error:
+        first = str(error).partition("\n")[0]
+        raise Refused(where, f"{kind.__name__} has a type that can't be checked: {first}") from error
+    return made  # type: ignore[no-any-return]
+
+
+def _as(default: Any, value: Any, where: Path) -> Any:
+    """``value`` of a YAML document in the form of the default: a list may stand for a tuple, a mapping for a configuration."""
+    if isinstance(default, tuple) and isinstance(value, list):
+        return tuple(_as(default[0] if default else None, item, where) for item in value)
+    if dataclasses.is_dataclass(default) and not isinstance(default, type) and isinstance(value, Mapping):
+        present = {item.name: getattr(default, item.name) for item in dataclasses.fields(default) if item.init}
+        return _made(type(default), default, present, value, where)
+    return value
+
+
+def _refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) -> Refused:
+    problems = error.errors(include_url=False)
+    first: Any = problems[0]
+    found = first.get("input")
+    # of a rule over several fields the words say it all; a tuple was a list in the YAML
+    first["input"] = {} if isinstance(found, ArgsKwargs) else list(found) if isinstance(found, tuple) else found
+    path = _keys(first["loc"], overrides)
+    cause = first.get("ctx", {}).get("error")
+    path, words = ((*path, *cause.path), cause.words) if isinstance(cause, Refused) else (path, explain(first))
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return Refused((*where, *path), f"{words}{more}")
+
+
+def _keys(path: Path, value: Any) -> Path:
+    """The part of ``path`` that is in the YAML: pydantic goes on with names of types."""
+    for place, key in enumerate(path):
+        inside = key in value if isinstance(value, Mapping) else isinstance(value, list) and key in range(len(value))
+        if not inside:
+            return path[: max(place, 1)]
+        value = value[key]
+    return path
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """What to say of a name that is none of ``known``."""
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(known) or 'none'}"
+
+
+def expecting(words: str) -> WrapValidator:
+    """Annotation of a field: whatever is wrong with a part of its value, say what the whole has to be."""
+
+    def check(value: Any, inner: Callable[[Any], Any]) -> Any:
+        try:
+            return inner(value)
+        except ValidationError:
+            raise ValueError(f"expected {words}") from None
+
+    return WrapValidator(check)
+
+
+def from_mapping(kind: type[Any]) -> BeforeValidator:
+    """Annotation of a field that is a configuration of this kind: a mapping of its fields will do."""
+    return BeforeValidator(lambda value: kind(**value) if isinstance(value, Mapping) else value)
