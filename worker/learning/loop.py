@@ -40,6 +40,8 @@ EVALUATED = 256
 """At most so many worlds of each rank are built to evaluate a policy: those of training still hold their memory."""
 WARNINGS = 10
 """At most so many iterations with worlds that were reset have a line of their own."""
+EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
+"""Those of a task's statistics that become reward, episode length and score; the others are told by their names."""
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
 """What the ranks tell each other once an iteration, besides the statistics: how many were asked to stop, how many to save now, how
 many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
@@ -308,13 +310,15 @@ class Loop:
         self.state.seconds += took
         self._iteration_seconds, self._collect_seconds = took, collect
         stall, self._stall_seconds = self._stall_seconds, 0.0
-        finished, returns, lengths, *others = totals
+        known = dict(zip(self.task.statistic_names, totals, strict=True))
+        finished, returns, lengths, squares = map(known.pop, EPISODES)
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
         progress.count(
             self.algorithm.steps,
             finished,
             returns,
+            squares,
             worlds=self.share.total,
             longest=self.task.max_episode_length,
         )
@@ -324,6 +328,7 @@ class Loop:
             "reward": progress.reward,
             "episode_length": progress.episode_length,
             "score": progress.score,
+            "score_error": progress.score_error,
             "episodes": int(finished),
             "steps_per_second": steps / took,  # by the clock, over everything
             "collect_seconds": collect,
@@ -335,10 +340,7 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{
-                name: _figure(name, value, finished)
-                for name, value in zip(self.task.statistic_names[3:], others, strict=True)
-            },
+            **{name: _figure(name, value, finished) for name, value in known.items()},
         }
 
     def _finish(self) -> None:
