@@ -254,13 +254,14 @@ class TrainingState:
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
         fixed = getattr(self.algorithm.config_type, "fixed", ())
-        settings = [("settings", key) for key in fixed if key in there["settings"]]
+        paths = [key.split(".") for key in fixed]  # a dot leads into a section
+        settings = [("settings", *path) for path in paths if path[0] in there["settings"]]
         for path in [("task",), ("algorithm",), *(("train", key) for key in ("seed", "config")), *settings]:
             old, new = _at(there, path), _at(here, path)
             if old != new:
                 raise UserError(
                     f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {_called(path, there)} is "
-                    f"{old!r} there and {new!r} here; start a new run for that"
+                    f"{old!r} there and {new!r} here; start a new run for that (`muster clone` begins one with its weights)"
                 )
 
     def _load_worlds(self, checkpoint: Checkpoint) -> None:
