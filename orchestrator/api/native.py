@@ -23,7 +23,7 @@ from orchestrator.api.context import controller_of, permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
-from orchestrator.api.submission import sources_of
+from orchestrator.api.sources import sources_of
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, find_job
@@ -93,7 +93,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     controller = controller_of(request)
     needs, definition = _gang_of(body), body.definition
     for source in sources_of(needs):
-        permitted_run(controller, source, Operation.READ_RUN)
+        permitted_run(controller, source.run, Operation.READ_RUN)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
