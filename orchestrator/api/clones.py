@@ -16,7 +16,7 @@ from orchestrator.admission import fit_in_queue
 from orchestrator.api import batch, definitions, limits, permissions, submission
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
-from orchestrator.api.runs import CONFLICT, setting_at, spec_of
+from orchestrator.api.runs import CONFLICT, resized, setting_at, spec_of
 from orchestrator.controller import Controller
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.several import FRESH
@@ -116,8 +116,7 @@ def _changed(session: Session, source: Run, wanted: Wanted) -> Spec:
     named = next((each for each in wanted.assignments if each.partition("=")[0] == "name"), None)
     if named is not None:
         raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")
-    changes = [*wanted.assignments, f"name={json.dumps(wanted.name)}"]
-    changes += [f"nodes={wanted.nodes}"] if wanted.nodes is not None else []
+    changes = [*wanted.assignments, *resized(wanted.assignments, wanted.nodes), f"name={json.dumps(wanted.name)}"]
     try:
         before = validate(document, f"run {source.name}")
         spec = validate(override(document, changes), f"clone of run {source.name}")

@@ -160,8 +160,7 @@ def resume(
             )
         try:
             before = validate(document, f"run {run.name}")
-            resized = [f"nodes={nodes}"] if nodes is not None else []
-            spec = validate(override(document, [*assignments, *resized]), f"run {run.name}")
+            spec = validate(override(document, [*assignments, *resized(assignments, nodes)]), f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
         _check_changes(run, before, spec)
@@ -236,6 +235,18 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
             )
 
 
+def resized(assignments: Sequence[str], nodes: int | None) -> list[str]:
+    """The change that sets the number of ``nodes``. Raises ClientError where the ``assignments`` set it, too."""
+    if nodes is None:
+        return []
+    for assignment in assignments:
+        if assignment.partition("=")[0].partition(".")[0] == "nodes":
+            raise ClientError(
+                f"--set {excerpt(assignment, 100)}: --nodes {nodes} sets the number of nodes; give one of them"
+            )
+    return [f"nodes={nodes}"]
+
+
 def setting_at(settings: Any, key: str) -> Any:
     """The setting ``key``, in which a dot leads into a section; None where it is not given."""
     for part in key.split("."):
@@ -245,16 +256,23 @@ def setting_at(settings: Any, key: str) -> Any:
 
 def _check_rate(run: Run, before: Spec, after: Spec, assignments: Sequence[str]) -> None:
     """Refuse a learning rate that is set to what it is: an adapted rate goes on from the checkpoint, unless the setting differs."""
-    if before.train is None or after.train is None or after.train.given().get("schedule") == "fixed":
+    if before.train is None or after.train is None:
         return
-    key = f"train.{after.train.algorithm}.learning_rate"
-    given = any(assignment.partition("=")[0] == key for assignment in assignments)
-    rate = after.train.given().get("learning_rate")
-    if given and after.train.algorithm == "ppo" and before.train.given().get("learning_rate") == rate:
+    name, given = after.train.algorithm, after.train.given()
+    if name not in _RATES or (name == "ppo" and given.get("schedule") == "fixed"):
+        return
+    key, hint = _RATES[name]
+    asked = any(assignment.partition("=")[0] == f"train.{name}.{key}" for assignment in assignments)
+    rate = setting_at(given, key)
+    if asked and setting_at(before.train.given(), key) == rate:
         raise ClientError(
-            f"run {run.name}: {key} is {rate!r} already, so that the run would go on with "
-            "the rate that its checkpoint has adapted; set another value, or train.ppo.schedule=fixed"
+            f"run {run.name}: train.{name}.{key} is {rate!r} already, so that the run would go on with "
+            f"the rate that its checkpoint has adapted; set another value{hint}"
         )
+
+
+_RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": ("algorithm.learning_rate", "")}
+"""Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
 
 
 def _choose(run: Run, iteration: int | None) -> Checkpoint | None:

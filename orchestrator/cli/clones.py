@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
@@ -52,7 +51,7 @@ def clone(
             "name": name,
             "checkpoint": checkpoint,
             "nodes": nodes,
-            "set": [*(set_ or []), *([] if elsewhere is None else [f"queue={json.dumps(elsewhere)}"])],
+            "set": [*(set_ or []), *on_queue(set_, elsewhere)],
             "directory": os.getcwd(),
         }
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -114,6 +115,16 @@ def engine_queue(client: Client, engine: str) -> str:
             + " ".join(f"--engine {name}" for name in (*queues, engine))
         )
     return queues[engine]
+
+
+def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
+    """The change that sends a job to ``queue``. Raises SpecError where ``changes`` name one, too."""
+    if queue is None:
+        return []
+    for change in changes or ():
+        if change.partition("=")[0] == "queue":
+            raise SpecError(f"--set {change}: --queue or --engine sets the queue ({queue}); give one of them")
+    return [f"queue={json.dumps(queue)}"]
 
 
 def check_engine(name: str) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, scored
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, scored
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
@@ -35,7 +35,7 @@ def resume(
 ) -> None:
     """Go on with a run from its newest checkpoint, at the next iteration."""
     with Client.connect() as client:
-        elsewhere = [f"queue={engine_queue(client, engine)}"] if engine is not None else []
+        elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
         body = {
             "checkpoint": checkpoint,
             "nodes": nodes,

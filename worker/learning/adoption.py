@@ -81,8 +81,9 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
     for key in getattr(algorithm.config_type, "fixed", ()):
         old, new = (setting_at(facts.get("settings"), key) for facts in (there, here))
         if key not in may_change and key.partition(".")[0] in (there.get("settings") or {}) and old != new:
+            section = here["algorithm"] if here["algorithm"] in BUILT_IN else "settings"
             raise UserError(
-                f"the weights of checkpoint {checkpoint.name} do not fit this job: {here['algorithm']}.{key} is {old!r} there "
+                f"the weights of checkpoint {checkpoint.name} do not fit this job: {section}.{key} is {old!r} there "
                 f"and {new!r} here; leave the setting as it is there"
             )
 

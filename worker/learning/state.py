@@ -28,6 +28,7 @@ from shared_store.epoch import check_epoch
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithms import BUILT_IN
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
@@ -290,7 +291,8 @@ _OF_ALGORITHM = "algorithm/"
 
 def _called(path: tuple[str, ...], manifest: Any) -> str:
     """How a job's YAML calls it: settings stand under the algorithm's name."""
-    return ".".join((manifest["algorithm"] if part == "settings" else part) for part in path)
+    name = manifest["algorithm"]
+    return ".".join((name if part == "settings" and name in BUILT_IN else part) for part in path)
 
 
 def _at(facts: Any, path: tuple[str, ...]) -> Any:
