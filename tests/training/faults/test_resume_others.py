@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.extensions import RandomNetworkDistillation
 
+from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from worker.errors import UserError
@@ -262,8 +264,6 @@ def test_settings_of_an_algorithm_of_ones_own_are_applied_or_refused_as_its_clas
 
 
 def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_path: Path) -> None:
-    import shutil
-
     copy = Path(shutil.copytree(store, tmp_path / "store"))
     shutil.rmtree(copy / "runs" / "rsl")
     assert go_on(copy, "pupil", PUPIL_RUN).algorithm.algorithm.teacher_loaded  # type: ignore[attr-defined]
@@ -272,3 +272,19 @@ def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_p
 def test_how_often_is_saved_and_how_much_is_kept_apply_at_once(store: Path) -> None:
     loop = go_on(store, "sac", SAC_RUN, every=7, keep=3)
     assert loop.state.saver.keep == 3 and loop.cadence.due(7, {}) and not loop.cadence.due(6, {})
+
+
+def test_a_clone_of_a_pupil_keeps_its_teacher_unless_it_names_another(store: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(store, tmp_path / "store"))
+    train(training(copy, run="other", iterations=1, seed=8, algorithm="rsl_rl", rsl_rl=PPO_RUN))
+    shutil.rmtree(copy / "runs" / "rsl")  # the pupil's teacher
+    found = {}
+    for name, teacher in {"same": "rsl", "another": "other"}.items():
+        make_clone(copy, name, "pupil")
+        settings = {**PUPIL_RUN, "teacher_checkpoint": teacher}
+        found[name] = runner(training(copy, run=name, algorithm="rsl_rl", rsl_rl=settings)).algorithm.state_dict()
+    original = go_on(copy, "pupil", PUPIL_RUN).algorithm.state_dict()
+    for part, same, another in (("policy", True, True), ("teacher_state_dict", True, False)):
+        for name, expected in (("same", same), ("another", another)):
+            weights = found[name][part]["mlp.0.weight"]
+            assert torch.equal(weights, original[part]["mlp.0.weight"]) is expected, (part, name)
