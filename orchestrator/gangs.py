@@ -26,13 +26,12 @@ from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, Plan, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
-from orchestrator.ownership import record_owner
+from orchestrator.ownership import first_description, record_owner
 from orchestrator.peers import Peers
 from orchestrator.pools import engine_options
 from orchestrator.retry import retries
 from orchestrator.scheduling import Start
 from orchestrator.tables import Attempt, Job, JobQueue, SchedulingPolicy, now
-from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.files import DamagedFile
@@ -111,19 +110,8 @@ class Gangs:
         self._launch(session, job, attempt)
 
     def _describe(self, session: Session, run: Run, job: Job) -> None:
-        needs, record = gang_needs(job.node_properties), record_owner(session, run, job)
-        run.create(
-            {
-                "run": run.name,
-                "job": job.id,
-                "created": now(),
-                "version": __version__,
-                "spec": needs.spec,
-                "name": job.name,
-                "owner": record.owner,
-                "queue": record.queue,
-            }
-        )
+        record = record_owner(session, run, job)
+        run.create(first_description(run, job, record.owner, record.queue))
 
     def _launch(self, session: Session, job: Job, attempt: Attempt) -> None:
         def plan() -> Plan:

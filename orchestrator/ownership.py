@@ -6,11 +6,15 @@ was lost, still has its owner.
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from orchestrator.definition import gang_needs
 from orchestrator.jobs import Status
 from orchestrator.tables import Job, RunRecord, now
+from shared_store import __version__
 from shared_store.layout import Run
 
 
@@ -39,6 +43,20 @@ def owner_of(session: Session, run: Run) -> RunRecord | None:
     if first is not None:
         return _record(run, first.queue, first.owner)
     return None if description is None else _record(run, "", None)
+
+
+def first_description(run: Run, job: Job, owner: str | None, queue: str) -> dict[str, Any]:
+    """What ``run.json`` of a run says that ``job`` begins."""
+    spec = gang_needs(job.node_properties).spec
+    facts = {"run": run.name, "job": job.id, "created": now(), "version": __version__, "spec": spec, "name": job.name}
+    return {**facts, "owner": owner, "queue": queue}
+
+
+def forget_gone_run(session: Session, run: Run) -> None:
+    """Whose an earlier run of this name was, which is gone from the store, has no say in a new one. Commits."""
+    if (record := session.get(RunRecord, run.name)) is not None:
+        session.delete(record)
+        session.commit()
 
 
 def record_owner(session: Session, run: Run, job: Job) -> RunRecord:

@@ -81,7 +81,7 @@ class Checkpoint:
             raise NewerFormat(
                 f"checkpoint {self.name}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
             )
-        for key in ("created", "reward", "score", "worlds", "world_size"):
+        for key in ("created", "reward", "score", "score_error", "worlds", "world_size"):
             if isinstance(manifest.get(key), str | list | dict):
                 raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json: {key} is not a number")
         return manifest
@@ -114,6 +114,12 @@ class Checkpoint:
                 raise DamagedCheckpoint(f"checkpoint {self.name}: {name} can't be read ({error.strerror})") from error
 
 
+def checkpoint_called(directory: Path, name: str) -> Checkpoint | None:
+    """The checkpoint of that name in ``directory``, whether it exists or not; None where no checkpoint can be called so."""
+    match = _NAME.fullmatch(name)
+    return Checkpoint(directory / match[0], int(match[1]), int(match[2])) if match else None
+
+
 def list_checkpoints(run: Run) -> list[Checkpoint]:
     """Every committed checkpoint, the newest last.
 
@@ -124,8 +130,7 @@ def list_checkpoints(run: Run) -> list[Checkpoint]:
         entries = os.listdir(run.checkpoints)
     except (FileNotFoundError, NotADirectoryError):
         return []
-    matches = filter(None, map(_NAME.fullmatch, entries))
-    found = [Checkpoint(run.checkpoints / match[0], int(match[1]), int(match[2])) for match in matches]
+    found = filter(None, (checkpoint_called(run.checkpoints, entry) for entry in entries))
     return sorted(found, key=lambda checkpoint: (checkpoint.epoch, checkpoint.iteration))
 
 
@@ -164,6 +169,22 @@ def newest_checkpoint(
             checkpoint.verify()
             return checkpoint
     raise DamagedCheckpoint(f"checkpoint {chosen}: not in run {run.name}")
+
+
+def best_checkpoint(run: Run) -> Checkpoint | None:
+    """The checkpoint with the greatest score, the later one of equals; None where none has a score yet.
+
+    A score is a mean over many episodes; the reward of the one iteration before a checkpoint counts for nothing here.
+    """
+    best, found = None, -math.inf
+    for checkpoint in list_checkpoints(run):
+        try:
+            score = checkpoint.manifest.get("score")
+        except DamagedCheckpoint:
+            continue
+        if isinstance(score, int | float) and found <= score < math.inf:
+            best, found = checkpoint, score
+    return best
 
 
 def set_aside(checkpoint: Checkpoint) -> Path:

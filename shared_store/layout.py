@@ -44,6 +44,10 @@ class Run:
         return self.path / "metrics"
 
     @property
+    def parent(self) -> Path:
+        return self.path / "parent"
+
+    @property
     def evaluations(self) -> Path:
         return self.path / "evaluations"
 
@@ -66,7 +70,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes"):
+        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent"):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:
@@ -81,6 +85,8 @@ class Run:
             raise DamagedFile(f"{path}: spec is not a mapping")
         if found is not None and not isinstance(found.get("created"), int | float | None):
             raise DamagedFile(f"{path}: created is not a number")
+        if found is not None and not isinstance(found.get("parent"), dict | None):
+            raise DamagedFile(f"{path}: parent is not a mapping")
         return found
 
     def is_missing(self) -> bool:

@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 
 from orchestrator.api import batch, docs_page, logs, native
 from orchestrator.api.auth import Access, Guard, error_response, kind_of
+from orchestrator.api.context import IDEMPOTENCY_HEADER
 from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import RateLimit, parse
 from orchestrator.controller import Controller
@@ -62,7 +63,7 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
         """AWS Batch: one POST an operation (rest-json)."""
         body = await _body(request)
         name = batch.operation_names().get(operation, operation)
-        key = request.headers.get(native.IDEMPOTENCY_HEADER)
+        key = request.headers.get(IDEMPOTENCY_HEADER)
         return JSONResponse(await run_in_threadpool(batch.call, controller, name, body, key))
 
     @app.api_route("/v1/tags/{arn:path}", methods=["GET", "POST", "DELETE"], include_in_schema=False)

@@ -6,6 +6,7 @@ import difflib
 from dataclasses import dataclass
 from itertools import islice
 
+from fastapi import Request
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -19,6 +20,9 @@ from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
 from shared_store.layout import Run, Store, StoreError
+
+IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
+"""Makes a submission safe to repeat after a lost answer."""
 
 _COMPARED = 1000
 """Names of runs among which the nearest to an unknown one is looked for."""
@@ -71,6 +75,12 @@ class Context:
     def reason(self, job: Job) -> str | None:
         """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
         return self.controller.reason(job)
+
+
+def controller_of(request: Request) -> Controller:
+    """The controller that the application serves."""
+    controller: Controller = request.app.state.controller
+    return controller
 
 
 def queue_names(session: Session) -> list[str]:

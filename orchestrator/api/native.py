@@ -1,4 +1,4 @@
-"""The native API: capacity, jobs with all their attempts, logs as a stream, runs, checkpoints, metrics, resume."""
+"""The native API: capacity, plans, jobs with all their attempts, logs as a stream; of runs, :mod:`orchestrator.api.run_routes`."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Request
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.admission import fit_in_queue, node_records
-from orchestrator.api import permissions, rules, runs
+from orchestrator.api import permissions, rules, run_routes, runs
 from orchestrator.api.batch import validate
-from orchestrator.api.context import permitted_run, queue_names
+from orchestrator.api.context import controller_of, permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
-from orchestrator.api.submission import sources_of
+from orchestrator.api.sources import sources_of
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, find_job
@@ -37,17 +37,11 @@ from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import needs as needed
 from orchestrator.spec import KINDS
 from orchestrator.tables import Attempt, Job, JobQueue
-from shared_store.checkpoints import list_checkpoints
 from shared_store.logs import LogFollower, LogLine, timestamp
-from shared_store.metrics import history_of
 
 router = APIRouter(prefix="/api")
+router.include_router(run_routes.router)
 
-IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
-"""Makes a submission safe to repeat after a lost answer."""
-
-RUNS_A_PAGE = 100
-METRICS_A_PAGE = 10_000
 _LARGEST_PLAN = 4 << 20
 """Characters of all nodes' variables together."""
 _POLL = 0.05
@@ -61,20 +55,6 @@ class PlanRequest(BaseModel):
 
     definition: dict[str, Any] = Field(description="a RegisterJobDefinition request of type multinode")
     queue: str = "default"
-
-
-class ResumeRequest(BaseModel):
-    """What to change when a run goes on."""
-
-    checkpoint: int | None = Field(default=None, description="iteration; the newest where absent")
-    nodes: int | None = Field(default=None, ge=1, description="another number of nodes; the worlds are dealt out anew")
-    set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
-    directory: str = Field(default="", description="working directory of the job")
-
-
-def _controller(request: Request) -> Controller:
-    controller: Controller = request.app.state.controller
-    return controller
 
 
 def _job(session: Session, reference: str, operation: Operation) -> Job:
@@ -92,7 +72,7 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
 
     ``queues``: those whose jobs the caller may see.
     """
-    controller = _controller(request)
+    controller = controller_of(request)
     names = controller.engine.names
     with controller.database.session() as session:
         if queue is not None:
@@ -110,10 +90,10 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
 @router.post("/plan")
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
-    controller = _controller(request)
+    controller = controller_of(request)
     needs, definition = _gang_of(body), body.definition
     for source in sources_of(needs):
-        permitted_run(controller, source, Operation.READ_RUN)
+        permitted_run(controller, source.run, Operation.READ_RUN)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
@@ -161,7 +141,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
 @router.post("/fit")
 def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
-    controller = _controller(request)
+    controller = controller_of(request)
     needs = _gang_of(body)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
@@ -196,7 +176,7 @@ def _planned(controller: Controller, gang: Gang) -> Plan:
 @router.get("/jobs/{reference}")
 def job_detail(request: Request, reference: str) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
-    controller = _controller(request)
+    controller = controller_of(request)
     with controller.database.session() as session:
         job = _job(session, reference, Operation.READ_JOB)
         run = controller.store.run(job.run)
@@ -243,7 +223,7 @@ def job_logs(
 
     ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
     """
-    controller = _controller(request)
+    controller = controller_of(request)
     with controller.database.session() as session:
         job = _job(session, reference, Operation.READ_JOB_LOGS)
         with reading(job):
@@ -273,7 +253,7 @@ def _positions(text: str) -> dict[str, int]:
 @router.post("/jobs/{reference}/checkpoint")
 def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
-    controller = _controller(request)
+    controller = controller_of(request)
     job, attempt, nodes = _running(controller, reference, Operation.CHECKPOINT_JOB)
     return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
 
@@ -281,7 +261,7 @@ def save_now(request: Request, reference: str) -> dict[str, str]:
 @router.get("/jobs/{reference}/stacks")
 def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
     """The Python and native stacks of every rank, node by node."""
-    controller = _controller(request)
+    controller = controller_of(request)
     job, attempt, nodes = _running(controller, reference, Operation.READ_JOB_STACKS)
     return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
 
@@ -304,70 +284,6 @@ def _command(controller: Controller, job: str, attempt: int, node: int, name: st
         return controller.bus.command(job, attempt, node, name, seconds)
     except BusError as error:
         raise ClientError(str(error), 503) from None
-
-
-@router.get("/runs")
-def list_runs(
-    request: Request,
-    response: Response,
-    after: str = Query(default="", max_length=128, description="name of the last run of the page before"),
-    most: int = Query(default=RUNS_A_PAGE, ge=1, le=RUNS_A_PAGE, alias="max"),
-) -> Any:
-    """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    controller = _controller(request)
-    with controller.database.session() as session:
-        found = runs.list_runs(controller, session, after, most)
-    if len(found) == most:
-        response.headers["Link"] = f'</api/runs?max={most}&after={found[-1]["run"]}>; rel="next"'
-    return permissions.shown(found)
-
-
-@router.get("/runs/{name}")
-def run_detail(request: Request, name: str) -> Any:
-    """One run."""
-    controller = _controller(request)
-    run = permitted_run(controller, name, Operation.READ_RUN)
-    with controller.database.session() as session:
-        return permissions.shown(runs.describe_run(controller, session, run))
-
-
-@router.get("/runs/{name}/checkpoints")
-def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
-    """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = permitted_run(_controller(request), name, Operation.READ_CHECKPOINTS)
-    return [runs.describe_checkpoint(checkpoint, verify) for checkpoint in list_checkpoints(run)]
-
-
-@router.get("/runs/{name}/metrics")
-def run_metrics(
-    request: Request,
-    response: Response,
-    name: str,
-    after: int = 0,
-    most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
-) -> list[dict[str, Any]]:
-    """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    history = history_of(permitted_run(_controller(request), name, Operation.READ_METRICS))
-    found = history.after(after, most)
-    if len(found) == most or history.behind:
-        last = found[-1]["iteration"] if found else after
-        response.headers["Link"] = f'</api/runs/{name}/metrics?max={most}&after={last}>; rel="next"'
-    return found
-
-
-@router.post("/runs/{name}/resume")
-def resume_run(
-    request: Request,
-    name: str,
-    body: ResumeRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
-) -> dict[str, Any]:
-    """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
-    controller = _controller(request)
-    run = permitted_run(controller, name, Operation.RESUME_RUN)
-    return runs.resume(
-        controller, run, body.checkpoint, body.set, body.directory, body.nodes, idempotency_key=idempotency_key
-    )
 
 
 def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:

@@ -109,6 +109,7 @@ class Operation(StrEnum):
     READ_CHECKPOINTS = "GET /api/runs/{name}/checkpoints"
     READ_METRICS = "GET /api/runs/{name}/metrics"
     RESUME_RUN = "POST /api/runs/{name}/resume"
+    CLONE_RUN = "POST /api/runs/{name}/clone"
 
     @property
     def reads(self) -> bool:

@@ -76,6 +76,7 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
         "checkpoint": str(checkpoints[-1].path) if checkpoints else None,
         "plot": str(plot) if plot.exists() else None,
         "evaluation": evaluation,
+        "parent": description.get("parent"),
     }
 
 
@@ -90,6 +91,8 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
             "created": manifest.get("created"),
             "reward": manifest.get("reward"),
             "score": manifest.get("score"),
+            "scoreError": manifest.get("score_error"),
+            "scoreEpisodes": manifest.get("score_episodes"),
         }
         facts |= {"worlds": manifest.get("worlds"), "worldSize": manifest.get("world_size")}
         if verify:
@@ -102,7 +105,7 @@ def describe_checkpoint(checkpoint: Checkpoint, verify: bool) -> dict[str, Any]:
 
 def spec_of(session: Session, run: Run) -> dict[str, Any] | None:
     """The spec with which a run goes on: that of its newest job, else the one that it was created with. Raises DamagedRow."""
-    newest = _newest_job(session, run)
+    newest = newest_job(session, run)
     if newest:
         with reading(newest):
             return gang_needs(newest.node_properties).spec
@@ -157,8 +160,7 @@ def resume(
             )
         try:
             before = validate(document, f"run {run.name}")
-            resized = [f"nodes={nodes}"] if nodes is not None else []
-            spec = validate(override(document, [*assignments, *resized]), f"run {run.name}")
+            spec = validate(override(document, [*assignments, *resized(assignments, nodes)]), f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
         _check_changes(run, before, spec)
@@ -217,31 +219,60 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         old, new = getattr(before.train, key), getattr(after.train, key)
         if old != new:
             raise ClientError(
-                f"run {run.name}: train.{key} is {shown(old)} and can't become {shown(new)}; start a new run for that"
+                f"run {run.name}: train.{key} is {shown(old)} and can't become {shown(new)}; start a new run for that: "
+                f"muster clone {run.name} --name NEW begins one with its weights"
             )
     name = after.train.algorithm
     was, wanted = before.train.given(), after.train.given()
     for key in getattr(ALGORITHMS.get(name), "fixed", ()):
-        if was.get(key) != wanted.get(key):
-            old, new = ("the task's own" if each.get(key) is None else shown(each[key]) for each in (was, wanted))
+        if (there := setting_at(was, key)) != (here := setting_at(wanted, key)):
+            old, new = ("the task's own" if each is None else shown(each) for each in (there, here))
+            may = key in getattr(ALGORITHMS.get(name), "clone_may_change", ())
             raise ClientError(
                 f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
                 "start a new run for that"
+                + (f": muster clone {run.name} --name NEW begins one with its weights" if may else "")
             )
+
+
+def resized(assignments: Sequence[str], nodes: int | None) -> list[str]:
+    """The change that sets the number of ``nodes``. Raises ClientError where the ``assignments`` set it, too."""
+    if nodes is None:
+        return []
+    for assignment in assignments:
+        if assignment.partition("=")[0].partition(".")[0] == "nodes":
+            raise ClientError(
+                f"--set {excerpt(assignment, 100)}: --nodes {nodes} sets the number of nodes; give one of them"
+            )
+    return [f"nodes={nodes}"]
+
+
+def setting_at(settings: Any, key: str) -> Any:
+    """The setting ``key``, in which a dot leads into a section; None where it is not given."""
+    for part in key.split("."):
+        settings = settings.get(part) if isinstance(settings, dict) else None
+    return settings
 
 
 def _check_rate(run: Run, before: Spec, after: Spec, assignments: Sequence[str]) -> None:
     """Refuse a learning rate that is set to what it is: an adapted rate goes on from the checkpoint, unless the setting differs."""
-    if before.train is None or after.train is None or after.train.given().get("schedule") == "fixed":
+    if before.train is None or after.train is None:
         return
-    key = f"train.{after.train.algorithm}.learning_rate"
-    given = any(assignment.partition("=")[0] == key for assignment in assignments)
-    rate = after.train.given().get("learning_rate")
-    if given and after.train.algorithm == "ppo" and before.train.given().get("learning_rate") == rate:
+    name, given = after.train.algorithm, after.train.given()
+    if name not in _RATES or (name == "ppo" and given.get("schedule") == "fixed"):
+        return
+    key, hint = _RATES[name]
+    asked = any(assignment.partition("=")[0] == f"train.{name}.{key}" for assignment in assignments)
+    rate = setting_at(given, key)
+    if asked and setting_at(before.train.given(), key) == rate:
         raise ClientError(
-            f"run {run.name}: {key} is {rate!r} already, so that the run would go on with "
-            "the rate that its checkpoint has adapted; set another value, or train.ppo.schedule=fixed"
+            f"run {run.name}: train.{name}.{key} is {rate!r} already, so that the run would go on with "
+            f"the rate that its checkpoint has adapted; set another value{hint}"
         )
+
+
+_RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": ("algorithm.learning_rate", "")}
+"""Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
 
 
 def _choose(run: Run, iteration: int | None) -> Checkpoint | None:
@@ -274,7 +305,7 @@ def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint)
         raise ClientError(f"run {run.name}: {error}", CONFLICT) from None
     except DamagedCheckpoint:
         pass  # the worker names it, sets it aside and uses the one before
-    newest = _newest_job(session, run)
+    newest = newest_job(session, run)
     owing = chosen.iteration == after.train.iterations and newest is not None and newest.status == Status.FAILED
     if chosen.iteration >= after.train.iterations and not owing:
         raise ClientError(
@@ -313,14 +344,14 @@ def _worlds_of(session: Session, run: Run, before: Spec, chosen: Checkpoint | No
             return told
     except DamagedCheckpoint:
         pass
-    if newest := _newest_job(session, run):
+    if newest := newest_job(session, run):
         given = gang_needs(newest.node_properties).setting("MUSTER_WORLDS")
         if given.isdecimal() and len(given) < 10:
             return int(given)
     return before.train.worlds * before.ranks_per_node * before.nodes.max
 
 
-def _newest_job(session: Session, run: Run) -> Job | None:
+def newest_job(session: Session, run: Run) -> Job | None:
     return session.scalars(select(Job).where(*_of_run(run)).order_by(Job.created_at.desc()).limit(1)).first()
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import BigInteger, ColumnElement, String, cast, insert, literal, select
@@ -14,17 +13,18 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api import permissions, rules
 from orchestrator.api.arns import definition_arn, job_arn, split_reference
-from orchestrator.api.context import Context, find_run
+from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.members import check_consumables
 from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.sources import check_sources
 from orchestrator.database import note_changed
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.job_secrets import SecretsError
 from orchestrator.jobs import WAITING, Status
 from orchestrator.ownership import owner_of
 from orchestrator.pools import queue_engines
-from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, RunRecord, now
+from orchestrator.tables import Dependency, Job, JobDefinition, JobQueue, now
 from shared_store.layout import NAME
 
 _MOST_DEPENDENCIES = 20
@@ -111,7 +111,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     named = needs.setting("MUSTER_RUN")
     run = named or f"{name[:110]}-{job_id[:8]}"
     _check_run(context, run, bool(named))
-    _check_sources(context, needs, is_waiting=bool(request.get("dependsOn")))
+    check_sources(context, needs, is_waiting=bool(request.get("dependsOn")))
     return Job(
         id=job_id,
         name=name,
@@ -179,37 +179,6 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
         if named and (writer := context.controller.peers.writer(context.controller.store.run(run))):
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
-
-
-def _check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> None:
-    """The runs that a job from YAML evaluates or exports are there, unless it waits for a job that makes them.
-
-    The caller may read them.
-    """
-    for source in sources_of(needs):
-        if not is_waiting:
-            find_run(context.controller, source)
-        if permissions.visible_queues() is not None:
-            nobodys = RunRecord(name=source, queue="")
-            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source)) or nobodys)
-
-
-def sources_of(needs: GangNeeds) -> list[str]:
-    """Names of the runs that a job evaluates or exports; each node reads the spec of its own environment."""
-    specs = {node.environment.get("MUSTER_SPEC", "") for node in needs.nodes}
-    return sorted({run for text in specs for run in _sources(text)})
-
-
-def _sources(spec: str) -> Iterator[str]:
-    """Names of the runs that a spec evaluates or exports."""
-    try:
-        document = json.loads(spec or "{}")
-    except (ValueError, RecursionError):
-        return  # refused where it is read
-    for kind in ("evaluate", "export"):
-        section = document.get(kind) if isinstance(document, dict) else None
-        if isinstance(section, dict) and isinstance(section.get("run"), str):
-            yield section["run"]
 
 
 def _release(job: Job) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -114,6 +115,16 @@ def engine_queue(client: Client, engine: str) -> str:
             + " ".join(f"--engine {name}" for name in (*queues, engine))
         )
     return queues[engine]
+
+
+def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
+    """The change that sends a job to ``queue``. Raises SpecError where ``changes`` name one, too."""
+    if queue is None:
+        return []
+    for change in changes or ():
+        if change.partition("=")[0] == "queue":
+            raise SpecError(f"--set {change}: --queue or --engine sets the queue ({queue}); give one of them")
+    return [f"queue={json.dumps(queue)}"]
 
 
 def check_engine(name: str) -> None:
@@ -243,6 +254,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "took": _took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"],
+        "begun with": begun_with((detail["results"] or {}).get("parent")),
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
     }
     results = detail["results"] or {}
@@ -281,6 +293,22 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
+
+
+def begun_with(parent: Mapping[str, Any] | None) -> str:
+    """Where a clone has its weights from, in one line; nothing of a run that is no clone."""
+    if not parent:
+        return ""
+    score = scored(parent.get("score"), parent.get("score_error"))
+    told = f", score {score}" if score != "-" else ""
+    return f"the weights of {parent.get('run')}@{parent.get('iteration')} (checkpoint {parent.get('checkpoint')}{told})"
+
+
+def scored(score: float | None, error: float | None) -> str:
+    """A score with its standard error, where that is known: ``812.30 ± 4.10``."""
+    if score is None:
+        return "-"
+    return f"{score:.2f}" + (f" ± {error:.2f}" if error is not None else "")
 
 
 def stop(

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue, scored
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
@@ -35,7 +35,7 @@ def resume(
 ) -> None:
     """Go on with a run from its newest checkpoint, at the next iteration."""
     with Client.connect() as client:
-        elsewhere = [f"queue={engine_queue(client, engine)}"] if engine is not None else []
+        elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
         body = {
             "checkpoint": checkpoint,
             "nodes": nodes,
@@ -73,7 +73,8 @@ def checkpoints(
             table.add_column(column, no_wrap=True)
         best = max((each["score"] for each in found if each.get("score") is not None), default=None)
         for each in found:
-            reward, score = ("-" if each.get(key) is None else f"{each[key]:.2f}" for key in ("reward", "score"))
+            reward = "-" if each.get("reward") is None else f"{each['reward']:.2f}"
+            score = scored(each.get("score"), each.get("scoreError"))
             size = f"{each['size'] / 2**20:.1f} MiB" if "size" in each else "-"
             created = (
                 time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each["created"])) if each.get("created") else "-"

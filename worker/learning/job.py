@@ -66,6 +66,8 @@ class Job:
     id: str
     checkpoint: str | None = None
     """Name of a checkpoint that a person chose to start from."""
+    parent: str | None = None
+    """``RUN@ITERATION`` whose weights a clone begins with."""
     section: dict[str, Any] = field(default_factory=dict)
     """The part of the YAML for this command: ``train``, ``evaluate`` or ``export``."""
 
@@ -90,7 +92,8 @@ class Job:
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
         chosen = env.get("MUSTER_CHECKPOINT") or None
-        return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, section)
+        parent = env.get("MUSTER_PARENT") or None
+        return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, parent, section)
 
     def named_run(self) -> Run:
         """The run that the section names (of ``evaluate`` and ``export``), else the job's own."""

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from shared_store.checkpoints import Checkpoint
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
 from worker.learning import algorithms
+from worker.learning.adoption import adopt
 from worker.learning.algorithm import Share
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
@@ -40,6 +42,8 @@ EVALUATED = 256
 """At most so many worlds of each rank are built to evaluate a policy: those of training still hold their memory."""
 WARNINGS = 10
 """At most so many iterations with worlds that were reset have a line of their own."""
+EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
+"""Those of a task's statistics that become reward, episode length and score; the others are told by their names."""
 SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
 """What the ranks tell each other once an iteration, besides the statistics: how many were asked to stop, how many to save now, how
 many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
@@ -68,26 +72,21 @@ class Loop:
         settings = algorithms.settings(chosen, self.algorithm_name, self.config, job.section)
         self.share = share
         self.algorithm = build_algorithm(chosen, settings, self.task, share, gang, self.seed)
-        if teacher := getattr(settings, "teacher_checkpoint", None):
-            with user_errors("train"):
-                self.algorithm.load_teacher(self._weights_of(teacher))  # type: ignore[attr-defined]
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
         self.incident = Incident(self.task, share, self.algorithm.steps, job.section, self.seed)
         seed_generators(self.seed, gang.rank)
         self.iterated = 0
         """Iterations that this process has done."""
-        self.state = TrainingState(
-            job,
-            gang,
-            share,
-            self.task,
-            self.algorithm,
-            describe(job, self.task, self.config, self.algorithm_name, settings),
-            int(checkpoints.get("keep", 5)),
-        )
+        facts = describe(job, self.task, self.config, self.algorithm_name, settings)
+        keep = int(checkpoints.get("keep", 5))
+        self.state = TrainingState(job, gang, share, self.task, self.algorithm, facts, keep)
         self.resumed = self.state.restore()
+        self.adopted: Checkpoint | None = None
+        """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
         if self.resumed is None:
+            self.adopted = adopt(job, gang, self.algorithm, facts)
+            self._load_teacher(getattr(settings, "teacher_checkpoint", None))
             self.task.set_random_episode_length()
         self.task.clear_statistics()
         self._stopwatch = Stopwatch(gang.device)
@@ -113,6 +112,13 @@ class Loop:
         self.beacon = Beacon()
         self.state.saver.start()
         end_startup()
+
+    def _load_teacher(self, reference: str | None) -> None:
+        """Give the algorithm its teacher, unless it has it already: a checkpoint holds the teacher that was named for it."""
+        adopted = self.adopted.manifest.get("settings") or {} if self.adopted else {}
+        if reference and adopted.get("teacher_checkpoint") != reference:
+            with user_errors("train"):
+                self.algorithm.load_teacher(self._weights_of(reference))  # type: ignore[attr-defined]
 
     def _weights_of(self, reference: str) -> dict[str, Any]:
         """What the algorithm of another run has learnt, ``RUN`` or ``RUN@ITERATION``. All ranks call it."""
@@ -190,6 +196,10 @@ class Loop:
     def _beginning(self) -> str:
         ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
         there = f"{self.share.total} worlds on {ranks}"
+        if self.adopted:
+            parent = (self.job.run.description() or {}).get("parent") or {}
+            of = f"{parent.get('run')}@{self.adopted.iteration} (checkpoint {self.adopted.name})"
+            return f"starting from the weights of {of}: {there}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
         size = self.resumed.size / 1e6
@@ -308,13 +318,15 @@ class Loop:
         self.state.seconds += took
         self._iteration_seconds, self._collect_seconds = took, collect
         stall, self._stall_seconds = self._stall_seconds, 0.0
-        finished, returns, lengths, *others = totals
+        known = dict(zip(self.task.statistic_names, totals, strict=True))
+        finished, returns, lengths, squares = map(known.pop, EPISODES)
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
         progress.count(
             self.algorithm.steps,
             finished,
             returns,
+            squares,
             worlds=self.share.total,
             longest=self.task.max_episode_length,
         )
@@ -324,6 +336,7 @@ class Loop:
             "reward": progress.reward,
             "episode_length": progress.episode_length,
             "score": progress.score,
+            "score_error": progress.score_error,
             "episodes": int(finished),
             "steps_per_second": steps / took,  # by the clock, over everything
             "collect_seconds": collect,
@@ -335,10 +348,7 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{
-                name: _figure(name, value, finished)
-                for name, value in zip(self.task.statistic_names[3:], others, strict=True)
-            },
+            **{name: _figure(name, value, finished) for name, value in known.items()},
         }
 
     def _finish(self) -> None:

@@ -8,6 +8,7 @@ Files are written with ``torch.save`` and only ever read with ``weights_only=Tru
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -27,6 +28,7 @@ from shared_store.epoch import check_epoch
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithms import BUILT_IN
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
@@ -50,11 +52,16 @@ class Progress:
     """Their mean length [steps]."""
     score: float | None = None
     """Mean return of the newest episodes, over enough of them to compare checkpoints; None until there are enough."""
+    score_error: float | None = None
+    """Standard error of the score: the standard deviation of these episodes' returns over the square root of their number."""
+    score_episodes: int = 0
+    """How many episodes the score is a mean of."""
     recent: list[list[float]] = field(default_factory=list)
-    """The newest iterations, as many as the score needs: steps of each world, episodes that ended, and the sum of their returns."""
+    """The newest iterations, as many as the score needs: steps of each world, episodes that ended, the sum of their returns, and the
+    sum of the squares of these."""
 
-    def count(self, steps: int, episodes: float, returns: float, *, worlds: int, longest: int) -> None:
-        """Note what ended in an iteration, and work out the score.
+    def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
+        """Note what ended in an iteration, and work out the score and its error.
 
         The score covers at least :data:`EPISODES` episodes, one for each world, and at least as many steps as an episode can have: over
         less, only those that ended early would count, which are falls.
@@ -63,16 +70,22 @@ class Progress:
             steps: Of each world.
             episodes: How many ended, in the worlds of all ranks.
             returns: Sum of their returns.
+            squares: Sum of the squares of their returns.
             worlds: Of all ranks.
             longest: Steps of the longest episode.
         """
-        self.recent.append([steps, episodes, returns])
-        span = ended = total = 0.0
+        self.recent.append([steps, episodes, returns, squares])
+        span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
             entry = self.recent[index]
             span, ended, total = span + entry[0], ended + entry[1], total + entry[2]
+            spread += (
+                entry[3] if len(entry) > 3 else math.nan
+            )  # of a checkpoint that was saved before there were squares
             if span >= longest and ended >= max(EPISODES, worlds):
-                self.score = total / ended
+                self.score, self.score_episodes = total / ended, int(ended)
+                variance = max(0.0, spread - total * total / ended) / (ended - 1) if math.isfinite(spread) else None
+                self.score_error = None if variance is None else math.sqrt(variance / ended)
                 del self.recent[:index]
                 return
 
@@ -161,6 +174,8 @@ class TrainingState:
             "shards": [[share.first, share.count] for share in shares],
             "reward": self.progress.reward,
             "score": self.progress.score,
+            "score_error": self.progress.score_error,
+            "score_episodes": self.progress.score_episodes,
             "episode_length": self.progress.episode_length,
             "env_steps": self.progress.env_steps,
             "learning_rate": self.learning_rate,
@@ -240,13 +255,14 @@ class TrainingState:
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
         fixed = getattr(self.algorithm.config_type, "fixed", ())
-        settings = [("settings", key) for key in fixed if key in there["settings"]]
+        paths = [key.split(".") for key in fixed]  # a dot leads into a section
+        settings = [("settings", *path) for path in paths if path[0] in there["settings"]]
         for path in [("task",), ("algorithm",), *(("train", key) for key in ("seed", "config")), *settings]:
             old, new = _at(there, path), _at(here, path)
             if old != new:
                 raise UserError(
                     f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {_called(path, there)} is "
-                    f"{old!r} there and {new!r} here; start a new run for that"
+                    f"{old!r} there and {new!r} here; start a new run for that (`muster clone` begins one with its weights)"
                 )
 
     def _load_worlds(self, checkpoint: Checkpoint) -> None:
@@ -275,7 +291,8 @@ _OF_ALGORITHM = "algorithm/"
 
 def _called(path: tuple[str, ...], manifest: Any) -> str:
     """How a job's YAML calls it: settings stand under the algorithm's name."""
-    return ".".join((manifest["algorithm"] if part == "settings" else part) for part in path)
+    name = manifest["algorithm"]
+    return ".".join((name if part == "settings" and name in BUILT_IN else part) for part in path)
 
 
 def _at(facts: Any, path: tuple[str, ...]) -> Any:

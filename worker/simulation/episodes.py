@@ -49,7 +49,8 @@ class EpisodeArrays:
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
-            a reward term, worlds reset because of NaN, control steps with a solver overflow; shape ``(5 + terms,)``.
+            a reward term, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns;
+            shape ``(6 + terms,)``.
     """
 
     actions: wp.array2d(dtype=wp.float32)
@@ -181,6 +182,8 @@ def end_step(
             wp.atomic_add(episodes.statistics, 0, wp.float64(1.0))
             for column in range(episodes.sums.shape[1]):
                 wp.atomic_add(episodes.statistics, 1 + column, wp.float64(episodes.sums[world, column]))
+            whole = wp.float64(episodes.sums[world, RETURN])
+            wp.atomic_add(episodes.statistics, TERMS + terms + 3, whole * whole)
     return done
 
 

@@ -114,6 +114,7 @@ class Task:
             *(f"reward_{name}" for name in self.reward_terms),
             "nan_worlds",
             "solver_overflows",
+            "squared_return",
         )
         self.first_world = first_world
         template = newton.ModelBuilder()

@@ -115,6 +115,12 @@ def test_resume_requests(fuzzed: Fuzzed, call: Call) -> None:
     fuzzed.send(call)
 
 
+@share(0.03)
+@given(call=fuzzing.clone_calls())
+def test_clone_requests(fuzzed: Fuzzed, call: Call) -> None:
+    fuzzed.send(call)
+
+
 def test_the_native_api_by_its_own_schema(fuzzed: Fuzzed) -> None:
     schema = schemathesis.openapi.from_url(
         f"{fuzzed.url}/api/openapi.json", headers={"Authorization": f"Bearer {TOKEN}"}

@@ -78,6 +78,7 @@ TABLE = {
     Operation.READ_CHECKPOINTS: OWN_READ,
     Operation.READ_METRICS: OWN_READ,
     Operation.RESUME_RUN: OWN_WRITE,
+    Operation.CLONE_RUN: OWN_WRITE,
 }
 ARN = "arn:aws:batch:us-east-1:000000000000:"
 
@@ -168,6 +169,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.READ_CHECKPOINTS),
         of_ours(of.READ_METRICS),
         of_ours(of.RESUME_RUN, {}),
+        of_ours(of.CLONE_RUN, {"name": "x"}),
     ]
     return dict(zip(Operation, found, strict=True))
 
@@ -285,7 +287,9 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
     for change in ("name=labs2", "queue=lab"):
         refused(foreign, lab.post, f"/api/runs/{world.run}/resume", {"set": [change, "queue=lab"]})
     waits = lab.batch("SubmitJob", jobName="x", jobQueue="lab", jobDefinition=own)["jobId"]
-    for section in ({"evaluate": {"run": world.run}}, {"export": {"run": world.run}}):
+    refused(foreign, lab.post, f"/api/runs/{world.run}/clone", {"name": "labs-own", "set": ["queue=lab"]})
+    teacher = {"train": {"task": "Cartpole", "rsl_rl": {"teacher_checkpoint": f"{world.run}@3"}}}
+    for section in ({"evaluate": {"run": world.run}}, {"export": {"run": world.run}}, teacher):
         spec = json.dumps({"name": "x", **section})
         refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_SPEC=spec))
         later = {**submission(own, "lab", MUSTER_SPEC=spec), "dependsOn": [{"jobId": waits}]}

@@ -221,7 +221,19 @@ def test_a_run_that_no_spec_started_is_not_resumed_blindly(shared_server: Servin
 
 def test_help_has_examples_for_every_command(tmp_path: Path) -> None:
     listing = call_muster("--help", home=tmp_path).stdout
-    for command in ("run", "serve", "submit", "list", "show", "stop", "schema", "logs", "resume", "checkpoints"):
+    for command in (
+        "run",
+        "serve",
+        "submit",
+        "list",
+        "show",
+        "stop",
+        "schema",
+        "logs",
+        "resume",
+        "clone",
+        "checkpoints",
+    ):
         assert f" {command} " in listing
         assert "Example" in call_muster(command, "--help", home=tmp_path).stdout or command == "schema"
 

@@ -344,6 +344,16 @@ def stray_calls(draw: st.DrawFn) -> Call:
 
 
 @st.composite
+def clone_calls(draw: st.DrawFn) -> Call:
+    """POST …/clone of a run that exists."""
+    changes = draw(st.lists(st.one_of(st.sampled_from(CHANGES), st.sampled_from(ODD_TEXTS)), max_size=2))
+    request: dict[str, Any] = {"set": changes, "name": draw(st.one_of(st.just("copy"), st.sampled_from(ODD_TEXTS)))}
+    request |= draw(st.sampled_from(({}, {"nodes": 2}, {"checkpoint": "best"}, {"checkpoint": -(10**30)})))
+    body = draw(encoded(st.one_of(st.just(request), mutated(st.just(request)))))
+    return Call("POST", "/api/runs/<run>/clone", body, draw(_headers()))
+
+
+@st.composite
 def resume_calls(draw: st.DrawFn) -> Call:
     """POST …/resume of a run that exists: what goes on behind it is compiled, registered and submitted."""
     changes = draw(st.lists(st.one_of(st.sampled_from(CHANGES), st.sampled_from(ODD_TEXTS)), max_size=2))

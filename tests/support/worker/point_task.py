@@ -42,7 +42,7 @@ class Point:
     """Push a point to the middle: 2 observations (place, velocity), 1 action."""
 
     config_type = PointConfig
-    statistic_names = ("episodes", "episode_return", "episode_length", "reward_place")
+    statistic_names = ("episodes", "episode_return", "episode_length", "reward_place", "squared_return")
     action_size, observation_shape = 1, (2,)
     action_names = ("push",)
     observation_names = ("place", "velocity")
@@ -66,7 +66,7 @@ class Point:
         self.dones = torch.zeros(world_count, dtype=torch.bool)
         self.time_outs = torch.zeros(world_count, dtype=torch.bool)
         self.episode_length = torch.zeros(world_count, dtype=torch.int32)
-        self.statistics = torch.zeros(4, dtype=torch.float64)
+        self.statistics = torch.zeros(5, dtype=torch.float64)
         self.mishap = torch.zeros(1, dtype=torch.int32)
         self.reset()
 
@@ -109,7 +109,8 @@ class Point:
         self.terminal_observations.copy_(torch.stack((self.place, self.velocity), 1))
         ended = self.dones.double()
         returns, lengths = (self._sums * ended).sum(), (self.episode_length * ended).sum()
-        self.statistics += torch.stack((ended.sum(), returns, lengths, returns))
+        squares = (self._sums * ended).double().square().sum()
+        self.statistics += torch.stack((ended.sum(), returns, lengths, returns, squares))
         self._restart(self.dones)
 
     def clear_statistics(self) -> None:

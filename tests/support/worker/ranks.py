@@ -62,7 +62,9 @@ def run_ranks(
 def training(store: Path, *, epoch: int = 1, run: str = "run", **train: Any) -> dict[str, str]:
     """The environment of a training job on :class:`tests.support.worker.point_task.Point`."""
     checkpoint = {"every": train.pop("every", 100), "keep": train.pop("keep", 10)}
-    extra = {key: str(train.pop(key)) for key in ("MUSTER_CHECKPOINT", "MUSTER_JOB_EPOCH") if key in train}
+    extra = {
+        key: str(train.pop(key)) for key in ("MUSTER_CHECKPOINT", "MUSTER_JOB_EPOCH", "MUSTER_PARENT") if key in train
+    }
     section = {"task": "Point", "worlds": 8, "iterations": 6, "seed": 3, **train}
     spec = {"name": "point", "train": section, "checkpoint": checkpoint}
     return {

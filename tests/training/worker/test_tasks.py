@@ -138,12 +138,13 @@ def test_replay_does_what_the_launches_do(cartpole: Cartpole) -> None:
 def test_statistics_are_sums_over_finished_episodes(cartpole: Cartpole) -> None:
     put(cartpole)
     returns, lengths = torch.zeros(8, dtype=torch.float64), torch.zeros(8)
-    episodes, total_return, total_length = 0, 0.0, 0.0
+    episodes, total_return, total_length, squares = 0, 0.0, 0.0, 0.0
     for _, rewards, dones, _ in play(cartpole, 200, seed=4):
         returns += rewards
         lengths += 1
         episodes += int(dones.sum())
         total_return += returns[dones].sum().item()
+        squares += returns[dones].square().sum().item()
         total_length += lengths[dones].sum().item()
         returns[dones] = 0
         lengths[dones] = 0
@@ -151,6 +152,7 @@ def test_statistics_are_sums_over_finished_episodes(cartpole: Cartpole) -> None:
     assert episodes > 20
     assert totals["episodes"] == episodes and totals["episode_length"] == total_length
     assert totals["episode_return"] == pytest.approx(total_return, rel=1e-5)
+    assert totals["squared_return"] == pytest.approx(squares, rel=1e-5)
     assert sum(totals[f"reward_{term}"] for term in Cartpole.reward_terms) == pytest.approx(total_return, rel=1e-5)
     cartpole.clear_statistics()
     assert not cartpole.statistics.any()

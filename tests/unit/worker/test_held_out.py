@@ -25,7 +25,7 @@ def scores(iterations: list[tuple[int, float]], **settings: int) -> list[float |
     """The score after each iteration of 10 steps, of (episodes that ended, their mean return)."""
     progress, found = Progress(), []
     for episodes, mean in iterations:
-        progress.count(10, episodes, episodes * mean, **settings)
+        progress.count(10, episodes, episodes * mean, episodes * mean**2, **settings)
         found.append(progress.score)
     return found
 
@@ -49,10 +49,29 @@ def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_
     assert better[-1] == pytest.approx(20.0)
 
 
+def test_a_score_tells_its_standard_error(tmp_path: Path) -> None:
+    returns = torch.randn(4, 75, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 3.0 + 800.0
+    progress = Progress()
+    for part in returns:
+        progress.count(10, len(part), float(part.sum()), float(part.square().sum()), worlds=200, longest=10)
+    covered = returns[1:].flatten()  # the newest iterations that have an episode of each world
+    assert progress.score_episodes == 225 and progress.score == pytest.approx(float(covered.mean()))
+    assert progress.score_error == pytest.approx(float(covered.std()) / 225**0.5, rel=1e-6)
+
+
+def test_a_score_of_which_a_part_was_saved_without_squares_has_no_error_until_that_part_is_old() -> None:
+    progress = Progress(recent=[[10, 100, 100.0]])  # as Muster saved it before
+    found = []
+    for _ in range(3):
+        progress.count(10, 100, 100.0, 100.0, worlds=100, longest=20)
+        found.append((progress.score, progress.score_error))
+    assert found == [(1.0, None), (1.0, 0.0), (1.0, 0.0)]
+
+
 def test_only_what_the_score_needs_is_kept() -> None:
     progress = Progress()
     for _ in range(1000):
-        progress.count(10, 50, 50.0, worlds=100, longest=40)
+        progress.count(10, 50, 50.0, 50.0, worlds=100, longest=40)
     assert len(progress.recent) == 4
 
 
@@ -62,6 +81,8 @@ def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -
     train(training(tmp_path, run="stopped", worlds=64, iterations=8, epoch=2))
     straight, stopped = (list_checkpoints(Store(tmp_path).run(name))[-1].manifest for name in ("straight", "stopped"))
     assert isinstance(straight["score"], float) and straight["score"] == stopped["score"] != straight["reward"]
+    assert straight["score_error"] == stopped["score_error"] > 0.0
+    assert straight["score_episodes"] == stopped["score_episodes"] >= 100
 
 
 # -- evaluation ------------------------------------------------------------------------------------------------------

@@ -150,8 +150,10 @@ def test_weights_alone_are_taken_over_with_fresh_optimizers() -> None:
     fresh = make(task, critic_learning_rate=0.123)
     fresh.load_state_dict(sac.state_dict(), weights_only=True)
     mine, theirs = fresh.state_dict(), sac.state_dict()
-    for part in ("policy", "critics", "targets", "log_temperature", "updates"):
+    for part in ("policy", "critics", "targets", "updates"):
         assert same(mine[part], theirs[part])
+    assert float(fresh.learner.temperature) == pytest.approx(fresh.config.init_temperature), "it is worth in rewards"
+    assert float(sac.learner.temperature) != pytest.approx(fresh.config.init_temperature)
     assert not mine["critic_optimizer"]["state"] and theirs["critic_optimizer"]["state"]
     full = make(task, critic_learning_rate=0.123)
     full.load_state_dict(sac.state_dict())

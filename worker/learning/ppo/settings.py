@@ -81,6 +81,8 @@ class PPOConfig:
         *("init_std", "channels", "kernel_sizes", "strides", "optimizer"),
     )
     """What a resumed run can't change: checkpoints hold what became of it."""
+    clone_may_change: ClassVar[tuple[str, ...]] = ("optimizer",)
+    """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
     elsewhere: ClassVar[dict[str, str]] = {
         **dict.fromkeys(
             ("rnd_cfg", "symmetry_cfg", "rnn_type", "rnn_hidden_dim", "class_name", "distribution_cfg"),

@@ -84,8 +84,19 @@ class RslRlConfig:
     torch_compile_mode: str | None = None
     """Compile the networks with ``torch.compile``: ``default`` or ``max-autotune-no-cudagraphs``."""
 
-    fixed: ClassVar[tuple[str, ...]] = ("obs_groups", "actor", "critic", "student", "teacher")
-    """What a resumed run can't change: checkpoints hold what became of it."""
+    fixed: ClassVar[tuple[str, ...]] = (
+        *("obs_groups", "actor", "critic", "student", "teacher", "teacher_checkpoint"),
+        *("algorithm.class_name", "algorithm.optimizer"),
+        *(f"algorithm.rnd_cfg.{name}" for name in ("num_outputs", "predictor_hidden_dims", "target_hidden_dims")),
+        *(f"algorithm.rnd_cfg.{name}" for name in ("activation", "state_normalization", "reward_normalization")),
+        "algorithm.rnd_cfg.learning_rate",
+    )
+    """What a resumed run can't change: checkpoints hold what became of it. A dot leads into a section."""
+    clone_may_change: ClassVar[tuple[str, ...]] = (
+        "teacher_checkpoint",
+        *(name for name in fixed if name.startswith("algorithm.")),
+    )
+    """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
     elsewhere: ClassVar[Mapping[str, str]] = REFUSED
     """What people look for here, and what to use instead."""
 

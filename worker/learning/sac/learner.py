@@ -191,13 +191,17 @@ class Learner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], *, weights_only: bool = False) -> None:
-        """Go on from :meth:`state_dict`; ``weights_only``: with fresh optimizers."""
+        """Go on from :meth:`state_dict`; ``weights_only``: with fresh optimizers and the temperature of the settings.
+
+        The temperature weighs entropy against rewards, which may be others now.
+        """
         self.actor.load_state_dict(state["policy"])
         self.critics.load_state_dict(state["critics"])
         self.targets.load_state_dict(state["targets"])
         for normalizer, saved in zip(self.normalizers[1:], state["critic_normalizers"], strict=True):
             normalizer.load_state_dict(saved)
-        self.log_temperature.data.copy_(state["log_temperature"])
+        if not weights_only:
+            self.log_temperature.data.copy_(state["log_temperature"])
         for name, optimizer in (("policy", self._policy_optimizer), ("critic", self._critic_optimizer)):
             if weights_only:
                 optimizer.state.clear()

@@ -105,9 +105,11 @@ class SACConfig:
 
     fixed: ClassVar[tuple[str, ...]] = (
         *("actor_sizes", "critic_sizes", "critics", "layer_norm", "critic_group", "normalize_observations"),
-        *("atoms", "v_min", "v_max", "replay_steps", "save_replay", "action_limit"),
+        *("atoms", "v_min", "v_max", "replay_steps", "save_replay", "action_limit", "init_std", "init_temperature"),
     )
     """What a resumed run can't change: checkpoints hold what became of it."""
+    clone_may_change: ClassVar[tuple[str, ...]] = ("replay_steps", "save_replay", "init_temperature")
+    """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
 
     @model_validator(mode="after")
     def _fits(self) -> SACConfig:

@@ -1,0 +1,78 @@
+"""``muster clone``."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated
+
+import typer
+
+from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.progress import follow
+from orchestrator.cli.terminal import echo, echo_json
+from orchestrator.client import Client, named
+from orchestrator.errors import UsageError
+
+_EXAMPLES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
+muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2"""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=_EXAMPLES)(clone)
+
+
+def clone(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN[@ITERATION|@best]",
+            help="Whose weights: of its newest checkpoint, of that of an iteration, or of the one with the best score.",
+        ),
+    ],
+    name: Annotated[str, typer.Option(help="Of the new run, and of its job.")],
+    set_: SetOption = None,
+    nodes: Annotated[int | None, typer.Option(min=1, help="Another number of nodes.")] = None,
+    queue: Annotated[str | None, typer.Option(help="Another queue.")] = None,
+    engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
+    follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Start a new run with the weights of a checkpoint, and with nothing else of it.
+
+    Networks and normalisers are taken over; the optimizer, the learning rate, the worlds and the curriculum begin anew, at
+    iteration 0, with the settings of RUN and the changes of --set: other rewards, another configuration of the task, another seed.
+    """
+    run, checkpoint = split_reference(source)
+    if queue is not None and engine is not None:
+        raise UsageError("--queue and --engine: an engine is chosen by its queue; leave one of them out")
+    with Client.connect() as client:
+        elsewhere = queue if engine is None else engine_queue(client, engine)
+        body = {
+            "name": name,
+            "checkpoint": checkpoint,
+            "nodes": nodes,
+            "set": [*(set_ or []), *on_queue(set_, elsewhere)],
+            "directory": os.getcwd(),
+        }
+        cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)
+        if as_json:
+            echo_json(cloned)
+        else:
+            parent = cloned["parent"]
+            echo(f"cloned {parent['run']}@{parent['iteration']} as run {cloned['run']}, job {cloned['jobId']}")
+            if not follow_:
+                echo(f"follow it with: muster logs {cloned['jobId'][:8]} -f")
+        if follow_:
+            raise typer.Exit(follow(client, cloned["jobId"]))
+
+
+def split_reference(text: str) -> tuple[str, int | str | None]:
+    """Run and checkpoint of ``RUN``, ``RUN@ITERATION`` or ``RUN@best``. Raises UsageError."""
+    run, sign, at = text.partition("@")
+    if not sign:
+        return run, None
+    if at == "best":
+        return run, at
+    if at.isascii() and at.isdecimal() and len(at) < 10:
+        return run, int(at)
+    raise UsageError(f"{text}: after @ stands an iteration, or best; `muster checkpoints {run}` lists the iterations")

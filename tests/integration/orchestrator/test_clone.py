@@ -1,0 +1,266 @@
+"""`muster clone` through a real server: what it takes over, what it refuses before a job exists, and what it leaves in the store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.checkpoints import FORMAT, list_checkpoints
+from shared_store.layout import Run, Store
+from shared_store.parent import parent_checkpoint
+from tests.conftest import Serving
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    """A server whose only CPU is taken: what is submitted waits. Its store has a run with three checkpoints."""
+    server = Serving(tmp_path_factory.mktemp("home"), "--cpus", "1")
+    blocker = server.gang("import time; time.sleep(3600)", cpus="1", name="blocker")
+    server.wait(blocker, "RUNNING")
+    store = Store(server.home / "store")
+    add_run(store, "taught")
+    add_checkpoint(store, "taught", 3, b"three", score=5.0, score_error=0.5, score_episodes=120, reward=1.0)
+    add_checkpoint(store, "taught", 6, b"six", score=9.25, score_error=0.25, score_episodes=110, reward=0.0)
+    add_checkpoint(store, "taught", 9, b"nine", score=7.0, score_error=0.5, score_episodes=130, reward=99.0)
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def store(full: Serving) -> Store:
+    return Store(full.home / "store")
+
+
+def clone(server: Serving, source: str, name: str, *options: str) -> dict[str, Any]:
+    done = server.muster("clone", source, "--name", name, "--json", *options)
+    assert done.returncode == 0, done.stderr
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def refused(server: Serving, code: int, source: str, name: str, *options: str) -> str:
+    """The one line with which it refuses; neither a job nor a run nor a hidden copy is left."""
+    jobs = [each["jobId"] for each in jobs_of(server)]
+    runs = sorted(path.name for path in (server.home / "store" / "runs").iterdir())
+    done = server.muster("clone", source, "--name", name, *options)
+    assert done.returncode == code and len(done.stderr.splitlines()) == 1, (done.returncode, done.stderr)
+    assert [each["jobId"] for each in jobs_of(server)] == jobs
+    assert sorted(path.name for path in (server.home / "store" / "runs").iterdir()) == runs
+    return done.stderr
+
+
+def jobs_of(server: Serving) -> list[dict[str, Any]]:
+    filters = [{"name": "AFTER_CREATED_AT", "values": ["0"]}]
+    found: list[dict[str, Any]] = server.client.batch("ListJobs", jobQueue="default", filters=filters)["jobSummaryList"]
+    return found
+
+
+def spec_of(server: Serving, job: str) -> dict[str, Any]:
+    found: dict[str, Any] = server.detail(job)["spec"]
+    return found
+
+
+def weights(run: Run) -> bytes:
+    parent = parent_checkpoint(run)
+    assert parent is not None
+    return (parent.path / "learner.pt").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("reference", "iteration", "held"), [("taught", 9, b"nine"), ("taught@3", 3, b"three"), ("taught@best", 6, b"six")]
+)
+def test_the_newest_a_named_and_the_best_checkpoint(
+    full: Serving, store: Store, reference: str, iteration: int, held: bytes
+) -> None:
+    name = f"of-{iteration}"
+    answer = clone(full, reference, name)
+    assert answer["run"] == name and answer["jobName"] == name and answer["parent"]["iteration"] == iteration
+    assert weights(store.run(name)) == held
+    description = store.run(name).description()
+    assert description is not None and description["job"] == answer["jobId"]
+    lineage = description["parent"]
+    assert lineage["run"] == "taught" and lineage["checkpoint"] == f"{iteration:08d}-e1"
+    assert lineage == full.client.get(f"/api/runs/{name}")["parent"] == answer["parent"]
+    assert full.client.get("/api/runs/taught")["parent"] is None
+    assert spec_of(full, answer["jobId"]) == {**spec_of(full, answer["jobId"]), "name": name}
+    assert spec_of(full, answer["jobId"])["train"]["ppo"]["hidden_sizes"] == [8]
+    assert [path.name for path in (store.run(name).path / "parent" / f"{iteration:08d}-e1").iterdir()] != []
+
+
+def test_show_and_checkpoints_say_where_the_weights_are_from_and_how_sure_the_score_is(full: Serving) -> None:
+    clone(full, "taught@best", "shown")
+    said = " ".join(full.muster("show", "shown").stdout.split())
+    assert "begun with: the weights of taught@6 (checkpoint 00000006-e1, score 9.25 ± 0.25)" in said
+    listed = full.muster("checkpoints", "taught").stdout
+    assert "9.25 ± 0.25" in listed and "the best" in next(line for line in listed.splitlines() if "9.25" in line)
+    (first, *_) = full.client.get("/api/runs/taught/checkpoints")
+    assert (first["score"], first["scoreError"], first["scoreEpisodes"]) == (5.0, 0.5, 120)
+
+
+def test_the_changes_are_in_the_new_run_s_spec(full: Serving) -> None:
+    changes = ["train.config.rewards.alive=2.5", "train.seed=5", "train.iterations=50", "train.ppo.optimizer=adamw"]
+    options = [part for change in changes for part in ("--set", change)]
+    spec = spec_of(full, clone(full, "taught", "changed", *options, "--nodes", "1")["jobId"])
+    assert spec["train"]["config"] == {"rewards": {"alive": 2.5}} and spec["train"]["seed"] == 5
+    assert spec["train"]["iterations"] == 50 and spec["train"]["ppo"]["optimizer"] == "adamw"
+
+
+def test_a_waiting_clone_needs_its_source_no_more_and_may_itself_be_resumed(full: Serving, store: Store) -> None:
+    add_run(store, "gone", {**SPEC, "name": "gone"})
+    add_checkpoint(store, "gone", 5, b"kept")
+    job = clone(full, "gone", "heir")["jobId"]
+    shutil.rmtree(store.run("gone").path)
+    assert weights(store.run("heir")) == b"kept"
+    full.client.batch("TerminateJob", jobId=job, reason="test")
+    full.wait(job)
+    resumed = full.client.post("/api/runs/heir/resume", {})
+    assert resumed["iteration"] == 0 and weights(store.run("heir")) == b"kept"
+
+
+def test_a_second_call_with_the_same_key_answers_what_the_first_did(full: Serving) -> None:
+    import httpx
+
+    def call(name: str) -> httpx.Response:
+        headers = {"X-Muster-Idempotency-Key": "the-same"}
+        body = {"name": name}
+        return httpx.post(f"{full.url}/api/runs/taught/clone", json=body, headers=headers, trust_env=False, timeout=60)
+
+    first, second, other = call("once"), call("once"), call("twice")
+    assert first.status_code == 200 and first.json() == second.json()
+    assert other.status_code == 409 and "used for another request" in other.json()["message"]
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "options", "code", "parts"),
+    [
+        ("nobody", "x", (), 2, ["run nobody does not exist"]),
+        ("taught@4", "x", (), 2, ["run taught has no checkpoint of iteration 4; it has: 3, 6, 9"]),
+        ("taught@last", "x", (), 2, ["taught@last: after @ stands an iteration, or best", "muster checkpoints taught"]),
+        ("taught", "taught", (), 1, ["run taught exists already: give the clone another --name"]),
+        ("taught", "a b", (), 2, ["clone of run taught: name: expected letters"]),
+        ("taught", "a.b", (), 2, ["clone of run taught: name: expected letters, digits, '_' and '-'"]),
+        ("empty", "x", (), 2, ["run empty has no checkpoint yet, so there are no weights to begin with"]),
+        ("script", "x", (), 2, ["run script is a command job, and only a training has weights to begin with"]),
+        ("batch", "x", (), 2, ["run batch was not started from a YAML spec"]),
+        (
+            "unscored@best",
+            "x",
+            (),
+            2,
+            ["no checkpoint has a score yet, which is a mean over at least 100 episodes", ": 2"],
+        ),
+        ("old", "x", (), 1, ["checkpoint 00000002-e1 is of an older Muster"]),
+        ("altered", "x", (), 1, ["checkpoint 00000004-e1: the content of learner.pt was altered", "another (2)"]),
+        ("missing", "x", (), 1, ["checkpoint 00000002-e1: learner.pt is missing; choose another (there is none)"]),
+        ("newer", "x", (), 1, [f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster"]),
+        (
+            "taught",
+            "x",
+            ("--set", "train.ppo.hidden_sizes=[9]"),
+            2,
+            ["train.ppo.hidden_sizes [8] and does not fit [9]"],
+        ),
+        (
+            "taught",
+            "x",
+            ("--set", "train.ppo.activation=relu"),
+            2,
+            ["train.ppo.activation 'elu' and does not fit 'relu'"],
+        ),
+        (
+            "taught",
+            "x",
+            ("--set", "train.algorithm=sac", "--set", "train.ppo={}"),
+            2,
+            ["has weights of algorithm ppo, which sac can't read", "train.algorithm=ppo, or with a module:Class"],
+        ),
+        ("taught", "x", ("--set", "train.ppo.lr=1"), 2, ["clone of run taught: train.ppo.lr: unknown key"]),
+        ("taught", "x", ("--set", "name=y"), 2, ["--set name=y: a clone has the name that --name gives it"]),
+        ("taught", "x", ("--nodes", "9"), 2, ["clone x: "]),
+        ("taught", "x", ("--queue", "nowhere"), 2, ["Job queue nowhere does not exist"]),
+        ("taught", "x", ("--queue", "default", "--engine", "local"), 2, ["leave one of them out"]),
+    ],
+)
+def test_what_can_not_be_is_refused_by_name(
+    full: Serving, source: str, name: str, options: tuple[str, ...], code: int, parts: list[str]
+) -> None:
+    store = Store(full.home / "store")
+    if not store.run("empty").path.exists():
+        add_run(store, "empty")
+        add_run(store, "script", {"name": "script", "command": ["true"]})
+        add_run(store, "batch", None)
+        for other in ("unscored", "old", "altered", "missing", "newer"):
+            add_run(store, other)
+            add_checkpoint(store, other, 2, **({"algorithm": None} if other == "old" else {}))
+        altered = add_checkpoint(store, "altered", 4)
+        (altered.path / "learner.pt").write_bytes(b"WEIGHTS")
+        (list_checkpoints(store.run("missing"))[0].path / "learner.pt").unlink()
+        manifest = list_checkpoints(store.run("newer"))[0].path / "manifest.json"
+        manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "format": FORMAT + 1}))
+    said = refused(full, code, source, name, *options)
+    assert all(part in said for part in parts), said
+
+
+def test_a_run_of_a_name_that_a_waiting_job_has_is_refused(full: Serving) -> None:
+    clone(full, "taught", "waiting")
+    shutil.rmtree(full.home / "store" / "runs" / "waiting")
+    assert "run waiting is being written by job waiting" in refused(full, 2, "taught", "waiting")
+
+
+def test_what_a_crash_left_of_an_earlier_clone_is_cleared_away(full: Serving, store: Store) -> None:
+    clone(full, "taught", "before-crash")
+    (owner,) = {path.name.removesuffix(".json") for path in (store.path / "controllers").glob("*.json")}
+    leftover, foreign = (store.path / "runs" / f".{each}.0123456789ab.clone" for each in (owner, "another"))
+    for path in (leftover, foreign):
+        (path / "parent").mkdir(parents=True)
+    clone(full, "taught", "after-crash")
+    assert not leftover.exists() and foreign.exists(), "only the controller that made it knows that nobody works on it"
+
+
+# -- the teacher ------------------------------------------------------------------------------------------------------
+
+
+def student(tmp_path: Path, teacher: str) -> str:
+    algorithm = {"algorithm": {"class_name": "Distillation"}, "teacher_checkpoint": teacher}
+    train = {"task": "Cartpole", "worlds": 4, "iterations": 2, "algorithm": "rsl_rl", "rsl_rl": algorithm}
+    path = tmp_path / "student.yaml"
+    path.write_text(json.dumps({"name": "student", "resources": SPEC["resources"], "train": train}))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("teacher", "said"),
+    [
+        ("nobody@3", "train.rsl_rl.teacher_checkpoint: run nobody does not exist"),
+        ("taught@4", "train.rsl_rl.teacher_checkpoint: run taught has no checkpoint of iteration 4; it has: 3, 6, 9"),
+        ("idle", "train.rsl_rl.teacher_checkpoint: run idle has no checkpoint yet; train it first"),
+        ("taught@best", "train.rsl_rl.teacher_checkpoint: expected RUN or RUN@ITERATION, found 'taught@best'"),
+        ("../taught", "train.rsl_rl.teacher_checkpoint: expected RUN or RUN@ITERATION"),
+    ],
+)
+def test_a_teacher_that_is_not_there_is_refused_at_submission(
+    full: Serving, store: Store, tmp_path: Path, teacher: str, said: str
+) -> None:
+    add_run(store, "idle")
+    done = full.muster("submit", student(tmp_path, teacher))
+    assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+@pytest.mark.parametrize("teacher", ["taught", "taught@6", "taught@00000006-e1"])
+def test_a_teacher_that_is_there_is_taken(full: Serving, tmp_path: Path, teacher: str) -> None:
+    done = full.muster("submit", student(tmp_path, teacher))
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_run_that_goes_on_has_its_teacher_and_needs_the_teacher_s_run_no_more(
+    full: Serving, store: Store, tmp_path: Path
+) -> None:
+    add_run(store, "pupil", json.loads(Path(student(tmp_path, "late")).read_text()))
+    add_checkpoint(store, "pupil", 1, algorithm="rsl_rl", settings={"teacher_checkpoint": "late"})
+    assert full.client.post("/api/runs/pupil/resume", {})["iteration"] == 1

@@ -1,0 +1,19 @@
+"""A clone as a controller makes it, without a controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shared_store.checkpoints import Checkpoint, list_checkpoints
+from shared_store.layout import Run, Store
+from shared_store.parent import NewRun
+
+
+def make_clone(store: Path, name: str, source: str = "run", checkpoint: Checkpoint | None = None) -> Run:
+    """Run ``name``, which begins with the weights of a checkpoint (by default the newest) of run ``source``."""
+    opened = Store(store)
+    making = NewRun(opened, "test", source, checkpoint or list_checkpoints(opened.run(source))[-1])
+    making.copy()
+    run = making.publish(name, {"run": name, "created": 0, "spec": None})
+    making.close()
+    return run

@@ -1,0 +1,216 @@
+"""`muster resume --set`: every key of the spec is applied to the job that goes on, or refused by name. A key without a decision fails."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel
+
+from orchestrator.api.errors import ClientError
+from orchestrator.api.runs import _check_changes, _check_rate, resized, setting_at
+from orchestrator.definition import compile_definition, compile_submission
+from orchestrator.spec import ALGORITHMS, Spec, override, validate
+from shared_store.layout import Run
+
+RUN = Run(Path("/store/runs/ant"))
+TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
+KINDS: dict[str, dict[str, Any]] = {
+    "train": {"train": TRAIN},
+    "evaluate": {"evaluate": {"run": "other"}},
+    "export": {"export": {"run": "other"}},
+    "command": {"command": ["true"]},
+}
+
+Place = Callable[[dict[str, Any], dict[str, Any]], Any]
+"""Where a job has a setting, in the requests RegisterJobDefinition and SubmitJob that are sent for it."""
+
+
+def container(definition: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = definition["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    return found
+
+
+def variable(name: str) -> Place:
+    return lambda definition, _: next(
+        (each["value"] for each in container(definition)["environment"] if each["name"] == name), None
+    )
+
+
+def resource(kind: str) -> Place:
+    return lambda definition, _: next(
+        (each["value"] for each in container(definition)["resourceRequirements"] if each["type"] == kind), None
+    )
+
+
+def carried(key: str) -> Place:
+    """In the spec that the rank reads; tests of the worker show what it does with it."""
+    return lambda definition, _: setting_at(json.loads(variable("MUSTER_SPEC")(definition, {})), key)
+
+
+APPLIED: dict[str, tuple[str, Any, Place]] = {
+    "name": ("again", "again", lambda _, job: job["jobName"]),
+    "queue": ("gpu", "gpu", lambda _, job: job["jobQueue"]),
+    "share": ("mine", "mine", lambda _, job: job.get("shareIdentifier")),
+    "priority": ("7", 7, lambda definition, _: definition.get("schedulingPriority")),
+    "preemptible": ("true", "1", variable("MUSTER_PREEMPTIBLE")),
+    "nodes.min": ("{min: 2, max: 3}", "2", variable("MUSTER_MIN_NODES")),
+    "nodes.max": ("{min: 2, max: 3}", 3, lambda definition, _: definition["nodeProperties"]["numNodes"]),
+    "resources.cpus": ("2.5", "2.5", resource("VCPU")),
+    "resources.gpus": ("2", "2", variable("MUSTER_RANKS_PER_NODE")),
+    "resources.memory": ("2GiB", "2048", resource("MEMORY")),
+    "train.iterations": ("9", 9, carried("train.iterations")),
+    "evaluate.run": ("ant", "ant", carried("evaluate.run")),
+    "evaluate.checkpoint": ("3", 3, carried("evaluate.checkpoint")),
+    "evaluate.episodes": ("3", 3, carried("evaluate.episodes")),
+    "evaluate.worlds": ("3", 3, carried("evaluate.worlds")),
+    "export.run": ("ant", "ant", carried("export.run")),
+    "export.checkpoint": ("3", 3, carried("export.checkpoint")),
+    "command": ("[echo, hello]", ["echo", "hello"], lambda definition, _: container(definition)["command"]),
+    "environment": ("{COLOUR: red}", "red", variable("COLOUR")),
+    "image": ("mine:2", "mine:2", lambda definition, _: container(definition)["image"]),
+    "checkpoint.every": ("auto", "auto", carried("checkpoint.every")),
+    "checkpoint.keep": ("3", 3, carried("checkpoint.keep")),
+    "logs.limit": ("2MiB", str(2 << 20), variable("MUSTER_LOG_LIMIT")),
+    "retry.attempts": ("7", 7, lambda definition, _: definition["retryStrategy"]["attempts"]),
+    "on_child_failure": ("fail", "fail", variable("MUSTER_ON_CHILD_FAILURE")),
+    "timeout": ("2h", 7200, lambda definition, _: (definition.get("timeout") or {}).get("attemptDurationSeconds")),
+    "stall_timeout": ("10m", "600", variable("MUSTER_STALL_TIMEOUT")),
+}
+"""Of each key that may change: another value as ``--set`` has it, what becomes of it, and where the job has that."""
+REFUSED = {
+    "train.task": "Cartpole",
+    "train.seed": "7",
+    "train.algorithm": "sac",
+    "train.config": "{rewards: {forward: 2.0}}",
+}
+"""Of each key that can't change: another value."""
+ELSEWHERE = {"train.worlds", "train.settings"}
+"""Depends on the checkpoint, or on the class of the user's own: tests/training/faults/test_refusals.py and test_resume_others.py."""
+
+
+def sections_of(annotation: Any) -> list[type[BaseModel]]:
+    kinds = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
+    return [kind for kind in kinds if issubclass(kind, BaseModel)]
+
+
+def keys_of(model: type[BaseModel], path: str = "") -> Iterator[str]:
+    """Every key of the spec that is no section."""
+    for name, field in model.model_fields.items():
+        inner = sections_of(field.annotation)
+        yield from (key for section in inner for key in keys_of(section, f"{path}{name}."))
+        if not inner:
+            yield f"{path}{name}"
+
+
+def kind_of(key: str) -> str:
+    first = key.partition(".")[0]
+    return first if first in KINDS else "train"
+
+
+def changed(kind: str, *assignments: str, **train: Any) -> tuple[Spec, Spec]:
+    document: dict[str, Any] = {"name": "ant", **KINDS[kind]}
+    if train:
+        document["train"] = {**TRAIN, **train}
+    return validate(document, "run ant"), validate(override(document, assignments), "run ant")
+
+
+def requests_of(spec: Spec) -> tuple[dict[str, Any], dict[str, Any]]:
+    return compile_definition(spec, "/"), compile_submission(spec, "arn")
+
+
+def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
+    algorithms = {f"train.{name}.{field}" for name, kind in ALGORITHMS.items() for field in kind.__pydantic_fields__}
+    assert len(algorithms) > 50
+    assert set(keys_of(Spec)) == {*APPLIED, *REFUSED, *ELSEWHERE, *algorithms}
+
+
+@pytest.mark.parametrize("key", APPLIED)
+def test_a_key_that_is_accepted_is_in_the_job_that_goes_on(key: str) -> None:
+    text, expected, place = APPLIED[key]
+    named = "nodes" if key.startswith("nodes.") else key
+    before, after = changed(kind_of(key), f"{named}={text}")
+    _check_changes(RUN, before, after)
+    assert place(*requests_of(before)) != expected and place(*requests_of(after)) == expected
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_key_of_the_run_s_history_is_refused_by_name_and_leads_to_a_clone(key: str) -> None:
+    before, after = changed("train", f"{key}={REFUSED[key]}")
+    with pytest.raises(
+        ClientError, match=rf"^run ant: {key} is .* can't become .*: muster clone ant --name NEW begins"
+    ):
+        _check_changes(RUN, before, after)
+
+
+def test_a_job_does_not_become_one_of_another_kind() -> None:
+    before, after = changed("train")[0], changed("command")[0]
+    with pytest.raises(ClientError, match="run ant is a train job; it can't go on as command"):
+        _check_changes(RUN, before, after)
+
+
+PROBES = ["1", "2", "0.5", "0.25", "true", "false", "[8]", "[8, 4, 2]", "[0.1, 0.2]", "adamw", "fixed", "tanh"]
+PROBES += ["critic", "min", "min_or_mean", "{a: [b]}", "{a: 1}", "run@3", "default"]
+
+
+def accepted_value(name: str, key: str) -> str:
+    """Some value that the setting takes."""
+    for probe in PROBES:
+        try:
+            document = {"name": "a", "train": {**TRAIN, "algorithm": name}}
+            spec = validate(override(document, [f"train.{name}.{key}={probe}"]), "x")
+        except Exception:
+            continue
+        assert spec.train is not None
+        if spec.train.given().get(key) is not None:
+            return probe
+    raise AssertionError(f"no probe is a value of train.{name}.{key}: add one")
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+def test_each_setting_of_an_algorithm_is_carried_to_the_rank_or_refused_by_name(name: str) -> None:
+    kind = ALGORITHMS[name]
+    fixed = set(kind.fixed)
+    assert {key.partition(".")[0] for key in fixed} <= {item.name for item in dataclasses.fields(kind)}
+    assert set(kind.clone_may_change) <= fixed
+    for item in dataclasses.fields(kind):
+        probe = accepted_value(name, item.name)
+        before, after = changed("train", f"train.{name}.{item.name}={probe}", algorithm=name)
+        if item.name in fixed:
+            may = "muster clone ant" if item.name in kind.clone_may_change else "start a new run for that$"
+            with pytest.raises(ClientError, match=rf"run ant: train\.{name}\.{item.name} is the task's own .*{may}"):
+                _check_changes(RUN, before, after)
+        else:
+            _check_changes(RUN, before, after)
+            assert carried(f"train.{name}.{item.name}")(*requests_of(after)) is not None
+
+
+@pytest.mark.parametrize("key", [key for key in ALGORITHMS["rsl_rl"].fixed if "." in key])
+def test_what_is_fixed_inside_a_section_is_refused_by_its_whole_name(key: str) -> None:
+    before, after = changed("train", f"train.rsl_rl.{key}=other", algorithm="rsl_rl")
+    with pytest.raises(
+        ClientError, match=rf"train\.rsl_rl\.{key} is the task's own and can't become 'other'.*clone ant"
+    ):
+        _check_changes(RUN, before, after)
+
+
+@pytest.mark.parametrize(("name", "key"), [("ppo", "learning_rate"), ("rsl_rl", "algorithm.learning_rate")])
+def test_a_learning_rate_that_is_set_already_would_change_nothing_and_is_refused(name: str, key: str) -> None:
+    assignment = f"train.{name}.{key}=0.001"
+    before = changed("train", assignment, algorithm=name)[1]
+    with pytest.raises(ClientError, match=rf"train\.{name}\.{key} is 0.001 already, .* has adapted; set another value"):
+        _check_rate(RUN, before, before, [assignment])
+    _check_rate(RUN, changed("train", algorithm=name)[0], before, [assignment])
+
+
+def test_two_options_that_say_the_same_are_refused() -> None:
+    assert resized(["train.iterations=3"], 4) == ["nodes=4"] and resized(["nodes=2"], None) == []
+    for assignment in ("nodes=2", "nodes.max=2"):
+        with pytest.raises(
+            ClientError, match=rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
+        ):
+            resized([assignment], 4)

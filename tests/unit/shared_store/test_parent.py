@@ -1,0 +1,153 @@
+"""The weights that a clone holds: copied whole and proven, published by one rename, taken back where it comes to nothing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, retain
+from shared_store.files import DamagedFile
+from shared_store.layout import Store
+from shared_store.parent import NewRun, RunExists, parent_checkpoint
+from tests.support.orchestrator.trained import add_checkpoint, add_run
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    store = Store(tmp_path / "store").open()
+    add_run(store, "source")
+    add_checkpoint(store, "source", 3, b"weights" * 1000, score=2.0, score_error=0.5, env_steps=96, task="x" * 200_000)
+    return store
+
+
+def new(store: Store, source: Checkpoint | None = None) -> NewRun:
+    return NewRun(store, "me", "source", source or list_checkpoints(store.run("source"))[-1])
+
+
+def names(store: Store) -> list[str]:
+    return sorted(os.listdir(store.path / "runs"))
+
+
+def test_the_new_run_has_the_weights_alone_and_its_lineage(store: Store) -> None:
+    making = new(store)
+    making.copy()
+    assert len(names(store)) == 2 and not store.run("heir").path.exists(), "nobody sees half of it"
+    assert [run.name for run in store.runs()] == ["source"]
+    run = making.publish("heir", {"run": "heir", "spec": None, "created": 5})
+    making.close()
+    assert names(store) == ["heir", "source"]
+    parent = parent_checkpoint(run)
+    assert parent is not None and sorted(os.listdir(parent.path)) == ["learner.pt", "manifest.json"]
+    assert (parent.path / "learner.pt").read_bytes() == b"weights" * 1000 and parent.iteration == 3
+    description = run.description()
+    assert description is not None
+    lineage: dict[str, Any] = {"run": "source", "checkpoint": "00000003-e1", "iteration": 3}
+    assert description["parent"] == {**lineage, "score": 2.0, "score_error": 0.5, "env_steps": 96}
+    assert parent_checkpoint(store.run("source")) is None
+
+
+def test_what_the_source_s_retention_deletes_is_still_in_the_clone(store: Store) -> None:
+    making = new(store)
+    making.copy()
+    run = making.publish("heir", {"run": "heir"})
+    for iteration in (4, 5, 6):
+        add_checkpoint(store, "source", iteration, score=9.0)
+    assert "00000003-e1" in retain(store.run("source"), 2)
+    parent = parent_checkpoint(run)
+    assert parent is not None and parent.path.is_dir()
+
+
+def harm(path: Path, how: str) -> None:
+    if how == "missing":
+        path.unlink()
+    elif how == "short":
+        path.write_bytes(b"w")
+    elif how == "link":
+        os.replace(path, path.with_name("elsewhere"))
+        path.symlink_to("elsewhere")
+    else:
+        path.write_bytes(b"WEIGHTS" * 1000)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("missing", "is missing"), ("short", "has 1 bytes"), ("link", "not a regular file"), ("altered", "was altered")],
+)
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_damage_is_found_before_the_copy_and_before_the_use(store: Store, when: str, how: str, said: str) -> None:
+    source = list_checkpoints(store.run("source"))[-1]
+    making = new(store)
+    if when == "before":
+        harm(source.path / "learner.pt", how)
+        with pytest.raises(DamagedCheckpoint, match=f"00000003-e1: .*learner.pt .*{said}|learner.pt was altered"):
+            making.copy()
+        making.discard()
+        assert names(store) == ["source"]
+        return
+    making.copy()
+    run = making.publish("heir", {"run": "heir"})
+    harm(run.parent / source.name / "learner.pt", how)
+    with pytest.raises(DamagedCheckpoint, match=said):
+        parent_checkpoint(run)
+
+
+def test_a_name_that_is_taken_is_never_written_over(store: Store) -> None:
+    making = new(store)
+    making.copy()
+    with pytest.raises(RunExists):
+        making.publish("source", {"run": "source"})
+    making.discard()
+    assert names(store) == ["source"] and list_checkpoints(store.run("source"))
+
+
+def test_a_published_run_can_be_taken_back(store: Store) -> None:
+    making = new(store)
+    making.copy()
+    making.publish("heir", {"run": "heir"})
+    making.discard()
+    assert names(store) == ["source"]
+
+
+def test_leftovers_of_the_same_owner_are_cleared_away_and_nobody_else_s(store: Store) -> None:
+    first, second = new(store), new(store)
+    first.copy()
+    leftovers = [store.path / "runs" / f".{owner}.00.clone" for owner in ("me", "you")]
+    for path in leftovers:
+        path.mkdir()
+    second.copy()
+    assert [path.exists() for path in leftovers] == [False, True]
+    assert first.publish("heir", {"run": "heir"}).path.is_dir(), "what is being made was left alone"
+
+
+def test_a_lineage_that_leads_elsewhere_is_refused(store: Store) -> None:
+    making = new(store)
+    making.copy()
+    run = making.publish("heir", {"run": "heir"})
+    text = (run.path / "run.json").read_text()
+    (run.path / "run.json").write_text(text.replace("00000003-e1", "../../source/checkpoints/00000003-e1"))
+    with pytest.raises(DamagedCheckpoint, match=r"run\.json names no checkpoint as its parent"):
+        parent_checkpoint(run)
+    (run.path / "run.json").write_text(text)
+    shutil.rmtree(run.parent)
+    run.parent.symlink_to(store.run("source").checkpoints)
+    with pytest.raises(DamagedFile, match="a link"):
+        parent_checkpoint(run)
+
+
+def test_the_best_goes_by_the_score_and_never_by_the_reward(store: Store) -> None:
+    def best() -> str:
+        found = best_checkpoint(store.run("source"))
+        return found.name if found else "none"
+
+    add_checkpoint(store, "source", 4, score=None, reward=1e9)
+    assert best() == "00000003-e1"
+    later = add_checkpoint(store, "source", 5, score=2.0)
+    assert best() == "00000005-e1", "the later one of equals"
+    (later.path / "manifest.json").write_text("{")
+    assert best() == "00000003-e1"
+    add_run(store, "idle")
+    assert best_checkpoint(store.run("idle")) is None

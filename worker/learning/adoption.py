@@ -1,0 +1,141 @@
+"""How a clone begins: with the weights of another run's checkpoint, of which its own run holds a copy (:mod:`shared_store.parent`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.files import DamagedFile
+from shared_store.parent import parent_checkpoint
+from worker.distributed import Gang
+from worker.errors import UserError
+from worker.learning.algorithm import Algorithm
+from worker.learning.algorithms import BUILT_IN
+from worker.learning.job import Job
+from worker.learning.shards import read_file
+
+
+def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) -> Checkpoint | None:
+    """Give ``algorithm`` the weights with which the run begins; None where it begins with new ones. All ranks call it.
+
+    Args:
+        job: The job, whose run has no checkpoint of its own yet.
+        gang: The ranks.
+        algorithm: Takes over networks and normalisers; its optimizer stays new.
+        facts: What a manifest of this job says of task, algorithm and policy.
+
+    Raises:
+        UserError: The weights are missing or damaged, or do not fit; the message says which tensor or setting differs.
+    """
+    name, problem = None, ""
+    if gang.is_main:
+        try:
+            found = parent_checkpoint(job.run)
+            name = found.name if found else None
+            if name is None and job.parent:
+                problem = "run.json does not name them: the run was deleted before it began"
+        except (DamagedCheckpoint, DamagedFile, OSError) as error:
+            problem = str(error)
+    if problem := gang.tell(problem) or "":
+        raise UserError(
+            f"run {job.run.name} can't begin with the weights of {job.parent or 'its parent'}: {problem}; clone it again under another name"
+        )
+    name = gang.tell(name)
+    if name is None:
+        return None
+    iteration, epoch = name.split("-e")
+    checkpoint = Checkpoint(job.run.parent / name, int(iteration), int(epoch))
+    learnt = read_file(checkpoint, "learner.pt", gang.device).get("algorithm")
+    here = json.loads(json.dumps(facts))
+    _check_settings(checkpoint, here, algorithm)
+    try:
+        algorithm.load_state_dict(learnt, weights_only=True)  # type: ignore[arg-type]
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        why = _difference(algorithm.state_dict(), learnt) or " ".join(str(error).split())[:300]
+        raise UserError(
+            f"the weights of checkpoint {name} do not fit this job: {why}{_others(checkpoint.manifest, here)}"
+        ) from error
+    if gang.is_main and (other := _renamed(checkpoint.manifest, here)):
+        print(
+            f"warning: the weights were learnt from other observations or actions, of the same sizes: {other}",
+            flush=True,
+        )
+    return checkpoint
+
+
+def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: Algorithm) -> None:
+    """What tensors alone would not show, or only in many lines. Raises UserError with the first setting that differs."""
+    there = checkpoint.manifest
+    if (learnt := there.get("algorithm")) != here["algorithm"]:
+        if learnt in BUILT_IN and here["algorithm"] in BUILT_IN:
+            raise UserError(
+                f"the weights of checkpoint {checkpoint.name} are of algorithm {learnt}, which {here['algorithm']} can't read; set "
+                f"train.algorithm: {learnt}, or a module:Class of your own whose load_state_dict reads them"
+            )
+        return  # whether a class of the user's own reads the other's, or is read, only the loading shows
+    may_change = getattr(algorithm.config_type, "clone_may_change", ())
+    for key in getattr(algorithm.config_type, "fixed", ()):
+        old, new = (setting_at(facts.get("settings"), key) for facts in (there, here))
+        if key not in may_change and key.partition(".")[0] in (there.get("settings") or {}) and old != new:
+            section = here["algorithm"] if here["algorithm"] in BUILT_IN else "settings"
+            raise UserError(
+                f"the weights of checkpoint {checkpoint.name} do not fit this job: {section}.{key} is {old!r} there "
+                f"and {new!r} here; leave the setting as it is there"
+            )
+
+
+def setting_at(settings: Any, key: str) -> Any:
+    """The setting ``key``, in which a dot leads into a section; None where there is none, or an empty section."""
+    for part in key.split("."):
+        settings = settings.get(part) if isinstance(settings, dict) else None
+    return None if settings == {} else settings
+
+
+def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """In what algorithm, or inputs and outputs of the policy, differ, in words; nothing where they are alike."""
+    if there.get("algorithm") != here["algorithm"]:
+        return f"; they are of algorithm {there.get('algorithm')}, and {here['algorithm']} does not read them"
+    told = []
+    for facts in (there, here):
+        policy = facts.get("policy") or {}
+        groups = ", ".join(f"{name} {shape}" for name, shape in sorted((policy.get("groups") or {}).items()))
+        told.append(f"observations {groups} and {policy.get('action_size')} actions (task {facts.get('task')})")
+    return "" if told[0].partition(" (")[0] == told[1].partition(" (")[0] else f"; there {told[0]}, here {told[1]}"
+
+
+def _renamed(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The first observation or action that has another name than in the source; nothing where all are called alike."""
+    for kind in ("observation_names", "action_names"):
+        old, new = ((facts.get("policy") or {}).get(kind) or [] for facts in (there, here))
+        for before, now in zip(old, new, strict=False):
+            if before != now:
+                return f"{before} there is {now} here"
+    return ""
+
+
+def _difference(own: Any, saved: Any) -> str:
+    """The first tensor of the networks that is missing on one side or has another shape; nothing where no such is found."""
+    if not isinstance(saved, Mapping):
+        return f"it holds a {type(saved).__name__} where the state of an algorithm is expected"
+    shapes, there = (dict(_shapes(each)) for each in (own, saved))
+    for name, shape in shapes.items():
+        if name in there and there[name] != shape:
+            return f"{name} has shape {there[name]} there and {shape} here"
+    for name in shapes:
+        if name not in there:
+            return f"{name} is not there"
+    return next((f"{name} is there, and this job's algorithm has none" for name in there if name not in shapes), "")
+
+
+def _shapes(state: Any, path: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Name and shape of every tensor that is no part of an optimizer."""
+    if isinstance(state, torch.Tensor):
+        yield path, tuple(state.shape)
+    items = state.items() if isinstance(state, Mapping) else enumerate(state) if isinstance(state, list | tuple) else ()
+    for name, value in items:
+        if "optimizer" not in str(name):
+            yield from _shapes(value, f"{path}.{name}" if path else str(name))
