@@ -1,0 +1,81 @@
+"""The loss of the fused PPO three ways, in one run: the hand-written kernel, plain torch, and plain torch that torch.compile has fused.
+
+    python -m benchmarks.objective [--tasks Ant Humanoid] [--worlds 4096] [--out DIRECTORY]
+
+Writes ``objective.md``: milliseconds of learning and of an iteration. Everything else is the same, recorded as the same graphs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from benchmarks.load import Watch, add_option, told
+from benchmarks.training import build, wait
+from worker.learning.ppo import fused, heads
+
+WAYS = ("kernel", "torch", "torch.compile")
+STRETCHES, ITERATIONS = 5, 15
+
+
+def measure(task: str, worlds: int, way: str) -> dict[str, float]:
+    """Medians [ms] of an iteration, and of learning in it, on this device."""
+    plain = fused.Gaussian, heads.clipped_loss, heads.gaussian_terms
+    try:
+        if way != "kernel":
+            fused.Gaussian = functools.partial(plain[0], plain=True)  # type: ignore[misc, assignment]
+        if way == "torch.compile":
+            compiled: list[Callable[..., object]] = [torch.compile(each) for each in plain[1:]]
+            heads.clipped_loss, heads.gaussian_terms = compiled  # type: ignore[assignment]
+        with tempfile.TemporaryDirectory() as directory:
+            loop = build(task, worlds, Path(directory))
+            for _ in range(6):
+                loop._iterate()
+            found = []
+            for _ in range(STRETCHES):
+                wait()
+                started = time.perf_counter()
+                learnt = [loop._iterate()[0]["learn_seconds"] for _ in range(ITERATIONS)]
+                wait()
+                found.append(((time.perf_counter() - started) / ITERATIONS, statistics.median(learnt)))
+            loop.close()
+    finally:
+        fused.Gaussian, heads.clipped_loss, heads.gaussian_terms = plain  # type: ignore[misc]
+    iteration, learn = (1000 * statistics.median(each) for each in zip(*found, strict=True))
+    return {"iteration": iteration, "learn": learn}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=["Ant", "Humanoid"])
+    parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
+    options = parser.parse_args()
+    watch, rows, lines = Watch(options.loaded_anyway), [], []
+    for task in options.tasks:
+        for way in WAYS:
+            found = measure(task, options.worlds, way)
+            rows.append(watch.check(f"while {task} was measured"))
+            lines.append(f"| {task} | {way} | {found['learn']:.2f} | {found['iteration']:.2f} |")
+            print(lines[-1], flush=True)
+    head = [
+        f"# The loss of the fused PPO on {torch.cuda.get_device_name() if torch.cuda.is_available() else 'the CPU'}",
+        "",
+        f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {told(rows)}",
+        "",
+        "| task | loss | learning | iteration |",
+        "|---|---|--:|--:|",
+    ]
+    (options.out / "objective.md").write_text("\n".join([*head, *lines]) + "\n")
+
+
+if __name__ == "__main__":
+    main()
