@@ -54,7 +54,7 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, **train: Any) -> L
         raise_epoch(run, 1)
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
     spec = {"train": section, "checkpoint": {"every": 10**9}}
-    job = Job(spec, Store(store), run, 1, 1, "bench", None, section)
+    job = Job(spec, Store(store), run, 1, 1, "bench", section=section)
     return Loop(job, connect(placement), find_task(task), StopRequest())
 
 
