@@ -249,14 +249,21 @@ def test_every_epoch_has_its_own_minibatches_with_each_sample_once_and_as_many_o
             assert (minibatch % 4).bincount().tolist() == [4, 4, 4, 4]
 
 
-def test_gradients_of_a_layer_are_those_of_torch() -> None:
+@pytest.mark.parametrize("missing", [0, 5])
+def test_gradients_of_a_layer_are_those_of_torch(missing: int) -> None:
+    """Also where columns of zeros were added to its input; they are written over what was there."""
     x, weight, bias = torch.randn(7, 3), torch.randn(4, 3), torch.randn(4)
-    found = []
-    for layer in (linear._Linear.apply, torch.nn.functional.linear):
-        leaves = [each.clone().requires_grad_() for each in (x, weight, bias)]
-        (layer(*leaves).tanh() ** 2).sum().backward()
-        found.append([each.grad for each in leaves])
-    torch.testing.assert_close(*found)
+    leaves = [each.clone().requires_grad_() for each in (x, weight, bias)]
+    (torch.nn.functional.linear(*leaves).tanh() ** 2).sum().backward()
+    own = torch.nn.functional.pad(x, (0, missing)).requires_grad_(not missing)
+    parameters = [torch.nn.Parameter(each.clone()) for each in (weight, bias)]
+    for parameter in parameters:
+        parameter.grad = torch.full_like(parameter, 7.0)
+    (linear._Linear.apply(own, *parameters, torch.ones(7)).tanh() ** 2).sum().backward()
+    seen = [] if missing else [own.grad]
+    torch.testing.assert_close(
+        [*seen, *(each.grad for each in parameters)], [each.grad for each in leaves[-2 - len(seen) :]]
+    )
 
 
 def test_the_objective_and_its_gradient_are_those_of_torch() -> None:
