@@ -26,6 +26,8 @@ _FLUSH_TIMEOUT = 60.0
 """Seconds without any progress after which a closing connection that still has something to send is cut off."""
 BACKLOG = 128
 """Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
+_PIECE = 16 << 10
+"""Bytes that are parsed at once. A head of more than h11's limit (64 KiB) and one piece is always refused."""
 _MOST_DESCRIPTORS = 65_536
 _MOST_CONNECTIONS = 4096
 _SAID = 60.0
@@ -138,7 +140,10 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        super().data_received(data)
+        # h11 asks for the size of a request's head only while it is incomplete: one that comes at once would pass, however large
+        for start in range(0, len(data), _PIECE):
+            if not self.transport.is_closing():
+                super().data_received(data[start : start + _PIECE])
         self._look()
 
     def on_response_complete(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import socket
@@ -100,6 +101,17 @@ def test_a_connection_that_does_not_finish_its_request_in_time_is_closed(
     monkeypatch.setattr(connections, "BODY_TIMEOUT", 0.3)
     with half_open(inside.url, sent) as connection:
         assert connection.recv(1000) == b""
+
+
+@pytest.mark.parametrize("piece", [1 << 20, 60_000, 1000])
+def test_a_head_that_is_too_large_is_refused_however_it_arrives(inside: Server, piece: int) -> None:
+    head = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * 100_000 + b"\r\n\r\n"
+    for _ in range(20):  # how much of it is read at once is up to the kernel
+        with half_open(inside.url, b"") as connection, contextlib.suppress(ConnectionError):
+            for start in range(0, len(head), piece):
+                connection.sendall(head[start : start + piece])
+            answer = connection.recv(1 << 16)
+            assert answer.startswith(b"HTTP/1.1 400 ") or not answer, answer
 
 
 def test_trickling_gains_a_connection_no_time(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
