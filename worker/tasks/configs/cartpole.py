@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
+from worker.learning.sac.settings import SACConfig
 from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weights
 from worker.tasks.configs.camera import CameraConfig
 from worker.tasks.overrides import from_mapping
@@ -46,6 +47,20 @@ class CartpoleConfig(TaskConfig):
         )
     )
     """How the task is trained: small, since the task is easy and often run on a processor."""
+    sac: SACConfig = field(
+        default_factory=lambda: SACConfig(
+            actor_sizes=(64, 64),
+            critic_sizes=(64, 64),
+            batch_size=256,
+            updates=8,
+            atoms=51,
+            v_min=-5.0,
+            v_max=5.0,
+            actor_learning_rate=1.0e-3,
+            critic_learning_rate=1.0e-3,
+        )
+    )
+    """How ``algorithm: sac`` trains it."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -8,6 +8,7 @@ from dataclasses import field
 from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
+from worker.learning.sac.settings import SACConfig
 from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weights
 
 
@@ -54,6 +55,8 @@ class RunningConfig(TaskConfig):
         )
     )
     """How the task is trained."""
+    sac: SACConfig = field(default_factory=lambda: SACConfig(v_min=-20.0, v_max=300.0))
+    """How ``algorithm: sac`` trains it: a good runner earns 9 a step, discounted 300."""
 
 
 @dataclass(frozen=True, config=STRICT)
