@@ -30,12 +30,14 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
 
 
-def run_muster(*arguments: str, home: Path, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
+def run_muster(
+    *arguments: str, home: Path, timeout: float = 120, cwd: Path = REPOSITORY, **env: str
+) -> subprocess.CompletedProcess[str]:
     """The real command in a subprocess."""
     return subprocess.run(
         [MUSTER, *arguments],
         env={**os.environ, "MUSTER_HOME": str(home), "COLUMNS": "200", **env},
-        cwd=REPOSITORY,
+        cwd=cwd,
         capture_output=True,
         text=True,
         timeout=timeout * PATIENCE,

@@ -50,7 +50,7 @@ def total_worlds(job: Job, gang: Gang) -> int:
 def spaces_of(task: Task) -> Spaces:
     """What the task's policies see and do."""
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
-    return Spaces(shapes, task.action_size, getattr(task, "discrete", False))
+    return Spaces(shapes, task.action_size, task.discrete)
 
 
 def spaces_from(policy: dict[str, Any]) -> Spaces:

@@ -56,7 +56,12 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             else gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
         )
         self._images = self._numpy(self.task.observations) if images else None
-        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        size = self.task.action_size
+        self.single_action_space: gymnasium.Space[Any] = (
+            gymnasium.spaces.Discrete(size)
+            if self.task.discrete
+            else gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
+        )
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -88,7 +93,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Advance every world by one control step.
 
         Args:
-            actions: Shape ``(num_envs, actions)``; clipped to [-1, 1].
+            actions: Shape ``(num_envs, actions)``, clipped to [-1, 1]; of choices ``(num_envs,)``.
 
         Returns:
             Observations (float32, images uint8), rewards (float32), terminations, truncations (bool) and info.
@@ -101,7 +106,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(
                 f"actions have shape {actions.shape}; {self.num_envs} worlds take {self.action_space.shape}"
             )
-        self.task.step(torch.from_numpy(actions))
+        self.task.step(torch.from_numpy(actions).view_as(self.task.actions))
         dones = self._numpy(self.task.dones)
         truncations = self._numpy(self.task.time_outs)
         info: dict[str, Any] = {}

@@ -49,7 +49,7 @@ class Task:
         world_count: Number of worlds.
         max_episode_length: Control steps after which the clock ends an episode.
         device: As given.
-        actions: What to do next, shape ``(worlds, action_size)``, float32.
+        actions: What to do next, shape ``(worlds, action_size)``, or ``(worlds, 1)`` where they are choices; float32.
         observations: What the policy sees, shape ``(worlds, *observation_shape)``: float32, or uint8 where there is a camera.
         states: What ``observe`` writes, named by ``observation_names``, shape ``(worlds, states)``, float32: without a camera the
             observations.
@@ -79,7 +79,9 @@ class Task:
     observation_names: ClassVar[tuple[str, ...]]
     """Name of each observation, in order."""
     action_names: ClassVar[tuple[str, ...]]
-    """Name of each action, in order (the joint that it drives)."""
+    """Name of each action, in order (the joint that it drives); of a task with choices, of each choice."""
+    discrete: ClassVar[bool] = False
+    """Whether an action is one of several choices: its number, from 0, is then ``episodes.actions[world, 0]``."""
     act: ClassVar[wp.Kernel]
     """Kernel ``(parameters, worlds, episodes)`` over worlds: from ``episodes.actions`` to ``worlds.controls``."""
     observe: ClassVar[wp.Kernel]
@@ -193,7 +195,7 @@ class Task:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
 
         Args:
-            actions: Shape ``(worlds, action_size)``, float32, on ``device``; copied into :attr:`actions`.
+            actions: As :attr:`actions`, into which they are copied.
         """
         self.actions.copy_(actions)
         self._graph.launch()
@@ -328,7 +330,7 @@ class Task:
 
         self._episodes = EpisodeArrays()
         self._episodes.warm_start = self.worlds.arrays.warm_start
-        self.actions = buffer("actions", (count, self.action_size), wp.float32)
+        self.actions = buffer("actions", (count, 1 if self.discrete else self.action_size), wp.float32)
         states = len(self.observation_names)
         self.states = self.observations = buffer("observations", (count, states), wp.float32)
         self.terminal_observations = buffer("terminal_observations", (count, states), wp.float32)

@@ -43,7 +43,7 @@ class Point:
 
     config_type = PointConfig
     statistic_names = ("episodes", "episode_return", "episode_length", "reward_place", "squared_return")
-    action_size, observation_shape = 1, (2,)
+    action_size, discrete, observation_shape = 1, False, (2,)
     action_names = ("push",)
     observation_names = ("place", "velocity")
 

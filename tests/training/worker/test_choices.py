@@ -1,0 +1,93 @@
+"""A task whose actions are choices, from its file to the exported policy: through the real command."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx.reference import ReferenceEvaluator
+
+from shared_store.layout import Store
+from shared_store.metrics import read_metrics
+from tests.conftest import run_muster
+from worker.tasks.gym import TaskVectorEnv
+
+TASK = '''
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.cartpole import Cartpole, CartpoleParameters
+
+
+@wp.kernel
+def push(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays):
+    world = wp.tid()
+    worlds.controls[world, 0] = 0.6 * (episodes.actions[world, 0] - 1.0)
+
+
+class Pushed(Cartpole):
+    """The cart is pushed to the left, not at all, or to the right."""
+
+    discrete = True
+    action_names = ("left", "nothing", "right")
+    act = push
+
+    def interface(self):
+        return None
+'''
+JOB = "name: pushed\nresources: {cpus: 1, memory: 1GiB}\ntrain: {task: pushed:Pushed, worlds: 64, iterations: 80}\n"
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "pushed.py").write_text(TASK)
+    (tmp_path / "job.yaml").write_text(JOB)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Path) -> None:
+    home = directory / "home"
+    options = ("--at", "79", "--iterations", "1", "--set", "checkpoint.every=10")
+    done = run_muster("verify-resume", "job.yaml", *options, home=home, cwd=directory, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^equal: \d+ tensors, 80 iterations$", done.stdout, re.M), done.stdout
+    run = Store(home / "store").run(re.search(r"^killed: +(\S+),", done.stdout, re.M)[1])  # type: ignore[index]
+    records = read_metrics(run)
+    assert records[0]["reward"] < 8.0 and records[-1]["reward"] > 18.0, "30 is the greatest that there could be"
+    assert 0.0 < records[-1]["entropy"] < np.log(3.0)
+    (evaluation,) = run.evaluations.iterdir()
+    assert json.loads(evaluation.read_text())["mean_return"] > 20.0
+    (directory / "export.yaml").write_text(f"name: export\nresources: {{memory: 1GiB}}\nexport: {{run: {run.name}}}\n")
+    done = run_muster("run", "export.yaml", home=home, cwd=directory, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (exported,) = run.exports.iterdir()
+    facts = json.loads((exported / "policy.json").read_text())
+    assert facts["action_names"] == ["left", "nothing", "right"]
+    leaning = np.array([[0.0, -0.1, 0.0, -0.5], [0.0, 0.1, 0.0, 0.5]], dtype=np.float32)
+    (chosen,) = ReferenceEvaluator(onnx.load(exported / "policy.onnx")).run(None, {"obs": leaning})
+    assert sorted(chosen[:, 0]) == [0.0, 2.0], "the cart goes under the pole"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "said"), [("sac", "this task's are choices; use ppo"), ("rsl_rl", "are choices")]
+)
+def test_who_can_not_choose_says_so_in_one_line(directory: Path, algorithm: str, said: str) -> None:
+    options = ("--set", f"train.algorithm={algorithm}", "--set", "retry.attempts=1")
+    done = run_muster("run", "job.yaml", *options, home=directory / "home", cwd=directory, timeout=300)
+    assert done.returncode != 0 and said in done.stdout + done.stderr and "Traceback" not in done.stdout
+
+
+def test_gymnasium_sees_choices(directory: Path) -> None:
+    environment = TaskVectorEnv("pushed:Pushed", 4)
+    assert environment.single_action_space.n == 3  # type: ignore[attr-defined]
+    velocities = []
+    for choice in range(3):
+        environment.reset(seed=1)
+        velocities.append(environment.step(np.full(4, choice))[0][:, 2])
+    assert (np.diff(velocities, axis=0) > 0).all(), "of each world's cart: further to the right"
