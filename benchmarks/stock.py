@@ -15,8 +15,8 @@ from worker.tasks.rsl_rl_env import TaskVecEnv
 from worker.tasks.task import Task
 
 
-def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
-    """rsl-rl's runner with the hyperparameters of ``ppo``; it writes nothing."""
+def stock_config(task: Task, ppo: PPOConfig) -> dict[str, Any]:
+    """rsl-rl's own keys for the hyperparameters of ``ppo``."""
     network: dict[str, Any] = {
         "class_name": "MLPModel",
         "hidden_dims": list(ppo.hidden_sizes),
@@ -28,9 +28,8 @@ def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
         layers = {"output_channels": list(ppo.channels), "kernel_size": list(ppo.kernel_sizes)}
         layers |= {"stride": list(ppo.strides), "activation": ppo.activation}
         network |= {"class_name": "CNNModel", "cnn_cfg": layers}
-    config = {
+    return {
         "num_steps_per_env": ppo.steps,
-        "save_interval": 10**9,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": {**network, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": ppo.init_std}},
         "critic": dict(network),
@@ -50,8 +49,13 @@ def stock_runner(task: Task, ppo: PPOConfig) -> OnPolicyRunner:
             "desired_kl": ppo.desired_kl,
         },
     }
+
+
+def stock_runner(task: Task, ppo: PPOConfig, log_dir: str | None = None, **changes: Any) -> OnPolicyRunner:
+    """rsl-rl's runner with the hyperparameters of ``ppo``; it writes nothing without a ``log_dir``."""
+    config = stock_config(task, ppo) | {"save_interval": 10**9} | changes
     with contextlib.redirect_stdout(io.StringIO()):
-        return OnPolicyRunner(TaskVecEnv(task), config, None, task.device)
+        return OnPolicyRunner(TaskVecEnv(task), config, log_dir, task.device)
 
 
 def _wait() -> None:

@@ -45,15 +45,15 @@ DEFAULT_CPU = {"Cartpole": [64, 1024], "Ant": [64], "Humanoid": [32], "Quadruped
 SWEEP = [2048, 8192, 32768, 65536]
 
 
-def build(task: str, worlds: int, store: Path, seed: int = 0, **train: Any) -> Loop:
-    """A runner of the real training loop, on a store of its own, that never saves."""
+def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9, **train: Any) -> Loop:
+    """The real training loop, on a store of its own; it saves every so many iterations, by default never."""
     placement = Placement.from_env(os.environ)
     run = Store(store).open().run(f"bench-{task}-{worlds}-{seed}".lower())
     if placement.rank == 0:
         run.create({"run": run.name})
         raise_epoch(run, 1)
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
-    spec = {"train": section, "checkpoint": {"every": 10**9}}
+    spec = {"train": section, "checkpoint": {"every": every}}
     job = Job(spec, Store(store), run, 1, 1, "bench", section=section)
     return Loop(job, connect(placement), find_task(task), StopRequest())
 

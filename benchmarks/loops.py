@@ -1,0 +1,113 @@
+"""One PPO configuration through four loops, by the clock, each with its logging and a checkpoint every 25 iterations.
+
+    python -m benchmarks.loops [--tasks Ant Humanoid Cartpole] [--worlds 4096] [--out DIRECTORY]
+
+They are ``algorithm: ppo`` and ``algorithm: rsl_rl`` in Muster's loop, as ``muster run`` has it, and rsl-rl's own runner with
+TensorBoard: as it is, and tuned (``check_for_nan: false``). All train on the same simulation. Writes ``loops.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.load import Watch, add_option, told
+from benchmarks.stock import stock_config, stock_runner
+from benchmarks.training import build, wait
+from shared_store.metrics import read_metrics
+from worker.learning.setup import build_task
+
+EVERY = 25
+WARM = 10
+"""Iterations that are not counted: graphs are recorded, kernels loaded."""
+
+
+def in_muster(task: str, worlds: int, iterations: int, algorithm: str) -> float:
+    """Steps a second, from the metrics of a whole run of the loop."""
+    with tempfile.TemporaryDirectory() as directory:
+        store, own = Path(directory), {}
+        if algorithm == "rsl_rl":
+            template = build(task, 1, store / "template")
+            own["rsl_rl"] = stock_config(template.task, template.config.ppo)
+            template.close()
+        loop = build(task, worlds, store / "store", every=EVERY, iterations=iterations, algorithm=algorithm, **own)
+        with contextlib.redirect_stdout(io.StringIO()):
+            loop.train()
+        records = read_metrics(loop.job.run)
+        loop.close()
+    first, last = records[WARM - 1], records[-1]
+    return float((last["env_steps"] - first["env_steps"]) / (last["total_seconds"] - first["total_seconds"]))
+
+
+def in_rsl_rl(task: str, worlds: int, iterations: int, **changes: Any) -> float:
+    """Steps a second of rsl-rl's own runner, from one of its log entries to another."""
+    with tempfile.TemporaryDirectory() as directory:
+        loop = build(task, worlds, Path(directory) / "store")
+        ppo, own = loop.config.ppo, build_task(type(loop.task), loop.config, loop.share, loop.gang, 1)
+        runner = stock_runner(own, ppo, str(Path(directory) / "logs"), save_interval=EVERY, **changes)
+        logged: list[float] = []
+        log = runner.logger.log
+
+        def noting(**entry: Any) -> None:
+            log(**entry)
+            wait()
+            logged.append(time.perf_counter())
+
+        runner.logger.log = noting  # type: ignore[method-assign]
+        with contextlib.redirect_stdout(io.StringIO()):
+            runner.learn(iterations)
+        loop.close()
+    return worlds * ppo.steps * (iterations - WARM) / (logged[-1] - logged[WARM - 1])
+
+
+WAYS = {
+    "Muster, ppo": lambda *case: in_muster(*case, "ppo"),
+    "Muster, rsl_rl": lambda *case: in_muster(*case, "rsl_rl"),
+    "rsl-rl's runner": in_rsl_rl,
+    "rsl-rl's runner, tuned": lambda *case: in_rsl_rl(*case, check_for_nan=False),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=["Ant", "Humanoid", "Cartpole"])
+    parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--iterations", type=int, default=110)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
+    options = parser.parse_args()
+    watch, rows = Watch(options.loaded_anyway), list[dict[str, Any]]()
+    found: dict[tuple[str, str], list[float]] = {}
+    for task in options.tasks:
+        for _ in range(options.repeats):  # alternating, so that a machine that changes changes all of them
+            for way, measure in WAYS.items():
+                found.setdefault((task, way), []).append(measure(task, options.worlds, options.iterations))
+                rows.append(watch.check(f"while {task} was measured"))
+                print(task, way, found[task, way][-1], flush=True)
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "the CPU"
+    lines = [
+        f"# One configuration, four loops, on {device}",
+        "",
+        f"Million steps a second by the clock, with logging and checkpoints, {options.worlds:,} worlds; medians of {options.repeats} runs "
+        f"in turn; `python -m benchmarks.loops`. {told(rows)}",
+        "",
+        f"| task | {' | '.join(WAYS)} |",
+        "|---|" + "--:|" * len(WAYS),
+    ]
+    for task in options.tasks:
+        rates = (f"{statistics.median(found[task, way]) / 1e6:.3f}" for way in WAYS)
+        lines.append(f"| {task} | {' | '.join(rates)} |")
+    (options.out / "loops.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
