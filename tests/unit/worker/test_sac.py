@@ -42,6 +42,7 @@ torch.set_num_threads(1)
         ({"batch_size": "64"}, "batch_size"),
         ({"batch_size": 64.0}, "batch_size"),
         ({"layer_norm": 1}, "layer_norm"),
+        ({"save_replay": "sometimes"}, "save_replay"),
         ({"actor_sizes": []}, "actor_sizes"),
         ({"actor_sizes": [True]}, "actor_sizes"),
         ({"combine": "max"}, "combine"),

@@ -48,7 +48,7 @@ class SACConfig:
     warm_up: Annotated[int, Field(ge=0)] = 8
     """Steps of every world that the replay has to hold before anything is learnt; until the first update, actions are drawn
     uniformly from within the limit."""
-    save_replay: bool | Literal["auto"] = "auto"
+    save_replay: Literal[True, False, "auto"] = "auto"
     """Whether checkpoints hold the replay. Without it they are small, and a resumed run fills a new one first: it goes on, but not
     as if it had never stopped. ``"auto"``: where the replay of a rank is small, see :data:`worker.learning.sac.sac.SAVED`."""
 
