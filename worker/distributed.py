@@ -128,20 +128,21 @@ class Gang:
         return answer[1:] if answer.startswith("+") else None
 
     @contextlib.contextmanager
-    def build_in_turn(self, warm: Path | None = None) -> Iterator[None]:
+    def build_in_turn(self, warm: Path | None = None, what: str = "task") -> Iterator[None]:
         """Compile kernels once a cache: the first rank of each (host, cache) builds, then the others, which find it warm.
 
         Args:
+            what: What is built; only the first time of each is in turn.
             warm: A marker in the cache that says that this was built before: then nobody waits, since all builds are quick.
                 The marker is a hint. Where it is wrong, kernels are compiled several times, and nothing else happens.
         """
         first = self._sites.index(self._sites[self.rank])
         alone = self._sites.count(self._sites[self.rank]) == 1
         if self.store is not None and not alone and self.rank == first:
-            self.store.set(f"warm/{first}", "1" if warm is not None and warm.exists() else "0")
+            self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
         wait = self.store is not None and not alone and self.rank != first
-        if wait and self.store.get(f"warm/{first}") == b"0":
-            self.store.wait([f"built/{first}"], timedelta(seconds=BUILD_SECONDS))
+        if wait and self.store.get(f"warm/{what}/{first}") == b"0":
+            self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
         try:
             yield
             if warm is not None and self.rank == first:
@@ -149,7 +150,7 @@ class Gang:
                     warm.mkdir(parents=True, exist_ok=True)
         finally:
             if self.store is not None and self.rank == first:
-                self.store.set(f"built/{first}", "1")
+                self.store.set(f"built/{what}/{first}", "1")
 
     def close(self) -> None:
         """Leave the process group."""

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.checkpoints import Checkpoint
 from shared_store.files import remove_tree, sync_directory, write_atomic, write_json
 from shared_store.layout import Run
-from worker.errors import TrainingError
+from worker.errors import TrainingError, UserError
 from worker.learning.job import Job, run_command
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy
 
 STEPS = 3
-"""Steps in which an exported policy with a memory is compared."""
+"""Steps in which an exported policy is compared, each with other observations: in one step nobody sees what a policy remembers."""
 TOLERANCE = 1e-5
 """Greatest absolute difference between the exported and the trained policy's actions."""
 
@@ -42,17 +42,29 @@ TOLERANCE = 1e-5
 def export(run: Run, checkpoint: Checkpoint) -> Path:
     """Export ``checkpoint`` to ``exports/<its name>/``, as a whole or not at all; returns that directory.
 
-    Raises TrainingError where the exported file computes something else than the policy; nothing is published then.
+    Raises TrainingError where the exported file computes something else than the policy, and UserError where the policy has a memory that
+    its :meth:`worker.learning.algorithm.Policy.module` does not have; nothing is published then.
     """
+    import numpy as np
+    import torch
+
     from worker.learning.trained import load_policy
 
     policy = load_policy(checkpoint)
     facts, exported = checkpoint.manifest, policy.module()
-    steps = STEPS if exported.states else 1
+    count = exported.sample.batch_size[0]
+    seen = [exported.sample[(torch.arange(count) + step) % count] for step in range(STEPS)]
+    policy.reset()
     # as it was trained, not as it is exported
-    actions = [policy.act(exported.sample).numpy() for _ in range(steps)]
-    fed = {name: tensor.numpy() for name, tensor in exported.observed().items()}
-    few = 8 if all(tensor.ndim == 2 for tensor in fed.values()) else 1
+    actions = [policy.act(observations).numpy().copy() for observations in seen]
+    policy.reset()
+    if not exported.states and np.abs(policy.act(seen[-1]).numpy() - actions[-1]).max() > TOLERANCE:
+        raise UserError(
+            f"the policy of algorithm {facts['algorithm']} remembers what it saw before, but its module() has no recurrent state among "
+            "inputs and outputs; not published"
+        )
+    fed = [{name: tensor.numpy() for name, tensor in exported.named(each).items()} for each in seen]
+    few = 8 if all(tensor.ndim == 2 for tensor in fed[0].values()) else 1
     metadata = {
         "format": 1,
         "task": facts["task"],
@@ -65,7 +77,7 @@ def export(run: Run, checkpoint: Checkpoint) -> Path:
         "output": "actions",
         **({"state": {name: list(exported.inputs[name].shape) for name in exported.states}} if exported.states else {}),
         "self_test": {
-            **{name: tensor[:few].tolist() for name, tensor in fed.items()},
+            **{name: tensor[:few].tolist() for name, tensor in fed[0].items()},
             "actions": actions[0][:few].tolist(),
             "tolerance": TOLERANCE,
         },
@@ -117,12 +129,12 @@ def to_onnx(policy: ExportedPolicy, metadata: dict[str, Any]) -> bytes:
 
 
 def check(
-    model: bytes, exported: ExportedPolicy, fed: Mapping[str, np.ndarray], actions: Sequence[np.ndarray]
+    model: bytes, exported: ExportedPolicy, fed: Sequence[Mapping[str, np.ndarray]], actions: Sequence[np.ndarray]
 ) -> float:
     """Run ``model`` with ONNX's reference evaluator; the greatest difference to ``actions``. Raises TrainingError above the tolerance.
 
     Args:
-        fed: The observations, the same in each step; a recurrent policy begins with a state of zeros.
+        fed: The observations of each step; a recurrent policy begins with a state of zeros.
         actions: What the policy does in each step, shape (n, actions).
     """
     import numpy as np
@@ -132,8 +144,8 @@ def check(
     evaluator, count = ReferenceEvaluator(onnx.load_from_string(model)), len(actions[0])
     states = {name: np.zeros((count, *exported.inputs[name].shape[1:]), dtype=np.float32) for name in exported.states}
     difference = 0.0
-    for wanted in actions:
-        found, *after = evaluator.run(None, {**fed, **states})
+    for observed, wanted in zip(fed, actions, strict=True):
+        found, *after = evaluator.run(None, {**observed, **states})
         states = dict(zip(states, after, strict=True))
         difference = max(difference, float(np.abs(found - wanted).max()))
     if not difference <= TOLERANCE:

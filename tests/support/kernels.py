@@ -12,13 +12,14 @@ from tests.conftest import REPOSITORY
 
 BUILD = """
 import warp
-from worker.distributed import warm_marker
-from worker.learning.ppo import draws, objective
+from worker.distributed import Gang, Placement, warm_marker
+from worker.learning.algorithms import BUILT_IN, find_algorithm
+from worker.learning.setup import load_kernels
 from worker.tasks import find_task
 
 warp.config.log_level = warp.LOG_WARNING
-for kernels in (draws, objective):
-    kernels.load("cpu")
+for algorithm in BUILT_IN:
+    load_kernels(find_algorithm(algorithm), Gang(Placement(), "cpu", None, ["here"]))
 task = find_task({name!r})
 task(task.config_type(), 2, seed=1)
 warm_marker(task, "cpu").mkdir(parents=True, exist_ok=True)

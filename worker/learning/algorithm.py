@@ -70,6 +70,9 @@ class Setting:
     """Of everything that the algorithm draws. Weights are drawn from torch's own generator, which is seeded alike on all ranks."""
     control_seconds: float = 1.0
     """Length of a control step [s]."""
+    rehearsal: bool = False
+    """Whether one iteration is run to see what memory it takes, and nothing else: it has to learn, as if what it waits for (a full
+    replay, a teacher's weights) were there."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +136,9 @@ class ExportedPolicy:
         """Names of the inputs that are the recurrent state."""
         return list(self.inputs)[len(self.sample.keys()) :]
 
-    def observed(self) -> dict[str, torch.Tensor]:
-        """The sample by the names of the inputs."""
-        return dict(zip(self.inputs, self.sample.values(), strict=False))
+    def named(self, observations: TensorDict) -> dict[str, torch.Tensor]:
+        """Observations, with the groups of the sample in its order, by the names of the inputs."""
+        return dict(zip(self.inputs, observations.values(), strict=False))
 
 
 class Algorithm(Protocol):
@@ -149,7 +152,9 @@ class Algorithm(Protocol):
     """Its settings: a pydantic dataclass that is imported without torch. ``fixed``, where it has that, names those that a resumed run
     can't change."""
     captures_rollout: ClassVar[bool]
-    """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.cuda_graph.CudaGraphFunction`."""
+    """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.cuda_graph.CudaGraphFunction`.
+
+    One more attribute of the class is optional: ``kernels``, modules with Warp kernels, which one rank of each host compiles."""
 
     steps: int
     """Control steps of every world in one iteration."""

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -42,25 +42,19 @@ def find_algorithm(name: str) -> type[Algorithm]:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UserError(f"train.algorithm: {name}: {error}") from error
-    missing = [part for part in _PARTS if not hasattr(found, part)]
-    if missing:
-        raise UserError(
-            f"train.algorithm: {name} is no algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
-        )
+    refuse_incomplete(found, name, ("config_type", "captures_rollout", *_METHODS))
     return found  # type: ignore[no-any-return]
 
 
-_PARTS = (
-    "config_type",
-    "captures_rollout",
-    "begin",
-    "act",
-    "record",
-    "learn",
-    "policy",
-    "state_dict",
-    "load_state_dict",
-)
+_METHODS = [name for name in vars(Algorithm) if not name.startswith("_")]
+
+
+def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
+    """Raises UserError, with the names of those that are missing, where ``found`` has not all ``parts``."""
+    if missing := [part for part in parts if not hasattr(found, part)]:
+        raise UserError(
+            f"train.algorithm: {name} is no algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
+        )
 
 
 def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:
@@ -80,14 +74,17 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
             raise UserError(f"{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
     try:
         return kind(**{**base, **given})
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        path = ".".join(map(str, (where, *first["loc"])))
-        raise UserError(
-            f"{path}: {first['msg'].removeprefix('Value error, ')}, got {first.get('input')!r}"[:1000]
-        ) from error
     except (TypeError, ValueError) as error:
-        raise UserError(f"{where}: {error}") from error
+        raise UserError(refusal(where, error)) from error
+
+
+def refusal(where: str, error: TypeError | ValueError) -> str:
+    """In one line what settings refuse; ``where``: their section."""
+    if not isinstance(error, ValidationError):
+        return f"{where}: {' '.join(str(error).split())}"
+    first = error.errors(include_url=False)[0]
+    path = ".".join(map(str, (where, *first["loc"])))
+    return f"{path}: {first['msg'].removeprefix('Value error, ')}, got {first.get('input')!r}"[:1000]
 
 
 def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:

@@ -9,15 +9,16 @@ import re
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from worker.distributed import Gang
-from worker.errors import UserError
+from worker.errors import UserError, is_out_of_memory
 from worker.learning.algorithm import Algorithm, Share
-from worker.learning.setup import build_algorithm, build_task, observed, transition
+from worker.learning.setup import build_algorithm, build_task, load_kernels, observed, transition
 
 if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 Learner = tuple[type[Algorithm], Any]
 """An algorithm, and its settings."""
 FEW, MORE = 64, 2048
-"""Worlds of two builds: the first loads kernels and libraries, the second is measured."""
+"""Worlds of the builds that are measured, after one that loads kernels and libraries: what both take is not the worlds' (networks, a
+batch of fixed size)."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
 """From so many worlds on, memory is looked at beforehand: on the CPU the kernel kills who takes too much, and on a GPU building many
 worlds takes long before it fails."""
@@ -54,25 +56,20 @@ def within_memory(
     """
     free = free_bytes(gang)
     if worlds >= CHECKED[gang.device.partition(":")[0]]:
-        size = bytes_per_world(task_type, config, learner, gang)
-        if worlds * size > SPARE * free:
-            raise UserError(_explain(task_type, worlds, gang, free, size))
+        need = measure(task_type, config, learner, gang)
+        if need.of(worlds) > SPARE * free:
+            raise UserError(_explain(task_type, worlds, gang, free, need))
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        if not starting() or not _is_out_of_memory(error):
+        if not starting() or not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # what was built so far goes
         try:
-            size = bytes_per_world(task_type, config, learner, gang)
+            need = measure(task_type, config, learner, gang)
         except Exception:  # on a device that is full, or in the middle of a recording: the first error is what counts
-            size = 0.0
-        raise UserError(_explain(task_type, worlds, gang, free, size)) from error
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    known = isinstance(error, MemoryError | torch.OutOfMemoryError)
-    return known or any(text in str(error) for text in ("Failed to allocate", "out of memory", "can't allocate memory"))
+            need = Need(0.0, 0.0)
+        raise UserError(_explain(task_type, worlds, gang, free, need)) from error
 
 
 def free_bytes(gang: Gang) -> int:
@@ -90,14 +87,31 @@ def free_bytes(gang: Gang) -> int:
     return max(free, 0) // gang.placement.local_world_size
 
 
-def bytes_per_world(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> float:
-    """What a world takes with its part of rollout and update. Takes some seconds; every rank calls it."""
+@dataclass(frozen=True)
+class Need:
+    """What a rank takes [bytes]."""
+
+    fixed: float
+    """Whatever its worlds: networks, optimizer, an update with a batch of fixed size."""
+    world: float
+    """Of each world, with its part of rollout, replay and update."""
+
+    def of(self, worlds: int) -> float:
+        """For so many worlds [bytes]."""
+        return self.fixed + worlds * self.world
+
+
+def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> Need:
+    """What the worlds of this task take with this algorithm. Takes some seconds; every rank calls it."""
+    load_kernels(learner[0], gang)
     _taken(task_type, config, learner, FEW, gang)
-    return _taken(task_type, config, learner, MORE, gang) / MORE
+    few, more = (_taken(task_type, config, learner, worlds, gang) for worlds in (FEW, MORE))
+    world = max(more - few, 0) / (MORE - FEW)
+    return Need(max(few - FEW * world, 0.0), world)
 
 
 def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
-    """The most memory that ``worlds`` take while they are built and learn once, from an iteration in which nothing moves."""
+    """The most memory that ``worlds`` take [bytes] while they are built and learn once, from an iteration in which nothing moves."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()
@@ -105,7 +119,7 @@ def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: 
     share = Share(0, worlds, worlds)
     task = build_task(task_type, config, share, gang, 0)
     kind, settings = learner
-    algorithm = build_algorithm(kind, settings, task, share, alone, 0)
+    algorithm = build_algorithm(kind, settings, task, share, alone, 0, rehearsal=True)
     observations = observed(task)
     step = transition(task, observations)
     algorithm.begin(0)
@@ -145,14 +159,17 @@ def _status(name: str) -> int:
     return int(found[1]) * 1024 if found else 0
 
 
-def _explain(task_type: type[Task], worlds: int, gang: Gang, free: int, size: float) -> str:
-    """One line; ``size`` of one world in bytes, 0 where it could not be measured."""
+def _explain(task_type: type[Task], worlds: int, gang: Gang, free: int, need: Need) -> str:
+    """One line; ``need`` is 0 where it could not be measured."""
     where = "memory" if gang.device == "cpu" else f"memory of {gang.device}"
     start = f"worlds: {worlds:,} worlds of {task_type.__name__} on rank {gang.placement.rank} need more {where} than"
-    if worlds * size <= SPARE * free:  # others took what was free at the start
+    if need.of(worlds) <= SPARE * free:  # others took what was free at the start
         return f"{start} there is; set fewer `worlds`, or free some"
-    fit = max(1, int(SPARE * free / size))
-    return f"{start} the {_gb(free)} that are free: about {_gb(worlds * size)}. About {fit:,} fit: set `worlds`"
+    room = SPARE * free - need.fixed
+    short = f"{start} the {_gb(free)} that are free: about {_gb(need.of(worlds))}"
+    if room < need.world:
+        return f"{short}. Not even one fits: set smaller networks or batches"
+    return f"{short}. About {int(room / need.world):,} fit: set `worlds`"
 
 
 def _gb(size: float) -> str:

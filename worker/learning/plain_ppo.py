@@ -19,6 +19,7 @@ from torch import nn
 from torch.distributions import Normal, kl_divergence
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Setting, Spaces, Transition
+from worker.learning.ppo import draws
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.settings import PPOConfig
 
@@ -90,6 +91,7 @@ class PlainPPO:
 
     config_type: ClassVar[type[PPOConfig]] = PPOConfig
     captures_rollout: ClassVar[bool] = False
+    kernels: ClassVar[Sequence[Any]] = (draws,)
     graphs: Sequence[Any] = ()
 
     def __init__(self, config: PPOConfig, setting: Setting) -> None:

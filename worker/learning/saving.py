@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import select
@@ -24,20 +23,27 @@ _BUFFERS = 2
 
 
 class HostCopies:
-    """Copies of device tensors in pinned host memory that is allocated once: the device is waited for one time a save."""
+    """Copies of device tensors in pinned host memory that is kept: the device is waited for one time a save."""
 
     def __init__(self) -> None:
-        self._pinned: dict[str, torch.Tensor] = {}
+        self._pinned: dict[str, tuple[tuple[object, ...], torch.Tensor]] = {}
+        """Each with the form of what it is a copy of."""
         self._copied = False
 
     def take(self, value: Any, key: str = "") -> Any:
-        """``value`` with every CUDA tensor in it replaced by its copy, which is complete after :meth:`wait`."""
+        """``value`` with every CUDA tensor in it replaced by its copy, which is complete after :meth:`wait`.
+
+        Of a CPU tensor that is part of a larger one the part is copied: ``torch.save`` would write the whole.
+        """
         if isinstance(value, torch.Tensor) and value.is_cuda:
-            host = self._pinned.get(key)
-            if host is None or host.shape != value.shape or host.dtype != value.dtype:
-                host = self._pinned[key] = torch.empty(value.shape, dtype=value.dtype, pin_memory=True)
+            # the strides, too: where dimensions lie in another order, the device makes a copy of its own first
+            form = value.dtype, value.shape, value.stride()
+            if key not in self._pinned or self._pinned[key][0] != form:
+                self._pinned[key] = form, torch.empty_like(value, device="cpu", pin_memory=True)
             self._copied = True
-            return host.copy_(value.detach(), non_blocking=True)
+            return self._pinned[key][1].copy_(value.detach(), non_blocking=True)
+        if isinstance(value, torch.Tensor):
+            return value.detach().clone() if value.nbytes < value.untyped_storage().nbytes() else value
         if isinstance(value, dict):
             return {name: self.take(item, f"{key}/{name}") for name, item in value.items()}
         if isinstance(value, list | tuple):
@@ -91,17 +97,15 @@ class Saver:
             self._take_answer(None)
         memory = self._memory[self._given % _BUFFERS]
         self._given += 1
-        layout, offset = [], 0
+        layout = []
         snapshots = {name: self._copies.take(content(), name) for name, content in files.items()}
         self._copies.wait()
-        for name, snapshot in snapshots.items():
-            buffer = io.BytesIO()
-            torch.save(snapshot, buffer)
-            content_bytes = buffer.getbuffer()
-            layout.append((name, offset, len(content_bytes)))
-            while content_bytes:  # one call writes 2 GiB at most
-                written = os.pwrite(memory, content_bytes, offset)
-                content_bytes, offset = content_bytes[written:], offset + written
+        with open(memory, "wb", buffering=1 << 20, closefd=False) as file:
+            file.seek(0)  # what an earlier save left behind the end stays, and is not read
+            for name, snapshot in snapshots.items():
+                begin = file.tell()
+                torch.save(snapshot, file)
+                layout.append((name, begin, file.tell() - begin))
         order = {
             "run": str(self.run.path),
             "iteration": iteration,

@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Setting, Share, Spaces, Transition
+from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
-from worker.learning.ppo import draws, objective
 
 if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
@@ -28,9 +28,14 @@ def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Ga
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
     with user_errors(), gang.build_in_turn(marker):
-        for kernels in (objective, draws):
-            kernels.load(gang.device)
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
+
+
+def load_kernels(algorithm: type[Algorithm], gang: Gang) -> None:
+    """Compile the algorithm's own Warp kernels, once a cache, or take them from there. All ranks call it."""
+    with gang.build_in_turn(what="algorithm"):
+        for module in getattr(algorithm, "kernels", ()):
+            warp.load_module(module, gang.device)
 
 
 def total_worlds(job: Job, gang: Gang) -> int:
@@ -60,12 +65,27 @@ def spaces_from(policy: dict[str, Any]) -> Spaces:
 
 
 def build_algorithm(
-    algorithm: type[Algorithm], settings: Any, task: Task, share: Share, gang: Gang, seed: int
+    algorithm: type[Algorithm],
+    settings: Any,
+    task: Task,
+    share: Share,
+    gang: Gang,
+    seed: int,
+    *,
+    rehearsal: bool = False,
 ) -> Algorithm:
-    """Raises UserError for settings that the algorithm refuses."""
+    """Raises UserError for settings that the algorithm refuses, and where it lacks what every algorithm has. All ranks call it.
+
+    Args:
+        rehearsal: See :attr:`Setting.rehearsal`.
+    """
+    load_kernels(algorithm, gang)
     control_seconds = 1.0 / task.config.control_hz
+    setting = Setting(spaces_of(task), share, gang, seed, control_seconds, rehearsal)
     with user_errors("train"):
-        return algorithm(settings, Setting(spaces_of(task), share, gang, seed, control_seconds))
+        built = algorithm(settings, setting)
+    refuse_incomplete(built, algorithm.__name__, ("steps", "graphs"))
+    return built
 
 
 def observed(task: Task) -> TensorDict:

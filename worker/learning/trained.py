@@ -51,16 +51,23 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
 
     >>> actions = load_policy(checkpoint).act({"policy": observations})  # shape (n, actions) for (n, observations)
 
-    Raises UserError where the checkpoint is of another version, or its algorithm can't be found.
+    Raises UserError where the checkpoint is of another version, its algorithm can't be found, or refuses the settings that it had then.
     """
-    from worker.learning.algorithms import find_algorithm
+    from worker.learning.algorithms import find_algorithm, refusal
     from worker.learning.setup import spaces_from
 
     facts = checkpoint.manifest
     if "algorithm" not in facts:
         raise UserError(f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms")
     algorithm = find_algorithm(facts["algorithm"])
-    policy = algorithm.build_policy(algorithm.config_type(**facts["settings"]), spaces_from(facts["policy"]), device)
+    try:
+        settings = algorithm.config_type(**facts["settings"])
+        policy = algorithm.build_policy(settings, spaces_from(facts["policy"]), device)
+    except (TypeError, ValueError) as error:
+        refused = refusal("settings", error)
+        raise UserError(
+            f"checkpoint {checkpoint.name}: algorithm {facts['algorithm']} refuses what it was trained with: {refused}"
+        ) from error
     try:
         policy.load_state_dict(load_learner(checkpoint, device)["algorithm"]["policy"])
     except (RuntimeError, KeyError) as error:

@@ -20,7 +20,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from worker.learning.ppo.models import to_numbers
+from worker.learning.observations import to_numbers
 from worker.tasks import find_task
 
 if TYPE_CHECKING:

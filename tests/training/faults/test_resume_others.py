@@ -84,12 +84,13 @@ SAC_APPLIED: dict[str, tuple[Any, Callable[[SAC], Any]]] = {
     "critic_learning_rate": (0.5, rate("critic")),
     "weight_decay": (0.5, rate("critic", 0, "weight_decay")),
     "max_grad_norm": (0.5, lambda sac: sac.learner.config.max_grad_norm),
+    "save_replay": (False, lambda sac: bool(sac.world_state())),
     "target_entropy": (-1.0, lambda sac: sac.learner.config.target_entropy),
 }
 SAC_REFUSED: dict[str, Any] = {
     **{"actor_sizes": [4], "critic_sizes": [4], "critics": 3, "layer_norm": False, "critic_group": "critic"},
     **{"normalize_observations": False, "atoms": 12, "v_min": -5.0, "v_max": 5.0, "replay_steps": 64},
-    **{"save_replay": False, "action_limit": 0.5, "init_std": 0.25, "init_temperature": 0.5},
+    **{"action_limit": 0.5, "init_std": 0.25, "init_temperature": 0.5},
 }
 
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from typing import Any
 
 import pytest
 import torch
 
 from worker.distributed import Gang, Placement
-from worker.errors import UserError
+from worker.errors import UserError, is_out_of_memory
 from worker.learning import memory
+from worker.learning.algorithms import find_algorithm
 from worker.learning.ppo.fused import PPO
+from worker.learning.rsl.settings import RslRlConfig
+from worker.learning.sac.settings import SACConfig
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import Randomization
 
@@ -53,18 +57,56 @@ FULL = (
 
 
 def test_an_allocation_that_fails_is_told_as_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert all(memory._is_out_of_memory(error) for error in FULL)
-    assert not memory._is_out_of_memory(RuntimeError("shapes do not fit"))
+    assert all(is_out_of_memory(error) for error in FULL)
+    assert not is_out_of_memory(RuntimeError("shapes do not fit"))
+    assert not is_out_of_memory(ValueError("the memory of a GRU is of no use here"))
     error = FULL[0]
     there = r"^worlds: 64 worlds of Cartpole on rank 0 need more memory than there is; set fewer"
     with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
     monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
-    little = r"than the 0.0 GB that are free: about 0.0 GB. About \d+ fit: set `worlds`$"
+    little = r"than the 0.0 GB that are free: about 0.0 GB. (About \d+ fit|Not even one fits): set "
     with pytest.raises(UserError, match=little), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE):
         raise error
     with pytest.raises(type(error)), memory.within_memory(Cartpole, CONFIG, LEARNER, 64, HERE, lambda: False):
         raise error  # long after the start: not the worlds' fault, and not the user's
+
+
+DISTILLATION = RslRlConfig(algorithm={"class_name": "Distillation"}, teacher_checkpoint="taught")
+LEARNERS: dict[str, tuple[str, Any]] = {
+    "ppo": ("ppo", CONFIG.ppo),
+    "sac": ("sac", CONFIG.sac),
+    "rsl_rl's PPO": ("rsl_rl", RslRlConfig()),
+    "rsl_rl's Distillation": ("rsl_rl", DISTILLATION),
+}
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_what_worlds_need_is_known_of_every_algorithm(name: str) -> None:
+    algorithm, settings = LEARNERS[name]
+    there = r"About [\d,]+ fit: set `worlds`$"
+    learner = find_algorithm(algorithm), settings
+    with pytest.raises(UserError, match=there), memory.within_memory(Cartpole, CONFIG, learner, 200_000_000, HERE):
+        pytest.fail("they are not to be built")
+
+
+def test_a_batch_of_sac_is_looked_at_though_the_first_iteration_of_a_run_only_collects() -> None:
+    def need(settings: SACConfig) -> memory.Need:
+        return memory.measure(Cartpole, CONFIG, (find_algorithm("sac"), settings), HERE)
+
+    few = need(dataclasses.replace(CONFIG.sac, updates=2, warm_up=3000))
+    many = need(dataclasses.replace(CONFIG.sac, updates=2, warm_up=3000, batch_size=65_536))
+    # of each sample of a batch at least what goes through two critics of two layers of 64, and 51 atoms, with gradients
+    assert many.fixed - few.fixed > 65_000 * 2 * (64 + 64 + 51) * 4
+    # 1024 steps of 2 x 4 states, an action and 3 outcomes
+    assert few.world == pytest.approx(1024 * 12 * 4, rel=0.5) and many.world < 3 * few.world
+
+
+def test_what_does_not_grow_with_the_worlds_leaves_less_room_for_them() -> None:
+    told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(4.5e6, 9_000.0))
+    assert told.endswith("than the 0.0 GB that are free: about 0.0 GB. About 500 fit: set `worlds`")
+    told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(9e6, 9_000.0))
+    assert told.endswith("Not even one fits: set smaller networks or batches")
 
 
 def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import pytest
@@ -111,6 +112,23 @@ def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
     ppo._adapt_learning_rate(torch.tensor(kl))
     assert float(ppo._rate) == pytest.approx(after)
     assert ppo.optimizer.param_groups[0]["lr"] is ppo._rate
+
+
+@pytest.mark.parametrize("device", [False, True])
+def test_an_optimizer_keeps_the_flags_of_its_own_device(device: bool) -> None:
+    """A step that is not capturable, as a CPU's, breaks the recording on a GPU that goes on from its checkpoint."""
+    ppo, saved = make(desired_kl=0.02), make()
+    for parameter in (*saved.actor.parameters(), *saved.critic.parameters()):
+        parameter.grad = torch.ones_like(parameter)
+    saved.optimizer.step()
+    state = copy.deepcopy(saved.state_dict())
+    state["optimizer"]["param_groups"][0]["capturable"] = not device
+    ppo.optimizer.param_groups[0]["capturable"] = device
+    ppo.load_state_dict(state)
+    (group,) = ppo.optimizer.param_groups
+    assert group["capturable"] is device and group["fused"] and group["lr"] is ppo._rate
+    moments, there = ppo.optimizer.state_dict()["state"], state["optimizer"]["state"]
+    assert moments and all(torch.equal(moments[i]["exp_avg"], there[i]["exp_avg"]) for i in there)
 
 
 def test_a_fixed_schedule_keeps_the_learning_rate() -> None:

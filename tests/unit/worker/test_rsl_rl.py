@@ -143,6 +143,7 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         ({"actor": {"class_name": "nowhere:Net"}}, r"actor\.class_name: No module named 'nowhere'"),
         ({"critic": {"hiden_dims": [8]}}, r"critic: .* unexpected keyword argument 'hiden_dims'"),
         ({"critic": {"hidden_dims": []}}, r"critic: IndexError: "),
+        ({"critic": {"memory": 8}}, r"critic: .* unexpected keyword argument 'memory'"),
         ({"actor": {"distribution_cfg": {"init_sd": 1.0}}}, r"actor: .* unexpected keyword argument 'init_sd'"),
         ({"actor": {"class_name": "MLPModel"}}, r"actor\.distribution_cfg: PPO needs a distribution"),
         ({"actor": CNN}, r"actor: No 2D observations are provided"),

@@ -20,8 +20,10 @@ from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.sac import SMALL, make, point, same
 from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces, Transition
-from worker.learning.sac.sac import SAC
+from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.sac.sac import SAC, SAVED
 from worker.learning.sac.settings import SACConfig
+from worker.learning.saving import HostCopies
 
 torch.set_num_threads(1)
 
@@ -40,6 +42,7 @@ torch.set_num_threads(1)
         ({"batch_size": "64"}, "batch_size"),
         ({"batch_size": 64.0}, "batch_size"),
         ({"layer_norm": 1}, "layer_norm"),
+        ({"save_replay": "sometimes"}, "save_replay"),
         ({"actor_sizes": []}, "actor_sizes"),
         ({"actor_sizes": [True]}, "actor_sizes"),
         ({"combine": "max"}, "combine"),
@@ -143,6 +146,44 @@ def test_without_its_replay_a_resumed_run_fills_a_new_one_with_the_policy() -> N
     assert not same(learnt, resumed.learner.critics.state_dict())
 
 
+def test_a_small_replay_is_saved_and_a_large_one_is_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a GPU a save of gigabytes would take as long as hundreds of iterations."""
+    task = point()
+    size = 32 * 6 * (2 * 2 + 1 + 3) * 4
+    monkeypatch.setitem(SAVED, "cpu", size)
+    assert make(task).world_state() and not capsys.readouterr().out
+    monkeypatch.setitem(SAVED, "cpu", size - 1)
+    assert make(task).world_state() == {}
+    told = "checkpoints do not hold the replay, 0 MiB a rank: a run that is resumed fills a new one first "
+    assert capsys.readouterr().out.startswith(told)
+    assert make(task, save_replay=True).world_state() and not make(task, save_replay=False).world_state()
+    make(point(2), gang=Half(1), share=Share(3, 2, 5))
+    SAC(SMALL, dataclasses.replace(setting_of(task), rehearsal=True))
+    assert not capsys.readouterr().out, "the main rank tells it, and only of a run that is to begin"
+
+
+@pytest.mark.parametrize(("total", "saved"), [(5, True), (7, False)])
+def test_all_ranks_save_their_replay_or_none(monkeypatch: pytest.MonkeyPatch, total: int, saved: bool) -> None:
+    """The rank with the most worlds decides."""
+    monkeypatch.setitem(SAVED, "cpu", 32 * (2 * 2 + 1 + 3) * 4 * 3)
+    shares = [Share.of(rank, 2, total) for rank in range(2)]
+    assert shares[0].count < shares[1].count and shares[0].count <= 3
+    made = [make(point(share.count), gang=Half(rank), share=share) for rank, share in enumerate(shares)]
+    assert [bool(sac.world_state()) for sac in made] == [saved, saved]
+
+
+def test_only_what_the_replay_holds_is_saved() -> None:
+    task = point()
+    sac = make(task, replay_steps=1000)
+    iterate(sac, task, 0, 3)
+    buffer = io.BytesIO()
+    torch.save(HostCopies().take(dict(sac.world_state())), buffer)
+    held = 12 * 6 * (2 * 2 + 1 + 3) * 4
+    assert held < buffer.tell() < 3 * held < sac.replay.nbytes / 10
+
+
 def test_weights_alone_are_taken_over_with_fresh_optimizers() -> None:
     task = point()
     sac = make(task)
@@ -161,6 +202,7 @@ def test_weights_alone_are_taken_over_with_fresh_optimizers() -> None:
     assert group["lr"] == 0.123, "the job's learning rate, not the checkpoint's"
     with pytest.raises(RuntimeError):
         make(task, critic_sizes=(8,)).load_state_dict(sac.state_dict())
+    iterate(sac, task, 4, 9)
     with pytest.raises(ValueError, match=r"replay_steps"):
         make(task, replay_steps=40).load_world_state(sac.world_state())
 
@@ -247,6 +289,34 @@ def test_what_is_recorded_asks_the_device_for_nothing_and_draws_nothing(settings
         for graph in sac.graphs:
             graph()
     assert watch.found == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "ranks", "names"),
+    [
+        ({}, 1, "moments, updates"),
+        ({"normalize_observations": False}, 1, "updates"),
+        (
+            {"policy_delay": 2},
+            2,
+            "gather moments, merge moments, critic gradients, critic step, all gradients, all steps",
+        ),
+        ({"policy_delay": 1}, 2, "gather moments, merge moments, all gradients, all steps"),
+        ({"normalize_observations": False, "policy_delay": 1}, 2, "all gradients, all steps"),
+    ],
+)
+def test_every_graph_is_called(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], ranks: int, names: str
+) -> None:
+    """The log names the graphs when all of them were captured; one that is never called would keep it waiting."""
+    called: list[str] = []
+    run = CudaGraphFunction.__call__
+    monkeypatch.setattr(CudaGraphFunction, "__call__", lambda graph: (called.append(graph.name), run(graph)))
+    task = point()
+    sac = make(task, gang=Half(0) if ranks > 1 else None, **settings)
+    assert ", ".join(graph.name for graph in sac.graphs) == names
+    iterate(sac, task, 0, 2)
+    assert set(called) == set(names.split(", "))
 
 
 class Half(Gang):

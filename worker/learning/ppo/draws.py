@@ -85,11 +85,6 @@ def _draw_order(
             orders[epoch * minibatches + minibatch, place, world] = wp.int64(step) * wp.int64(worlds) + wp.int64(world)
 
 
-def load(device: str) -> None:
-    """Compile the kernels for ``device``, or take them from the cache."""
-    wp.load_module(__name__, device)
-
-
 class Draws:
     """The draws of one rank. What :meth:`begin` sets is read by the kernels, so that these can be part of a graph.
 

@@ -19,14 +19,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping
+from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
 
+from worker.learning import moments
 from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.ppo import linear, moments
+from worker.learning.optimizers import load_optimizer
+from worker.learning.ppo import draws, linear, objective
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.heads import Categorical, Gaussian, Head
 from worker.learning.ppo.loss import LOSSES, Clipping
@@ -44,6 +47,7 @@ class PPO:
 
     config_type: ClassVar[type[PPOConfig]] = PPOConfig
     captures_rollout: ClassVar[bool] = True
+    kernels: ClassVar[tuple[ModuleType, ...]] = (draws, objective)
 
     def __init__(self, config: PPOConfig, setting: Setting, *, plain: bool = False) -> None:
         """``plain``: the loss in plain torch where there is a kernel for it. Raises ValueError for what it can't do."""
@@ -290,11 +294,7 @@ class PPO:
         self.critic.load_state_dict(state["critic"])
         if weights_only:
             return []
-        self.optimizer.load_state_dict(state["optimizer"])
-        for group in self.optimizer.param_groups:
-            group["lr"] = self._rate  # the optimizer goes on reading the one tensor
-            if self.config.optimizer == "adamw":
-                group["weight_decay"] = self.config.weight_decay
+        load_optimizer(self.optimizer, state["optimizer"])
         saved, asked = float(state["learning_rate"]), self.config.learning_rate
         keeps = self.config.schedule == "adaptive" and "learning_rate" not in changed
         self._rate.fill_(saved if keeps else asked)

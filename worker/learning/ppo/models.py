@@ -16,10 +16,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
+from worker.learning.observations import made_up, to_numbers
 from worker.learning.ppo.settings import PPOConfig
-
-SAMPLES, IMAGES = 1024, 16
-"""Observations on which an exported policy is compared: numbers, or images, for which ONNX's evaluator takes its time."""
 
 
 class PixelModel(CNNModel):
@@ -29,11 +27,6 @@ class PixelModel(CNNModel):
         """What the convolutions make of images, shape (batch, channels, height, width), uint8: shape (batch, features)."""
         # the bytes are few: bring them into the order that convolutions are fastest with before they become numbers
         return self.cnns[POLICY](to_numbers(obs[POLICY].contiguous(memory_format=torch.channels_last)))
-
-
-def to_numbers(images: torch.Tensor) -> torch.Tensor:
-    """Bytes from 0 to 255 as float32 from -0.5 to 0.5."""
-    return images.to(torch.float32) / 255.0 - 0.5
 
 
 class ActorPolicy:
@@ -59,8 +52,8 @@ class ActorPolicy:
     def module(self) -> ExportedPolicy:
         actor = copy.deepcopy(self.actor).cpu().eval()
         network = _Network(actor, self._spaces.discrete).eval()
-        seen = _seen(actor, self._spaces.observations[POLICY])
-        return ExportedPolicy(network, {"obs": seen[:1]}, ["actions"], TensorDict({POLICY: seen}, [len(seen)]))
+        seen = made_up({POLICY: self._spaces.observations[POLICY]}, getattr(actor, "obs_normalizer", None))
+        return ExportedPolicy(network, {"obs": seen[POLICY][:1]}, ["actions"], seen)
 
 
 class _Network(nn.Module):
@@ -82,16 +75,6 @@ class _Network(nn.Module):
 class _Numbers(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return to_numbers(obs)
-
-
-def _seen(actor: MLPModel | PixelModel, shape: Sequence[int]) -> torch.Tensor:
-    """Observations as the policy has met them (its normaliser's moments), a few far outside; of one that sees images, any bytes."""
-    generator = torch.Generator().manual_seed(0)
-    if len(shape) > 1:
-        return torch.randint(0, 256, (IMAGES, *shape), dtype=torch.uint8, generator=generator)
-    samples = torch.randn(SAMPLES, *shape, generator=generator)
-    samples[-SAMPLES // 8 :] *= 5.0
-    return actor.obs_normalizer.inverse(samples) if actor.obs_normalization else samples
 
 
 def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:

@@ -78,11 +78,6 @@ def _objective(
         terms[i, 4 + j] = scale * (slope * (distance * distance - 1.0) - entropy_coef) / std[j]
 
 
-def load(device: str) -> None:
-    """Compile the kernel for ``device``, or take it from the cache."""
-    wp.load_module(__name__, device)
-
-
 class Objective:
     """:func:`worker.learning.ppo.loss.clipped_loss` of a diagonal Gaussian, for minibatches of one size.
 

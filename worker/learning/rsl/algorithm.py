@@ -52,6 +52,8 @@ class RslRl:
         self._asked_rate: float | None = config.algorithm.get("learning_rate")
         self._intrinsic = torch.zeros((), device=setting.gang.device)
         self._policy = RslRlPolicy(self.algorithm.get_policy(), seen, setting.spaces)
+        if self._distils and setting.rehearsal:
+            self.algorithm.teacher_loaded = True  # any weights take the same memory
         if setting.gang.size > 1:
             self.algorithm.broadcast_parameters()
         self._begin_memories(building.example_of(setting.spaces, self._worlds, setting.gang.device))

@@ -19,6 +19,7 @@ from rsl_rl.utils import resolve_callable, resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import nn
 
+from worker.errors import is_out_of_memory
 from worker.learning.algorithm import Setting, Share, Spaces
 from worker.learning.rsl.settings import RslRlConfig
 from worker.tasks.rsl_rl_env import as_floats
@@ -122,7 +123,7 @@ def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[st
         with _quiet():
             built = found.construct_algorithm(example, Surroundings(setting, example), complete, gang.device)
     except Exception as error:
-        for name in names if not _out_of_memory(error) else ():  # was it one of them?
+        for name in names if not is_out_of_memory(error) else ():  # was it one of them?
             try:
                 build_network(config, name, sets, example, 1 if name == "critic" else spaces.actions)
             except ValueError as refusal:
@@ -193,11 +194,7 @@ def _refused(where: str) -> Iterator[None]:
         with _quiet():
             yield
     except Exception as error:
-        if _out_of_memory(error):
+        if is_out_of_memory(error):
             raise
         kind = f"{type(error).__name__}: " if isinstance(error, LookupError | AssertionError) else ""
         raise ValueError(f"rsl_rl.{where}: {kind}{' '.join(str(error).split())}") from error
-
-
-def _out_of_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError | torch.OutOfMemoryError) or "memory" in str(error)

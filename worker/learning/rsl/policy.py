@@ -7,16 +7,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from rsl_rl.modules import EmpiricalNormalization
 from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import ExportedPolicy, Spaces
-from worker.learning.ppo.models import to_numbers
+from worker.learning.observations import made_up, to_numbers
 from worker.tasks.rsl_rl_env import as_floats
-
-SAMPLES, IMAGES = 1024, 16
-"""Observations on which an export is compared: of numbers alone, or with images."""
 
 
 class RslRlPolicy:
@@ -89,28 +85,10 @@ class RslRlPolicy:
             network=_Exported(network, vectors, images).eval(),
             inputs={**inputs, **remembered},
             outputs=["actions", *(f"{name}_out" for name in remembered)],
-            sample=self._sample(IMAGES if images else SAMPLES),
+            sample=made_up(
+                {group: self._spaces.observations[group] for group in self._groups}, self._model.obs_normalizer
+            ),
         )
-
-    def _sample(self, count: int) -> TensorDict:
-        """Observations as the policy has met them (its normaliser's moments), a few far outside; images of any bytes."""
-        generator = torch.Generator().manual_seed(0)
-        shapes = {group: self._spaces.observations[group] for group in self._groups}
-        sizes = [shape[0] for shape in shapes.values() if len(shape) == 1]
-        numbers = torch.randn(count, sum(sizes), generator=generator)
-        numbers[-count // 8 :] *= 5.0
-        normalizer = self._model.obs_normalizer
-        if isinstance(normalizer, EmpiricalNormalization):
-            mean, deviation = normalizer.mean.cpu(), normalizer.std.cpu()
-            numbers = numbers * (deviation + normalizer.eps) + mean
-        parts = iter(numbers.split(sizes, dim=1) if sizes else ())
-        sample = {
-            group: next(parts)
-            if len(shape) == 1
-            else torch.randint(0, 256, (count, *shape), dtype=torch.uint8, generator=generator)
-            for group, shape in shapes.items()
-        }
-        return TensorDict(sample, batch_size=[count])
 
 
 class _Exported(nn.Module):

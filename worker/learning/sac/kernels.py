@@ -68,12 +68,6 @@ def _project(
     projected[sample, atom] = total
 
 
-def load(device: str) -> None:
-    """Compile the kernels for ``device``, or take them from the cache."""
-    wp.init()
-    wp.load_module(__name__, device)
-
-
 def explore(
     keys: torch.Tensor,
     step: int,

@@ -12,6 +12,7 @@ from torch.nn.functional import log_softmax
 
 from worker.distributed import Gang
 from worker.learning.algorithm import Share
+from worker.learning.optimizers import load_optimizer
 from worker.learning.sac import kernels
 from worker.learning.sac.networks import Actor, Critics, make_normalizer
 from worker.learning.sac.replay import Batch
@@ -206,7 +207,4 @@ class Learner:
             if weights_only:
                 optimizer.state.clear()
                 continue
-            own = [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            optimizer.load_state_dict(state[f"{name}_optimizer"])
-            for group, settings in zip(optimizer.param_groups, own, strict=True):
-                group.update(settings)  # of this job and this device, not of those that saved it
+            load_optimizer(optimizer, state[f"{name}_optimizer"])

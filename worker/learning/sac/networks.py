@@ -15,12 +15,11 @@ from torch import nn
 from torch.nn.functional import layer_norm, silu, softplus
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
+from worker.learning.observations import made_up
 from worker.learning.sac.settings import LOG_STD, SACConfig
 
 HEAD_SCALE = 0.01
 """First weights of the last layers, as a part of torch's: so the first policy is centred, and the first critics expect nothing."""
-SAMPLES = 1024
-"""Observations on which an exported policy is compared."""
 
 
 def size_of(spaces: Spaces, group: str) -> int:
@@ -180,16 +179,8 @@ class SquashedPolicy:
     def module(self) -> ExportedPolicy:
         """The mean action as a function of ``obs``, shape (batch, observations); the observations are normalised inside."""
         network = _Best(self.actor)
-        samples = torch.randn(SAMPLES, self.actor.observations, generator=torch.Generator().manual_seed(0))
-        samples[-SAMPLES // 8 :] *= 5.0  # a few far outside
-        if isinstance(normalizer := network.actor.normalizer, EmpiricalNormalization):
-            samples = normalizer.inverse(samples)
-        return ExportedPolicy(
-            network,
-            {"obs": torch.zeros(1, self.actor.observations)},
-            ("actions",),
-            TensorDict({POLICY: samples}, batch_size=[SAMPLES]),
-        )
+        seen = made_up({POLICY: (self.actor.observations,)}, network.actor.normalizer)
+        return ExportedPolicy(network, {"obs": seen[POLICY][:1]}, ("actions",), seen)
 
     def state_dict(self) -> Mapping[str, Any]:
         """The actor's tensors, with its normaliser's."""

@@ -56,6 +56,11 @@ class Replay:
         self._ahead = torch.arange(n_step, device=device) * worlds
         self._powers = torch.tensor([gamma**k for k in range(n_step + 1)], device=device)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the ring [bytes]."""
+        return self.before.nbytes + self.after.nbytes + self.outcomes.nbytes
+
     def find_slots(self, slots: torch.Tensor) -> None:
         """Fill ``slots``, shape (n,), int64, with the places of the next n steps."""
         torch.arange(len(slots), out=slots).add_(self.recorded).remainder_(self.capacity)
@@ -121,13 +126,17 @@ class Replay:
         return self.before[slots]
 
     def world_state(self) -> dict[str, torch.Tensor]:
-        """Live views of everything, leading dimension (worlds,)."""
+        """Live views of all that was written, leading dimension (worlds,)."""
+        return {"recorded": self._recorded, **self._written(self.recorded)}
+
+    def _written(self, recorded: int) -> dict[str, torch.Tensor]:
+        """The places that hold something after ``recorded`` steps, shape (worlds, places, …): the ring fills from its beginning."""
         rings = {"before": self.before, "after": self.after, "outcomes": self.outcomes}
-        return {"recorded": self._recorded, **{name: ring.transpose(0, 1) for name, ring in rings.items()}}
+        return {name: ring[: min(recorded, self.capacity)].transpose(0, 1) for name, ring in rings.items()}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
         """Go on from :meth:`world_state`. Raises ValueError where it is that of another ring, and KeyError where it lacks something."""
-        live = self.world_state()
+        live = {"recorded": self._recorded, **self._written(int(state["recorded"][0]))}
         for name, tensor in live.items():
             if state[name].shape != tensor.shape:
                 raise ValueError(

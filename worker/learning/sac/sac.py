@@ -16,14 +16,15 @@ mean instead of the least, normalised observations, AdamW with a little weight d
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
 
+from worker.learning import moments
 from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.ppo import moments
 from worker.learning.randomness import mix_seed
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
@@ -31,12 +32,17 @@ from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, si
 from worker.learning.sac.replay import Replay
 from worker.learning.sac.settings import SACConfig
 
+SAVED = {"cpu": 64 << 20, "cuda": 4 << 20}
+"""With ``save_replay: auto``, a rank's replay of up to so many bytes is part of its checkpoints. A GPU's iteration takes milliseconds, and
+so does saving what is allowed it; a resumed run has not the same bits there in any case."""
+
 
 class SAC:
     """Collects with :meth:`act` and :meth:`record`, then :meth:`learn`; see :class:`worker.learning.algorithm.Algorithm`."""
 
     config_type: ClassVar[type[SACConfig]] = SACConfig
     captures_rollout: ClassVar[bool] = True
+    kernels: ClassVar[tuple[ModuleType, ...]] = (kernels,)
 
     def __init__(self, config: SACConfig, setting: Setting) -> None:
         """Allocate everything once. Raises ValueError for images, choices, an unknown group, or a batch with no sample for some rank."""
@@ -47,7 +53,6 @@ class SAC:
                 f"sac.batch_size: {self.gang.size} ranks need at least as many samples, got {config.batch_size}"
             )
         self.config, self.steps, self.device = config, config.steps, self.gang.device
-        kernels.load(self.device)
         self._groups = list(dict.fromkeys((POLICY, config.critic_group)))
         sizes = [size_of(spaces, group) for group in self._groups]
         self.learner = Learner(config, sizes, spaces.actions, self.gang)
@@ -55,10 +60,27 @@ class SAC:
         self.replay = Replay(
             config.replay_steps, self.share.count, width, spaces.actions, config.n_step, config.gamma, self.device
         )
+        if setting.rehearsal:
+            self.replay.advance(max(config.replay_steps, config.warm_up))
+        self._saves_replay = self._decide_saving(tells=self.gang.is_main and not setting.rehearsal)
         self._updates = 0
         self._learns = False
         self._allocate(width, spaces.actions)
         self._make_graphs()
+
+    def _decide_saving(self, *, tells: bool) -> bool:
+        """Whether checkpoints hold the replay; the same on all ranks. ``tells``: print it where the settings leave it open."""
+        if self.config.save_replay != "auto":
+            return self.config.save_replay
+        most, ranks = SAVED[self.device.partition(":")[0]], self.gang.size
+        size = self.replay.nbytes // self.share.count * -(-self.share.total // ranks)
+        if size > most and tells:
+            print(
+                f"checkpoints do not hold the replay, {size / 2**20:,.0f} MiB a rank: a run that is resumed fills a new one first "
+                "(sac.save_replay: true saves it, and takes longer to save)",
+                flush=True,
+            )
+        return size <= most
 
     def _allocate(self, width: int, actions: int) -> None:
         config, device, samples = self.config, self.device, self.learner.samples
@@ -80,16 +102,19 @@ class SAC:
         self._rate = torch.tensor(config.critic_learning_rate, device=device)
 
     def _make_graphs(self) -> None:
-        """What the device replays as graphs: in a gang of one two of them, else the parts between which the collectives stand."""
-        parts: dict[str, Callable[[], None]] = {
-            "gather moments": self._gather_moments,
-            "merge moments": self._merge_moments,
-            "critic gradients": lambda: self._compute(False),
-            "all gradients": lambda: self._compute(True),
-            "critic step": lambda: self._apply(False),
-            "all steps": lambda: self._apply(True),
-        }
-        wholes: dict[str, Callable[[], None]] = {"moments": self._observe, "updates": self._update}
+        """What the device replays as graphs: in a gang of one two of them, else the parts between which the collectives stand.
+
+        Only those that are called: the loop waits for all of them before it tells that they were captured.
+        """
+        wholes: dict[str, Callable[[], None]] = {}
+        parts: dict[str, Callable[[], None]] = {}
+        if self.config.normalize_observations:
+            wholes = {"moments": self._observe}
+            parts = {"gather moments": self._gather_moments, "merge moments": self._merge_moments}
+        if self.config.policy_delay > 1:
+            parts |= {"critic gradients": lambda: self._compute(False), "critic step": lambda: self._apply(False)}
+        wholes |= {"updates": self._update}
+        parts |= {"all gradients": lambda: self._compute(True), "all steps": lambda: self._apply(True)}
         graphs = wholes if self.gang.size == 1 else parts
         recorded = {name: CudaGraphFunction(function, self.device, name) for name, function in graphs.items()}
         self.graphs: Sequence[CudaGraphFunction] = [*recorded.values()]
@@ -230,7 +255,7 @@ class SAC:
 
     def world_state(self) -> Mapping[str, torch.Tensor]:
         """The replay, where it is to be saved."""
-        return self.replay.world_state() if self.config.save_replay else {}
+        return self.replay.world_state() if self._saves_replay else {}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
         """Go on with the replay of :meth:`world_state`; where none was saved, with an empty one."""

@@ -48,9 +48,9 @@ class SACConfig:
     warm_up: Annotated[int, Field(ge=0)] = 8
     """Steps of every world that the replay has to hold before anything is learnt; until the first update, actions are drawn
     uniformly from within the limit."""
-    save_replay: bool = True
+    save_replay: Literal[True, False, "auto"] = "auto"
     """Whether checkpoints hold the replay. Without it they are small, and a resumed run fills a new one first: it goes on, but not
-    as if it had never stopped."""
+    as if it had never stopped. ``"auto"``: where the replay of a rank is small, see :data:`worker.learning.sac.sac.SAVED`."""
 
     actor_sizes: Sizes = (512, 256, 128)
     """Widths of the hidden layers of the policy."""
@@ -105,10 +105,10 @@ class SACConfig:
 
     fixed: ClassVar[tuple[str, ...]] = (
         *("actor_sizes", "critic_sizes", "critics", "layer_norm", "critic_group", "normalize_observations"),
-        *("atoms", "v_min", "v_max", "replay_steps", "save_replay", "action_limit", "init_std", "init_temperature"),
+        *("atoms", "v_min", "v_max", "replay_steps", "action_limit", "init_std", "init_temperature"),
     )
     """What a resumed run can't change: checkpoints hold what became of it."""
-    clone_may_change: ClassVar[tuple[str, ...]] = ("replay_steps", "save_replay", "init_temperature")
+    clone_may_change: ClassVar[tuple[str, ...]] = ("replay_steps", "init_temperature")
     """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
 
     @model_validator(mode="after")

@@ -1,0 +1,89 @@
+"""What makes a class an algorithm, and what is done before one is built."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import warp
+
+from tests.conftest import REPOSITORY
+from tests.support.worker.loop import alone
+from tests.support.worker.point_task import Point, PointConfig
+from worker.distributed import Gang
+from worker.errors import UserError
+from worker.learning.algorithm import Share
+from worker.learning.algorithms import BUILT_IN, find_algorithm
+from worker.learning.plain_ppo import PlainPPO
+from worker.learning.ppo import draws, objective
+from worker.learning.sac import kernels
+from worker.learning.setup import build_algorithm, load_kernels
+
+HERE = "tests.unit.worker.test_algorithms"
+
+
+class OnlyLearns:
+    """Has a few of the parts."""
+
+    config_type, captures_rollout = PointConfig, False
+
+    def learn(self) -> None: ...
+    def policy(self) -> None: ...
+    def state_dict(self) -> None: ...
+
+
+class Forgetful(PlainPPO):
+    """Has all methods, and does not say how many steps an iteration has."""
+
+    def __init__(self, config: Any, setting: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_those_that_come_with_muster_are_algorithms(name: str) -> None:
+    assert find_algorithm(name)
+
+
+def test_a_class_that_is_no_algorithm_is_refused_with_all_that_it_lacks() -> None:
+    lacks = "begin, act, record, load_state_dict, world_state, load_world_state, build_policy"
+    with pytest.raises(UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is no algorithm: it lacks {lacks} \("):
+        find_algorithm(f"{HERE}:OnlyLearns")
+
+
+def test_what_only_an_instance_has_is_looked_for_before_the_first_iteration() -> None:
+    chosen = find_algorithm(f"{HERE}:Forgetful")
+    with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
+        build_algorithm(chosen, None, Point(PointConfig(), 2), Share(0, 2, 2), alone(), 0)  # type: ignore[arg-type]
+
+
+class InTurn(Gang):
+    """Notes when it is this rank's turn to compile."""
+
+    def __init__(self) -> None:
+        vars(self).update(vars(alone()))
+        self.turn: str | None = None
+
+    @contextlib.contextmanager
+    def build_in_turn(self, warm: Any = None, what: str = "task") -> Iterator[None]:
+        self.turn = what
+        yield
+        self.turn = None
+
+
+@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, objective)), ("sac", (kernels,)), ("rsl_rl", ())])
+def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algorithm(
+    monkeypatch: pytest.MonkeyPatch, name: str, modules: tuple[Any, ...]
+) -> None:
+    gang, loaded = InTurn(), []
+    monkeypatch.setattr(warp, "load_module", lambda module, device: loaded.append((module, device, gang.turn)))
+    load_kernels(find_algorithm(name), gang)
+    assert loaded == [(module, "cpu", "algorithm") for module in modules]
+
+
+def test_what_is_common_to_all_algorithms_imports_none_of_them() -> None:
+    told = "import sys, worker.learning.setup as s; sys.exit(any(n.startswith('worker.learning.ppo.d') for n in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", told], cwd=REPOSITORY).returncode == 0
