@@ -93,17 +93,20 @@ class PPO:
         self._observation_sums = self._sums[3:].split(sizes)
 
     def _allocate_gradients(self) -> None:
-        """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it."""
+        """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it.
+
+        Each begins at a multiple of :data:`worker.learning.ppo.linear.ALIGNED`, with zeros between them.
+        """
         actor = list(self.actor.parameters())
         shared = set(map(id, actor))  # convolutions are the actor's too
         critic = [parameter for parameter in self.critic.parameters() if id(parameter) not in shared]
-        sizes = [sum(p.numel() for p in part) for part in (actor, critic)]
+        sizes = [sum(linear.aligned(p.numel()) for p in part) for part in (actor, critic)]
         self._parameters = actor + critic
         self._shared = torch.zeros(sum(sizes) + len(LOSSES), device=self.device)
         offset = 0
         for parameter in self._parameters:
             parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
-            offset += parameter.numel()
+            offset += linear.aligned(parameter.numel())
         self._gradients = self._shared[: sizes[0]], self._shared[sizes[0] : sum(sizes)]
         self._losses = self._shared[sum(sizes) :]
         self._rate = torch.tensor(self.config.learning_rate, device=self.device)

@@ -14,7 +14,12 @@ ALIGNED = 8
 
 def padded(columns: int, device: str) -> int:
     """How many columns a buffer of ``columns`` gets: on a GPU the next multiple of :data:`ALIGNED`."""
-    return -(-columns // ALIGNED) * ALIGNED if device.startswith("cuda") else columns
+    return aligned(columns) if device.startswith("cuda") else columns
+
+
+def aligned(count: int) -> int:
+    """The next multiple of :data:`ALIGNED`."""
+    return -(-count // ALIGNED) * ALIGNED
 
 
 class _Linear(torch.autograd.Function):
