@@ -35,6 +35,7 @@ from worker.learning.saving import Saver
 from worker.learning.shards import Shards, read_file
 
 if TYPE_CHECKING:
+    from worker.learning.reporter import Reporter
     from worker.tasks.task import Task
 
 
@@ -129,10 +130,16 @@ class TrainingState:
         self.set_anew: Sequence[str] = ()
         """What this job's settings put in place of the checkpoint's, a line each."""
 
-    def save(self) -> None:
+    def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
-        Raises StaleEpoch where a newer attempt owns the run.
+        Args:
+            reporter: The checkpoint is committed after what ``reporter`` has been given so far: a run that goes on from it has the
+                metrics records before it.
+            wait: For earlier saves that are still being written, as long as they take.
+
+        Raises:
+            StaleEpoch: A newer attempt owns the run.
         """
         worlds = {"first": self.share.first, "count": self.share.count}
         files: dict[str, Callable[[], Any]] = {
@@ -143,8 +150,12 @@ class TrainingState:
         }
         if self.gang.is_main:
             files["learner.pt"] = lambda: {"algorithm": self.algorithm.state_dict(), "progress": asdict(self.progress)}
-        self.saver.save(self.progress.iteration, files, self._manifest() if self.gang.is_main else None)
-        self.ordered_at = self.progress.iteration
+        iteration = self.progress.iteration
+        if reporter:
+            reporter.do(self.saver.note_records, iteration)
+        facts = self._manifest() if self.gang.is_main else None
+        self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
+        self.ordered_at = iteration
 
     def _of_algorithm(self) -> dict[str, torch.Tensor]:
         """What the algorithm keeps for each world, beside what the task does."""
