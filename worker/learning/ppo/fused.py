@@ -47,10 +47,6 @@ class PPO:
 
     def __init__(self, config: PPOConfig, setting: Setting, *, plain: bool = False) -> None:
         """``plain``: the loss in plain torch where there is a kernel for it. Raises ValueError for what it can't do."""
-        if config.minibatches > config.steps:
-            raise ValueError(
-                f"ppo.minibatches: {config.minibatches} minibatches need as many steps of each world, there are {config.steps}"
-            )
         self.config, self.setting, self.gang = config, setting, setting.gang
         self.steps, self.device = config.steps, setting.gang.device
         spaces, worlds = setting.spaces, setting.share.count
