@@ -125,7 +125,7 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
 
 def end_startup() -> None:
-    """What was imported and built so far stays: leave it out of garbage collection, which begins now."""
+    """Freeze start-up objects out of the garbage collector, then enable it."""
     gc.freeze()
     gc.enable()
 
@@ -141,7 +141,7 @@ def user_errors(where: str | None = None) -> Iterator[None]:
 
 def run_command(body: Callable[[], int]) -> None:
     """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
-    # importing the simulation parses hundreds of kernels: collecting garbage meanwhile takes half as long again
+    # Importing the simulation parses hundreds of kernels; garbage collection would make that half as long again.
     gc.disable()
     try:
         code = body()
@@ -156,7 +156,7 @@ def run_command(body: Callable[[], int]) -> None:
         code = EX_ERROR
     sys.stdout.flush()
     sys.stderr.flush()
-    # the process group's threads of a gang that broke would keep a normal exit waiting for peers that are gone
+    # A normal exit would join NCCL/Gloo threads that wait for dead peers.
     os._exit(code)
 
 

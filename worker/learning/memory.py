@@ -1,4 +1,4 @@
-"""Whether the worlds fit into memory. What a world needs is measured on a few: the solver's and torch's buffers are theirs alone to know."""
+"""Whether the worlds fit into memory. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ Learner = tuple[type[Algorithm], Any]
 FEW, MORE = 64, 2048
 """Worlds of two builds: the first loads kernels and libraries, the second is measured."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
-"""From so many worlds on, memory is looked at beforehand: on the CPU the kernel kills who takes too much, and on a GPU building many
-worlds takes long before it fails."""
+"""Number of worlds from which memory is checked beforehand: on CPU the OOM killer strikes without a message; on GPU a too large build
+fails only after minutes."""
 SPARE = 0.9
 """Share of the free memory that may be taken: graphs and kernels take some more."""
 

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -39,6 +39,19 @@ if TYPE_CHECKING:
     from worker.tasks.task import Task
 
 
+class Ended(NamedTuple):
+    """What ended in one iteration, in the worlds of all ranks."""
+
+    steps: int
+    """Control steps of each world."""
+    episodes: float
+    """How many episodes ended."""
+    returns: float
+    """The sum of their returns."""
+    squares: float = math.nan
+    """The sum of the squares of their returns; unknown in checkpoints that were saved before there were squares."""
+
+
 @dataclass
 class Progress:
     """How far training is."""
@@ -58,8 +71,7 @@ class Progress:
     score_episodes: int = 0
     """How many episodes the score is a mean of."""
     recent: list[list[float]] = field(default_factory=list)
-    """The newest iterations, as many as the score needs: steps of each world, episodes that ended, the sum of their returns, and the
-    sum of the squares of these."""
+    """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists, which checkpoints can hold."""
 
     def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
         """Note what ended in an iteration, and work out the score and its error.
@@ -75,14 +87,12 @@ class Progress:
             worlds: Of all ranks.
             longest: Steps of the longest episode.
         """
-        self.recent.append([steps, episodes, returns, squares])
+        self.recent.append(list(Ended(steps, episodes, returns, squares)))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
-            entry = self.recent[index]
-            span, ended, total = span + entry[0], ended + entry[1], total + entry[2]
-            spread += (
-                entry[3] if len(entry) > 3 else math.nan
-            )  # of a checkpoint that was saved before there were squares
+            entry = Ended(*self.recent[index])
+            span, ended = span + entry.steps, ended + entry.episodes
+            total, spread = total + entry.returns, spread + entry.squares
             if span >= longest and ended >= max(EPISODES, worlds):
                 self.score, self.score_episodes = total / ended, int(ended)
                 variance = max(0.0, spread - total * total / ended) / (ended - 1) if math.isfinite(spread) else None
@@ -108,7 +118,7 @@ class TrainingState:
         facts: dict[str, Any],
         keep: int,
     ) -> None:
-        """``facts``: what the manifest says besides (task, configuration), for those who read a checkpoint without the job."""
+        """``facts``: extra manifest fields (task, configuration), so that a checkpoint can be read on its own."""
         self.job, self.gang, self.share, self.task, self.algorithm, self.facts = (
             job,
             gang,

@@ -1,4 +1,4 @@
-"""Named numbers that are added up over the ranks once an iteration, in one buffer."""
+"""Named numbers that are added up over the ranks in one buffer."""
 
 from __future__ import annotations
 

@@ -320,7 +320,7 @@ class Task:
             raise ValueError(f"config.randomize.observation_noise: {error}") from error
 
     def _allocate(self) -> None:
-        """Allocate every buffer once and let torch see it."""
+        """Allocate every buffer once, as views that torch and Warp share."""
         count, device = self.world_count, self.device
 
         def buffer(name: str, shape: tuple[int, ...], dtype: Any) -> torch.Tensor:
@@ -365,7 +365,7 @@ class Task:
         return seen, before
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
+        """Views of all state that persists between control steps."""
         arrays = self.worlds.arrays
         memory = {"memory": self._memory} if self.memory_size else {}
         images = {"images": self._camera.images} if self._camera else {}
@@ -385,7 +385,7 @@ class Task:
         }
 
     def _assert_captured(self) -> None:
-        """Replay once and see that it rewards: a graph that recorded nothing would step for ever without a sound.
+        """Replay the graph once and check that it writes rewards: an empty graph would step for ever without an error.
 
         Raises:
             RuntimeError: The replay left a reward as it was.
