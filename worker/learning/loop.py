@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 
 EVALUATED = 256
-"""At most so many worlds of each rank are built to evaluate a policy: those of training still hold their memory."""
+"""Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
 WARNINGS = 10
-"""At most so many iterations with worlds that were reset have a line of their own."""
+"""Resets of worlds are logged for at most this many iterations; later ones are only counted."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
 """Those of a task's statistics that become reward, episode length and score; the others are told by their names."""
 
@@ -146,7 +146,7 @@ class Loop:
             )
 
     def _handle(self, signals: dict[str, float]) -> bool:
-        """Save when it is time, tell of earlier saves; True where the gang is to leave (then everything is saved)."""
+        """Save when a save is due, and log how earlier saves ended; returns whether the gang leaves (then everything is saved)."""
         state, iteration = self.state, self.state.progress.iteration
         stopping = signals["stopping"] > 0
         if signals["failed_saves"] > 0:
@@ -216,7 +216,7 @@ class Loop:
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
-        """Tell of worlds that were reset since something was not finite or the physics failed; raises TrainingError where they are too many."""
+        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError where they are too many."""
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
@@ -242,7 +242,7 @@ class Loop:
         )
 
     def _begin_iteration(self, iteration: int) -> None:
-        """Tell the task, whose curriculum may depend on it."""
+        """Tell the task which iteration begins: its curriculum may depend on it."""
         told = iteration, self.state.progress.reward, self.state.progress.episode_length
         self.incident.begin(*told)
         self.task.begin_iteration(*told)
@@ -363,7 +363,7 @@ def _print(text: str) -> None:
 
 
 def straggler(seconds: list[float]) -> dict[str, float]:
-    """Which rank collected the longest in the iteration before, and how much longer than the median: all others wait for it.
+    """The rank that collected longest in the iteration before, and its excess over the median: all others wait for it.
 
     Args:
         seconds: By rank; empty figures for a gang of one.
@@ -376,7 +376,7 @@ def straggler(seconds: list[float]) -> dict[str, float]:
 
 
 def _figure(name: str, total: float, episodes: float) -> float | None:
-    """A reward term is told as its mean over the finished episodes, a count of mishaps as it is."""
+    """A reward term as its mean over the finished episodes; a count of mishaps as it is."""
     if not name.startswith("reward_"):
         return total
     return total / episodes if episodes else None
