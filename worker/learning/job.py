@@ -29,7 +29,7 @@ EX_ERROR, EX_USAGE = 1, 2
 
 
 class StopRequest:
-    """What signals ask for: SIGTERM and SIGINT to leave at the next chance with a checkpoint, SIGUSR2 to save and go on."""
+    """Requests by signal: SIGTERM and SIGINT save a checkpoint and leave after the iteration; SIGUSR2 saves and goes on."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -110,7 +110,7 @@ class Job:
 def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
     """``task``'s configuration with the overrides of a ``train`` section (``config``).
 
-    Raises UserError for a key that does not exist or a value that can't be: in the words in which a submission refuses it.
+    Raises UserError for an unknown key or an invalid value, in the same words as the submission.
     """
     from worker.tasks.overrides import Refused, configured
 
@@ -132,7 +132,7 @@ def end_startup() -> None:
 
 @contextmanager
 def user_errors(where: str | None = None) -> Iterator[None]:
-    """In here a ValueError is the user's to put right; elsewhere it is a defect and shows its traceback."""
+    """Turn a ValueError into a UserError, which is shown in one line; elsewhere a ValueError is a defect and shows its traceback."""
     try:
         yield
     except ValueError as error:

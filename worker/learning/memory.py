@@ -97,7 +97,7 @@ def bytes_per_world(task_type: type[Task], config: TaskConfig, learner: Learner,
 
 
 def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
-    """The most memory that ``worlds`` take while they are built and learn once, from an iteration in which nothing moves."""
+    """Peak memory [bytes] of building ``worlds`` and learning once from an iteration in which the worlds are not stepped."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()

@@ -138,7 +138,7 @@ class TrainingState:
         self.learning_rate: float | None = None
         """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
         self.set_anew: Sequence[str] = ()
-        """What this job's settings put in place of the checkpoint's, a line each."""
+        """One log line for each value that this job's settings replace in the checkpoint."""
 
     def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
@@ -168,7 +168,7 @@ class TrainingState:
         self.ordered_at = iteration
 
     def _of_algorithm(self) -> dict[str, torch.Tensor]:
-        """What the algorithm keeps for each world, beside what the task does."""
+        """Per-world state of the algorithm, named apart from the task's."""
         return {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
 
     def finish(self) -> list[str]:
@@ -269,7 +269,7 @@ class TrainingState:
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
-        """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
+        """Compare the manifest with this job, before any tensor is loaded. Raises UserError with the first difference."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
         if "algorithm" not in there:
             raise UserError(
@@ -307,7 +307,7 @@ class TrainingState:
 
 
 _OF_ALGORITHM = "algorithm/"
-"""Begins the names of what an algorithm keeps for each world."""
+"""Prefix of the names of an algorithm's per-world state."""
 
 
 def _called(path: tuple[str, ...], manifest: Any) -> str:
