@@ -33,6 +33,7 @@ from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.setup import build_task
+from worker.learning.training import Training
 from worker.tasks import find_task
 
 CUDA = torch.cuda.is_available()
@@ -55,7 +56,7 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
     spec = {"train": section, "checkpoint": {"every": every}}
     job = Job(spec, Store(store), run, 1, 1, "bench", section=section)
-    return Loop(job, connect(placement), find_task(task), StopRequest())
+    return Loop(Training.of(job, find_task(task)), connect(placement), StopRequest())
 
 
 def wait() -> None:

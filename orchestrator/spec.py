@@ -37,7 +37,7 @@ from orchestrator.spec_values import (
     TaskName,
 )
 from shared_store.log_files import LEAST_LIMIT, LIMIT
-from shared_store.wording import explain, kind_of
+from shared_store.wording import explain, kind_of, path_of
 
 KINDS = ("train", "evaluate", "export", "command")
 """What a job can do: exactly one of these keys is in a spec."""
@@ -245,7 +245,7 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         # a misspelt key comes before the one that is missing for it: it has a line, and a nearest name
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
-        path = tuple(part for part in first["loc"] if isinstance(part, str | int))
+        path = tuple(part for part in path_of(first) if isinstance(part, str | int))
         raise SpecError(f"{_place(path, source, lines)}{_explain(first, path)}{more}") from None
     if spec.train and (problem := _problem_of(spec.train)):
         path, words = problem

@@ -24,6 +24,31 @@ _EXPECTED = {
     "dataclass_exact_type": "expected a mapping",
 }
 
+Path = tuple[str | int, ...]
+
+
+class Refused(ValueError):
+    """A value can't be used.
+
+    Args:
+        path: Keys to it, from the configuration on.
+        words: One line: what was expected, what was found.
+    """
+
+    def __init__(self, path: Path, words: str) -> None:
+        super().__init__(": ".join(filter(None, (".".join(map(str, path)), words))))
+        self.path, self.words = path, words
+
+
+def path_of(problem: Mapping[str, Any]) -> Path:
+    """Keys to the value that is wrong: a :class:`Refused` knows more of them than pydantic.
+
+    Args:
+        problem: One of ``pydantic.ValidationError.errors()``.
+    """
+    cause = problem.get("ctx", {}).get("error")
+    return (*problem["loc"], *(cause.path if isinstance(cause, Refused) else ()))
+
 
 def explain(problem: Mapping[str, Any]) -> str:
     """What was expected and what was found.
@@ -35,13 +60,20 @@ def explain(problem: Mapping[str, Any]) -> str:
     if kind == "missing":
         return "is required"
     if kind == "value_error":
-        text = str(problem["ctx"]["error"])
+        cause = problem["ctx"]["error"]
+        if isinstance(cause, Refused):
+            return cause.words
+        text = str(cause)
         return text if not text.startswith("expected") or isinstance(found, dict) else f"{text}, found {shown(found)}"
     if kind == "literal_error":
         return f"expected {problem['ctx']['expected']}, found {shown(found)}"
     if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
         written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
         return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
+    if kind == "too_short" and problem["ctx"]["min_length"] == 1:
+        # tuples are settings such as the widths of layers
+        what = "number" if problem["ctx"]["field_type"] == "Tuple" else "item"
+        return f"expected at least one {what}, found {shown(list(found) if isinstance(found, tuple) else found)}"
     if kind in _EXPECTED:
         return f"{_EXPECTED[kind]}, found {kind_of(found)}"
     message = str(problem["msg"])

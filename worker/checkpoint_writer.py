@@ -2,8 +2,9 @@
 
 ``python -m worker.checkpoint_writer`` is started by :class:`worker.learning.saving.Saver`. It reads one JSON order a line on standard input,
 takes the files' content from a memory file (inherited descriptor), writes, fsyncs and digests them, and answers one JSON line an
-order on standard output. The main rank's writer then waits until every rank's files are durable, and commits. Orders are carried
-out one after the other: a later save never overtakes an earlier one. Imports no torch.
+order on standard output. The main rank's writer then waits until every rank's files are durable and the metrics records up to the
+save's iteration are written, and commits. Orders are carried out one after the other: a later save never overtakes an earlier one.
+Imports no torch.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from shared_store.layout import Run
 
 GATHER_SECONDS = 120.0
 """How long the main rank's writer waits for the files of the other ranks [s]."""
+_POLL = 0.02
+"""Seconds between two looks at what the main rank's writer waits for."""
 _CHUNK = 1 << 20
 
 
@@ -78,8 +81,14 @@ def save(order: dict[str, Any], orders: Orders) -> dict[str, Any]:
             return {"written": writer.name, "seconds": time.monotonic() - started}
         for rank in range(order["ranks"]):
             digests |= _gather(writer.path, rank, order["iteration"], orders)
+        recorded = _wait_for_records(order, orders)
         checkpoint = writer.commit(order["facts"], order["keep"], digests)
-        return {"committed": checkpoint.name, "seconds": time.monotonic() - started, "bytes": checkpoint.size}
+        return {
+            "committed": checkpoint.name,
+            "recorded": recorded,
+            "seconds": time.monotonic() - started,
+            "bytes": checkpoint.size,
+        }
     except StaleEpoch as error:
         return {"stale": str(error)}
     except OSError as error:
@@ -125,8 +134,26 @@ def _gather(directory: Path, rank: int, iteration: int, orders: Orders) -> dict[
             raise Abandoned("another rank could not write its files")
         if time.monotonic() > deadline:
             raise Abandoned(f"the files of rank {rank} did not come within {GATHER_SECONDS:g} s")
-        orders.look(0.02)
+        orders.look(_POLL)
     return read_json(directory / name) or {}
+
+
+def _wait_for_records(order: dict[str, Any], orders: Orders) -> bool:
+    """Wait until the records up to the save's iteration are written, for the time that the order gives; returns whether they are."""
+    waited = order.get("records")
+    if waited is None:
+        return True
+    deadline = time.monotonic() + waited["seconds"]
+    while read_iteration(waited["memory"]) < order["iteration"]:
+        if orders.ended or time.monotonic() > deadline:
+            return False
+        orders.look(_POLL)
+    return True
+
+
+def read_iteration(memory: int) -> int:
+    """The iteration in a memory file, up to which records are written; 0 before the first."""
+    return int.from_bytes(os.pread(memory, 8, 0), "little")
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from worker.errors import UserError
-from worker.learning.job import Job, StopRequest, configure, run_command, user_errors
+from worker.learning.job import Job, StopRequest, run_command, user_errors
 
 
 def main() -> int:
@@ -25,20 +25,18 @@ def main() -> int:
 
     with user_errors("train.task"):
         task_type = find_task(job.section["task"])
-    from worker.learning.algorithms import DEFAULT, find_algorithm, settings
     from worker.learning.loop import Loop
     from worker.learning.memory import within_memory
     from worker.learning.setup import total_worlds
+    from worker.learning.training import Training
 
-    config = configure(task_type, job.section)
-    name = job.section.get("algorithm", DEFAULT)
-    algorithm = find_algorithm(name)
-    learner = algorithm, settings(algorithm, name, config, job.section)
+    training = Training.of(job, task_type)
+    learner = training.algorithm_type, training.settings
     worlds = -(-total_worlds(job, gang) // gang.size)
     loop: Loop | None = None
-    # what fails later than the first iterations, which allocate everything, is not the worlds' fault
-    with within_memory(task_type, config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
-        loop = Loop(job, gang, task_type, stop)
+    # All memory is allocated in the first iterations; a later out-of-memory error has another cause.
+    with within_memory(task_type, training.config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
+        loop = Loop(training, gang, stop)
         code = loop.train()
     loop.close()
     return code

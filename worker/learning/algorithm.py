@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
@@ -219,3 +219,17 @@ class Algorithm(Protocol):
     @classmethod
     def build_policy(cls, config: Any, spaces: Spaces, device: str) -> Policy:
         """A policy that can take over the ``policy`` of a :meth:`state_dict`, without anything that learning needs."""
+
+
+@runtime_checkable
+class Student(Protocol):
+    """What an :class:`Algorithm` has besides, where it may learn from the policy of another run."""
+
+    teacher_checkpoint: str | None
+    """That run, ``RUN`` or ``RUN@ITERATION``; None where these settings ask for no teacher. The setting has the same name."""
+
+    def load_teacher(self, state: Mapping[str, Any]) -> None:
+        """Take the teacher's weights from its :meth:`Algorithm.state_dict`; called on all ranks before the first iteration of a run.
+
+        A run that goes on has them in its own checkpoint. Raises ValueError where they do not fit.
+        """

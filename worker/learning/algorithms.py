@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic_core import ArgsKwargs
 
+from shared_store.wording import explain, path_of
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
 from worker.tasks.config import TaskConfig
@@ -34,7 +36,7 @@ def find_algorithm(name: str) -> type[Algorithm]:
     module, sign, attribute = place.partition(":")
     if not sign:
         raise UserError(
-            f"train.algorithm: there is no {name!r}; there are {', '.join(BUILT_IN)}, and module:Class of your own"
+            f"train.algorithm: no algorithm is called {name!r}; known: {', '.join(BUILT_IN)}, and module:Class of your own"
         )
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as a task of the user's own is found (worker.tasks)
@@ -71,7 +73,7 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
     known = [item.name for item in dataclasses.fields(kind)]
     for key in given:
         if key not in known:
-            raise UserError(f"{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
+            raise UserError(f"train.{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
     try:
         return kind(**{**base, **given})
     except (TypeError, ValueError) as error:
@@ -79,12 +81,13 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
 
 
 def refusal(where: str, error: TypeError | ValueError) -> str:
-    """In one line what settings refuse; ``where``: their section."""
+    """In one line what settings refuse; ``where``: their section of ``train``."""
     if not isinstance(error, ValidationError):
-        return f"{where}: {' '.join(str(error).split())}"
-    first = error.errors(include_url=False)[0]
-    path = ".".join(map(str, (where, *first["loc"])))
-    return f"{path}: {first['msg'].removeprefix('Value error, ')}, got {first.get('input')!r}"[:1000]
+        return f"train.{where}: {' '.join(str(error).split())}"
+    first: Any = error.errors(include_url=False)[0]
+    if isinstance(first.get("input"), ArgsKwargs):  # of a rule over several fields the words say it all
+        first["input"] = {}
+    return f"{'.'.join(map(str, ('train', where, *path_of(first))))}: {explain(first)}"[:1000]
 
 
 def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:

@@ -70,7 +70,7 @@ class CudaGraphFunction:
         return graph
 
 
-class HostCopy:
+class Readback:
     """Brings a few numbers to the host: the one place where an iteration waits for the device."""
 
     def __init__(self, device: str) -> None:

@@ -29,7 +29,7 @@ EX_ERROR, EX_USAGE = 1, 2
 
 
 class StopRequest:
-    """What signals ask for: SIGTERM and SIGINT to leave at the next chance with a checkpoint, SIGUSR2 to save and go on."""
+    """Requests by signal: SIGTERM and SIGINT save a checkpoint and leave after the iteration; SIGUSR2 saves and goes on."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -110,7 +110,7 @@ class Job:
 def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
     """``task``'s configuration with the overrides of a ``train`` section (``config``).
 
-    Raises UserError for a key that does not exist or a value that can't be: in the words in which a submission refuses it.
+    Raises UserError for an unknown key or an invalid value, in the same words as the submission.
     """
     from worker.tasks.overrides import Refused, configured
 
@@ -125,14 +125,14 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
 
 
 def end_startup() -> None:
-    """What was imported and built so far stays: leave it out of garbage collection, which begins now."""
+    """Freeze start-up objects out of the garbage collector, then enable it."""
     gc.freeze()
     gc.enable()
 
 
 @contextmanager
 def user_errors(where: str | None = None) -> Iterator[None]:
-    """In here a ValueError is the user's to put right; elsewhere it is a defect and shows its traceback."""
+    """Turn a ValueError into a UserError, which is shown in one line; elsewhere a ValueError is a defect and shows its traceback."""
     try:
         yield
     except ValueError as error:
@@ -141,7 +141,7 @@ def user_errors(where: str | None = None) -> Iterator[None]:
 
 def run_command(body: Callable[[], int]) -> None:
     """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
-    # importing the simulation parses hundreds of kernels: collecting garbage meanwhile takes half as long again
+    # Importing the simulation parses hundreds of kernels; garbage collection would make that half as long again.
     gc.disable()
     try:
         code = body()
@@ -156,7 +156,7 @@ def run_command(body: Callable[[], int]) -> None:
         code = EX_ERROR
     sys.stdout.flush()
     sys.stderr.flush()
-    # the process group's threads of a gang that broke would keep a normal exit waiting for peers that are gone
+    # A normal exit would join NCCL/Gloo threads that wait for dead peers.
     os._exit(code)
 
 

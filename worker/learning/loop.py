@@ -5,33 +5,30 @@ from __future__ import annotations
 import math
 import os
 import statistics
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import torch
 
 from shared_store.checkpoints import Checkpoint
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
-from worker.learning import algorithms
 from worker.learning.adoption import adopt
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import Algorithm, Share
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
-from worker.learning.cuda_graph import CudaGraphFunction, HostCopy
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.evaluation import evaluate
+from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
-from worker.learning.job import Job, StopRequest, configure, end_startup, user_errors
+from worker.learning.job import StopRequest, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.report import Report, Stopwatch
 from worker.learning.reporter import Fence, Reporter
 from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
 from worker.learning.state import TrainingState
-from worker.learning.totals import Totals
-from worker.learning.trained import choose_checkpoint, load_learner
+from worker.learning.teacher import give_teacher
+from worker.learning.training import Training
 from worker.tasks.config import value_at
 
 if TYPE_CHECKING:
@@ -39,93 +36,64 @@ if TYPE_CHECKING:
 
 
 EVALUATED = 256
-"""At most so many worlds of each rank are built to evaluate a policy: those of training still hold their memory."""
+"""Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
 WARNINGS = 10
-"""At most so many iterations with worlds that were reset have a line of their own."""
+"""Resets of worlds are logged for at most this many iterations; later ones are only counted."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
 """Those of a task's statistics that become reward, episode length and score; the others are told by their names."""
-SIGNALS = ("stopping", "save_now", "failed_saves", "stall", "iteration_seconds")
-"""What the ranks tell each other once an iteration, besides the statistics: how many were asked to stop, how many to save now, how
-many of their saves failed, how long the last save stopped them and how long the last iteration took [s]."""
 
 
 class Loop:
     """Trains one task on the worlds of one rank, in step with the other ranks."""
 
-    def __init__(self, job: Job, gang: Gang, task_type: type[Task], stop: StopRequest) -> None:
+    def __init__(self, training: Training, gang: Gang, stop: StopRequest) -> None:
         """Build worlds and learner, and go on from the run's newest checkpoint where there is one. All ranks call it.
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
         """
-        self.job, self.gang, self.stop = job, gang, stop
-        self.iterations = job.setting("iterations", 100)
-        self.seed = job.setting("seed", 0, least=0)
+        job = training.job
+        self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
+        self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
         self._kill_at = kill_at(os.environ, job) if gang.is_main else None
-        checkpoints = job.spec.get("checkpoint") or {}
-        self.cadence = Cadence(checkpoints.get("every", 25))
-        self.config = configure(task_type, job.section)
-        share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
-        seed_generators(self.seed)
-        self.task = build_task(task_type, self.config, share, gang, self.seed)
-        self.algorithm_name = job.section.get("algorithm", algorithms.DEFAULT)
-        chosen = algorithms.find_algorithm(self.algorithm_name)
-        settings = algorithms.settings(chosen, self.algorithm_name, self.config, job.section)
-        self.share = share
-        self.algorithm = build_algorithm(chosen, settings, self.task, share, gang, self.seed)
+        self.cadence = Cadence(training.save_every)
+        self._save_is_due = False
+        self.task, self.algorithm = self._build()
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
-        self.incident = Incident(self.task, share, self.algorithm.steps, job.section, self.seed)
-        seed_generators(self.seed, gang.rank)
+        self.incident = Incident(self.task, self.share, self.algorithm.steps, job.section, training.seed)
+        seed_generators(training.seed, gang.rank)
+        facts = describe(training, self.task)
+        self.state = TrainingState(job, gang, self.share, self.task, self.algorithm, facts, training.keep)
+        self.resumed = self.state.restore()
+        self.adopted = None if self.resumed else self._begin_run(facts)
+        """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
+        self.task.clear_statistics()
         self.iterated = 0
         """Iterations that this process has done."""
-        facts = describe(job, self.task, self.config, self.algorithm_name, settings)
-        keep = int(checkpoints.get("keep", 5))
-        self.state = TrainingState(job, gang, share, self.task, self.algorithm, facts, keep)
-        self.resumed = self.state.restore()
-        self.adopted: Checkpoint | None = None
-        """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
-        if self.resumed is None:
-            self.adopted = adopt(job, gang, self.algorithm, facts)
-            self._load_teacher(getattr(settings, "teacher_checkpoint", None))
-            self.task.set_random_episode_length()
-        self.task.clear_statistics()
+        self._warnings = 0
+        self._told_captured = False
         self._stopwatch = Stopwatch(gang.device)
+        self._stall_seconds = 0.0
         captured = gang.device if self.algorithm.captures_rollout else "cpu"
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
-        self._numbers = HostCopy(gang.device)
-        self._totals = Totals(
-            {
-                "collected": gang.size,  # [s], of each rank in the iteration before
-                "mishap": gang.size,  # of each rank, see Task.read_mishap
-                "statistics": len(self.task.statistic_names),
-                **dict.fromkeys(SIGNALS, 1),
-            },
-            gang.device,
-        )
-        self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
-        self._read_at = time.perf_counter()
-        self._told_captured = False
-        self._warnings = 0
-        self._iteration_seconds = self._collect_seconds = self._stall_seconds = 0.0
-        self.reporter = Reporter()
-        self.fence = Fence(job.run, job.epoch)
-        self.beacon = Beacon()
+        self._exchange = Exchange(gang, self.task)
+        self.reporter, self.fence, self.beacon = Reporter(), Fence(job.run, job.epoch), Beacon()
         self.state.saver.start()
         end_startup()
 
-    def _load_teacher(self, reference: str | None) -> None:
-        """Give the algorithm its teacher, unless it has it already: a checkpoint holds the teacher that was named for it."""
-        adopted = self.adopted.manifest.get("settings") or {} if self.adopted else {}
-        if reference and adopted.get("teacher_checkpoint") != reference:
-            with user_errors("train"):
-                self.algorithm.load_teacher(self._weights_of(reference))  # type: ignore[attr-defined]
+    def _build(self) -> tuple[Task, Algorithm]:
+        """This rank's worlds and the learner; the learner's weights are drawn alike on all ranks."""
+        training, gang = self.training, self.gang
+        seed_generators(training.seed)
+        task = build_task(training.task_type, training.config, self.share, gang, training.seed)
+        return task, build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
 
-    def _weights_of(self, reference: str) -> dict[str, Any]:
-        """What the algorithm of another run has learnt, ``RUN`` or ``RUN@ITERATION``. All ranks call it."""
-        name, _, iteration = reference.partition("@")
-        checkpoint = choose_checkpoint(self.gang, self.job.store.run(name), iteration or None)
-        learnt: dict[str, Any] = load_learner(checkpoint, self.gang.device)["algorithm"]
-        return learnt
+    def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
+        """The first start of a run, which may be a clone: returns the checkpoint with whose weights it begins."""
+        adopted = adopt(self.job, self.gang, self.algorithm, facts)
+        give_teacher(self.job, self.gang, self.algorithm, adopted)
+        self.task.set_random_episode_length()
+        return adopted
 
     def train(self) -> int:
         """Train to the end; returns the exit code: 0 done, 75 left on request with a checkpoint.
@@ -133,11 +101,11 @@ class Loop:
         Raises TrainingError where a loss is not finite; the last checkpoint stands.
         """
         progress = self.state.progress
-        report = Report(self.job, self.iterations, progress.iteration) if self.gang.is_main else None
+        report = Report(self.job, self.training.iterations, progress.iteration) if self.gang.is_main else None
         self._say(self._beginning())
-        self._read_at = time.perf_counter()
+        self._stopwatch.begin()
         try:
-            while progress.iteration < self.iterations:
+            while progress.iteration < self.training.iterations:
                 record, signals = self._iterate()
                 if progress.iteration == self._kill_at:
                     die()
@@ -147,7 +115,7 @@ class Loop:
                 self._tell_captured()
                 self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
                 if self._handle(signals):
-                    self._say(f"asked to stop: left after iteration {progress.iteration} of {self.iterations}")
+                    self._say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
                     return EX_TEMPFAIL
             self._finish()
             return 0
@@ -164,7 +132,7 @@ class Loop:
         self.gang.close()
 
     def _tell_captured(self) -> None:
-        """Say once, when it has come to that, which parts of an iteration the device replays by itself."""
+        """Log once which parts of the iteration run as CUDA graphs."""
         parts = [self._collecting, *self.algorithm.graphs]
         if (
             not self._told_captured
@@ -178,16 +146,19 @@ class Loop:
             )
 
     def _handle(self, signals: dict[str, float]) -> bool:
-        """Save when it is time, tell of earlier saves; True where the gang is to leave (then everything is saved)."""
+        """Save when a save is due, and log how earlier saves ended; returns whether the gang leaves (then everything is saved)."""
         state, iteration = self.state, self.state.progress.iteration
         stopping = signals["stopping"] > 0
         if signals["failed_saves"] > 0:
             state.saver.abandon()
-        due = self.cadence.due(iteration, signals)
-        if stopping or due or signals["save_now"] > 0 or iteration == self.iterations:
-            self.reporter.flush()  # a run that goes on from this save has the records before it
-            state.save()
+        if self.cadence.due(iteration, signals) or signals["save_now"] > 0:
+            self._save_is_due = True
+        is_last = stopping or iteration == self.training.iterations
+        # While the volume hangs, a save is put off and training goes on. All ranks decide alike.
+        if is_last or (self._save_is_due and not signals["busy"]):
+            state.save(self.reporter if self.gang.is_main else None, wait=is_last)
             self._stall_seconds = state.saver.stall
+            self._save_is_due = False
         self._tell_saved(state.saver.poll())
         if stopping:
             self._tell_saved(state.finish())
@@ -221,14 +192,11 @@ class Loop:
         self._begin_iteration(progress.iteration)
         self._collecting()
         self._stopwatch.mark()
-        self._gather()
+        self._exchange.gather(self._stopwatch.collect, self._signals())
         metrics = algorithm.learn(self._observations)
         self._stopwatch.mark()
         # the one transfer of the iteration: from here on the host knows
-        numbers = torch.cat([torch.stack([value.double() for value in metrics.values()]), self._totals.values])
-        known = self._numbers.read(numbers)
-        learnt = dict(zip(metrics, known, strict=False))
-        totals = Totals.named(self._totals.layout, known[len(metrics) :])
+        learnt, totals = self._exchange.read(metrics)
         signals = {name: totals[name][0] for name in SIGNALS}
         progress.iteration += 1
         self.state.learning_rate = learnt.get("learning_rate")
@@ -241,27 +209,14 @@ class Loop:
             self._judge_resets(int(record["nan_worlds"]), totals["mishap"])
         return record | learnt | straggler(totals["collected"]), signals
 
-    def _gather(self) -> None:
-        """Add up over the ranks what happened in the rollout, and what each rank has to tell."""
-        totals, rank = self._totals, self.gang.rank
-        totals.values.zero_()
-        totals["mishap"][rank].copy_(self.task.mishap[0])
-        totals["statistics"].copy_(self.task.statistics)
-        self.task.clear_statistics()
-        self._own.copy_(torch.tensor([self._collect_seconds, *self._signals()], dtype=torch.float64))
-        totals["collected"][rank].copy_(self._own[0], non_blocking=True)
-        for place, name in enumerate(SIGNALS, start=1):
-            totals[name].copy_(self._own[place : place + 1], non_blocking=True)
-        self.gang.sum(totals.values)
-
     def _failure(self, what: str, hint: str) -> TrainingError:
-        """The end of a training that can't go on. The figures are those of the gang: every rank is here."""
+        """Build the error that ends training. Every rank must call it."""
         self._tell_saved(self.state.finish())
         last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
-        """Tell of worlds that were reset since something was not finite or the physics failed; raises TrainingError where they are too many."""
+        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError where they are too many."""
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
@@ -287,17 +242,24 @@ class Loop:
         )
 
     def _begin_iteration(self, iteration: int) -> None:
-        """Tell the task, whose curriculum may depend on it."""
+        """Tell the task which iteration begins: its curriculum may depend on it."""
         told = iteration, self.state.progress.reward, self.state.progress.episode_length
         self.incident.begin(*told)
         self.task.begin_iteration(*told)
 
-    def _signals(self) -> tuple[float, ...]:
+    def _signals(self) -> dict[str, float]:
         """This rank's :data:`SIGNALS`."""
         saver, stop = self.state.saver, self.stop
         save_now, stop.save_requested = stop.save_requested, False
         failures, saver.failures = saver.failures, 0
-        return float(stop.requested), float(save_now), float(failures), saver.stall, self._iteration_seconds
+        return {
+            "stopping": stop.requested,
+            "save_now": save_now,
+            "failed_saves": failures,
+            "busy": saver.is_busy,
+            "stall": saver.stall,
+            "iteration_seconds": self._stopwatch.iteration,
+        }
 
     def _collect(self) -> None:
         self.incident.keep()
@@ -310,13 +272,11 @@ class Loop:
     def _count(self, totals: list[float]) -> dict[str, Any]:
         """Bring the progress up to date with the ``totals`` of all ranks; the iteration's record without the losses."""
         progress = self.state.progress
-        collect, learn = self._stopwatch.parts()
-        now = time.perf_counter()
-        took, self._read_at = now - self._read_at, now
+        self._stopwatch.read()
+        took = self._stopwatch.iteration
         steps = self.share.total * self.algorithm.steps
         progress.env_steps += steps
         self.state.seconds += took
-        self._iteration_seconds, self._collect_seconds = took, collect
         stall, self._stall_seconds = self._stall_seconds, 0.0
         known = dict(zip(self.task.statistic_names, totals, strict=True))
         finished, returns, lengths, squares = map(known.pop, EPISODES)
@@ -339,8 +299,8 @@ class Loop:
             "score_error": progress.score_error,
             "episodes": int(finished),
             "steps_per_second": steps / took,  # by the clock, over everything
-            "collect_seconds": collect,
-            "learn_seconds": learn,
+            "collect_seconds": self._stopwatch.collect,
+            "learn_seconds": self._stopwatch.learn,
             "iteration_seconds": took,
             "stall_seconds": stall,  # of the save before this iteration, 0 where there was none
             "total_seconds": self.state.seconds,
@@ -354,7 +314,7 @@ class Loop:
     def _finish(self) -> None:
         """Wait for the last save, evaluate what was learnt, draw the curve, say where everything is."""
         if self.state.ordered_at != self.state.progress.iteration:
-            self.state.save()
+            self.state.save(self.reporter if self.gang.is_main else None)
         self._tell_saved(self.state.finish())
         name = self.gang.tell(self.state.saved_at) or ""
         if not name.startswith(f"{self.state.progress.iteration:08d}-"):
@@ -389,7 +349,7 @@ class Loop:
         if self.config.randomize.draws_worlds:
             total = min(self.share.total, EVALUATED * self.gang.size)
             share = Share.of(self.gang.rank, self.gang.size, total)
-            worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.seed))
+            worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.training.seed))
         worlds.begin_iteration(began, self.state.progress.reward, self.state.progress.episode_length)
         return worlds
 
@@ -403,7 +363,7 @@ def _print(text: str) -> None:
 
 
 def straggler(seconds: list[float]) -> dict[str, float]:
-    """Which rank collected the longest in the iteration before, and how much longer than the median: all others wait for it.
+    """The rank that collected longest in the iteration before, and its excess over the median: all others wait for it.
 
     Args:
         seconds: By rank; empty figures for a gang of one.
@@ -416,7 +376,7 @@ def straggler(seconds: list[float]) -> dict[str, float]:
 
 
 def _figure(name: str, total: float, episodes: float) -> float | None:
-    """A reward term is told as its mean over the finished episodes, a count of mishaps as it is."""
+    """A reward term as its mean over the finished episodes; a count of mishaps as it is."""
     if not name.startswith("reward_"):
         return total
     return total / episodes if episodes else None

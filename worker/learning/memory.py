@@ -1,4 +1,4 @@
-"""Whether the worlds fit into memory. What a world needs is measured on a few: the solver's and torch's buffers are theirs alone to know."""
+"""Whether the worlds fit into memory. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ FEW, MORE = 64, 2048
 """Worlds of the builds that are measured, after one that loads kernels and libraries: what both take is not the worlds' (networks, a
 batch of fixed size)."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
-"""From so many worlds on, memory is looked at beforehand: on the CPU the kernel kills who takes too much, and on a GPU building many
-worlds takes long before it fails."""
+"""Number of worlds from which memory is checked beforehand: on CPU the OOM killer strikes without a message; on GPU a too large build
+fails only after minutes."""
 SPARE = 0.9
 """Share of the free memory that may be taken: graphs and kernels take some more."""
 
@@ -111,7 +111,7 @@ def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: G
 
 
 def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
-    """The most memory that ``worlds`` take [bytes] while they are built and learn once, from an iteration in which nothing moves."""
+    """Peak memory [bytes] of building ``worlds`` and learning once from an iteration in which the worlds are not stepped."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()

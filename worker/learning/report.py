@@ -13,15 +13,29 @@ from worker.learning.job import Job
 
 
 class Stopwatch:
-    """Times the parts of an iteration, on CUDA with events so that nothing waits; read it after the device was waited for."""
+    """Times iterations by the clock, and their parts: on CUDA with events, so that nothing waits."""
 
     def __init__(self, device: str) -> None:
         self._cuda = device.startswith("cuda")
         self._marks: list[Any] = []
+        self._read_at = time.perf_counter()
+        self.iteration = self.collect = self.learn = 0.0
+        """Seconds of the iteration that was read last, by the clock, and of its two parts."""
+
+    def begin(self) -> None:
+        """The first iteration begins now."""
+        self._read_at = time.perf_counter()
 
     def start(self) -> None:
+        """The first part begins now."""
         self._marks = []
         self.mark()
+
+    def read(self) -> None:
+        """The iteration is over, and the device was waited for."""
+        now = time.perf_counter()
+        self.iteration, self._read_at = now - self._read_at, now
+        self.collect, self.learn = self.parts()
 
     def mark(self) -> None:
         """The end of one part and the start of the next."""

@@ -1,85 +1,99 @@
-"""What a training tells the volume, on a thread of its own: training waits for neither disk nor network (a volume that is away for an
-hour costs the run nothing but its newest metrics)."""
+"""The threads that read and write the volume for a training, so that the training thread waits for neither disk nor network.
+
+A volume that is away for an hour costs the run nothing but its newest metrics.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import queue
 import threading
+import traceback
 from collections.abc import Callable
 from typing import Any
 
-from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.epoch import check_epoch
 from shared_store.layout import Run
 
 _EVERY = 1.0
-"""Seconds between two looks at the epoch."""
+"""Seconds between two reads of the epoch."""
 _MOST = 10_000
-"""Pieces of work that are kept while the volume does not take them; later ones are dropped."""
-_PATIENCE = 2.0
-"""Seconds that a save waits for the records before it, which a resumed run would lack."""
+"""Calls that are kept while the volume does not take them; later ones are dropped."""
 _FAREWELL = 30.0
 """Seconds that the end of a training waits for the volume to take the last records."""
 
 
 class Fence:
-    """Looks once a second whether a newer attempt owns the run: a rank that was frozen for long sees it at once."""
+    """Checks once a second, on its own thread, whether a newer attempt owns the run."""
 
     def __init__(self, run: Run, epoch: int) -> None:
         self._run, self._epoch = run, epoch
-        self._stale: StaleEpoch | None = None
+        self._problem: Exception | None = None
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="fence", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._watch, name="fence", daemon=True).start()
 
     def check(self) -> None:
-        """Raises StaleEpoch where a newer attempt owned the run when it was last looked."""
-        if self._stale is not None:
-            raise self._stale
+        """Does not wait. Raises StaleEpoch where a newer attempt owned the run at the last read, and whatever else ended the reading."""
+        if self._problem is not None:
+            raise self._problem
 
     def close(self) -> None:
-        """Look no more."""
+        """Read no more."""
         self._over.set()
 
     def _watch(self) -> None:
         while not self._over.is_set():
-            # a volume that is away for a while: the next look reads it again
-            with contextlib.suppress(OSError, ValueError):
-                try:
+            try:
+                # a volume that is away for a while: the next read will tell
+                with contextlib.suppress(OSError, ValueError):
                     check_epoch(self._run, self._epoch)
-                except StaleEpoch as error:
-                    self._stale = error
-                    return
+            except Exception as error:  # StaleEpoch; a defect must not end the fence unseen
+                self._problem = error
+                return
             self._over.wait(_EVERY)
 
 
 class Reporter:
-    """Does what it is told, in order, on a thread of its own: prints and writes of which training needs no answer."""
+    """Runs print and write calls in order on its own thread, so that training never waits for them."""
 
     def __init__(self) -> None:
-        self._work: queue.Queue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.Queue(_MOST)
+        self._calls: queue.Queue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.Queue(_MOST)
         self._dropped = 0
+        self._failed = 0
         threading.Thread(target=self._run, name="reporter", daemon=True).start()
 
     def do(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Have ``function`` called; does not wait. It must not raise."""
+        """Have ``function`` called; does not wait. A call that raises is lost; the first one is warned of."""
         try:
-            self._work.put_nowait((function, arguments))
+            self._calls.put_nowait((function, arguments))
         except queue.Full:  # there is nobody to tell: what would print it is what hangs
             self._dropped += 1
 
-    def flush(self, seconds: float = _PATIENCE) -> bool:
-        """Wait until all is done, for at most so long; whether it is."""
+    def close(self) -> None:
+        """Wait for the calls that are left, at most :data:`_FAREWELL` seconds, and print how many were lost."""
         done = threading.Event()
         self.do(done.set)
-        return done.wait(seconds)
-
-    def close(self) -> None:
-        """Wait for what is left, for a while."""
-        if not self.flush(_FAREWELL) or self._dropped:
+        if not done.wait(_FAREWELL) or self._dropped:
             print(f"warning: the volume did not take the last metrics ({self._dropped} were dropped)", flush=True)
+        if self._failed:
+            print(f"warning: {self._failed} reports failed and were lost", flush=True)
 
     def _run(self) -> None:
         while True:
-            function, arguments = self._work.get()
-            function(*arguments)
+            function, arguments = self._calls.get()
+            try:
+                function(*arguments)
+            except Exception as error:  # the thread must live: without it every later record would be lost
+                self._failed += 1
+                if self._failed == 1:
+                    _warn(error)
+
+
+def _warn(error: Exception) -> None:
+    with contextlib.suppress(OSError, ValueError):  # standard output may be what failed
+        print(
+            f"warning: a report failed ({type(error).__name__}: {error}); training goes on without it\n"
+            + "".join(traceback.format_exception(error)),
+            end="",
+            flush=True,
+        )

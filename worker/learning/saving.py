@@ -20,6 +20,10 @@ from shared_store.tied import tied
 
 _BUFFERS = 2
 """One save is written while the next one is copied; a third waits."""
+PATIENCE = 2.0
+"""For how long after the order of the oldest save a third one waits for it [s]: the volume hangs, and training goes on without."""
+RECORDS_SECONDS = 10.0
+"""How long a commit waits for the metrics records before it [s]: a checkpoint is worth more than records that are never written."""
 
 
 class HostCopies:
@@ -69,8 +73,10 @@ class Saver:
         """How long the last save stopped the loop [s]."""
         self._copies = HostCopies()
         self._memory = [os.memfd_create(f"muster-snapshot-{index}") for index in range(_BUFFERS)]
+        self._records = os.memfd_create("muster-records")
         self._given = 0
-        self._pending: list[int] = []
+        self._pending: list[tuple[int, float]] = []
+        """Iteration of each save that is under way, and when it was ordered (``time.perf_counter``)."""
         self._process: subprocess.Popen[bytes] | None = None
         self._answers = b""
         self._lines: list[str] = []
@@ -81,20 +87,42 @@ class Saver:
         if self._process is None:
             self._start()
 
-    def save(self, iteration: int, files: Mapping[str, Callable[[], Any]], facts: Mapping[str, Any] | None) -> None:
+    @property
+    def is_busy(self) -> bool:
+        """Whether the volume hangs: no save can be ordered, and an earlier one has been under way for :data:`PATIENCE`."""
+        return len(self._pending) >= _BUFFERS and self._patience() == 0.0
+
+    def note_records(self, iteration: int) -> None:
+        """Let the writer know that the metrics records up to ``iteration`` are written. Any thread may call it."""
+        os.pwrite(self._records, iteration.to_bytes(8, "little"), 0)
+
+    def save(
+        self,
+        iteration: int,
+        files: Mapping[str, Callable[[], Any]],
+        facts: Mapping[str, Any] | None,
+        *,
+        after_records: bool = False,
+        wait: bool = True,
+    ) -> None:
         """Copy the state and order its saving; returns before anything is on the volume.
 
         Args:
             iteration: Iterations done.
             files: Name of each file and a function that gives its content: dictionaries of tensors and plain values.
             facts: What the manifest says besides; the main rank gives it, and commits.
+            after_records: Commit only after :meth:`note_records` of this iteration, or after :data:`RECORDS_SECONDS`.
+            wait: For earlier saves, as long as they take; else the save fails where they take longer than :data:`PATIENCE`.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.
         """
         started = time.perf_counter()
         while len(self._pending) >= _BUFFERS:
-            self._take_answer(None)
+            if not self._take_answer(None if wait else self._patience()):
+                self._fail(iteration, "earlier saves are still being written")
+                self.stall = time.perf_counter() - started
+                return
         memory = self._memory[self._given % _BUFFERS]
         self._given += 1
         layout = []
@@ -113,8 +141,9 @@ class Saver:
             "rank": self.rank,
             "ranks": self.ranks,
         }
-        self._send({**order, "files": layout, "memory": memory, "facts": facts, "keep": self.keep})
-        self._pending.append(iteration)
+        records = {"memory": self._records, "seconds": RECORDS_SECONDS} if after_records else None
+        self._send({**order, "files": layout, "memory": memory, "facts": facts, "keep": self.keep, "records": records})
+        self._pending.append((iteration, started))
         self.stall = time.perf_counter() - started
 
     def poll(self) -> list[str]:
@@ -131,7 +160,7 @@ class Saver:
 
     def abandon(self) -> None:
         """Another rank's part of a save failed: the main rank's writer must not wait for it."""
-        for iteration in self._pending:
+        for iteration, _ in self._pending:
             self._send({"abandon": iteration})
 
     def close(self) -> None:
@@ -141,6 +170,10 @@ class Saver:
             self._process.stdin.close()
             self._process.wait()
             self._process = None
+
+    def _patience(self) -> float:
+        """How long a save still waits for the oldest one [s]."""
+        return max(0.0, self._pending[0][1] + PATIENCE - time.perf_counter())
 
     def _told(self) -> list[str]:
         lines, self._lines = self._lines, []
@@ -171,7 +204,7 @@ class Saver:
                 tied([sys.executable, "-P", "-m", "worker.checkpoint_writer"], ignoring=[signal.SIGTERM]),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                pass_fds=self._memory,
+                pass_fds=[*self._memory, self._records],
                 start_new_session=True,
             )
         finally:
@@ -189,7 +222,7 @@ class Saver:
                 return True
             self._answers += chunk
         line, _, self._answers = self._answers.partition(b"\n")
-        iteration = self._pending.pop(0)
+        iteration, _ = self._pending.pop(0)
         answer = json.loads(line)
         if "stale" in answer:
             raise StaleEpoch(answer["stale"])
@@ -198,6 +231,11 @@ class Saver:
         elif "committed" in answer:
             self.committed = answer["committed"]
             self._lines.append(f"checkpoint {self.committed}")
+            if not answer["recorded"]:
+                self._lines.append(
+                    f"warning: checkpoint {self.committed} was committed before the metrics up to it were written; "
+                    "a run that goes on from it may lack some"
+                )
         return True
 
     def _fail(self, iteration: int, why: str) -> None:
@@ -210,5 +248,5 @@ class Saver:
         code = self._process.wait()
         self._process = None
         lost, self._pending = self._pending, []
-        for iteration in lost:
+        for iteration, _ in lost:
             self._fail(iteration, f"its writer died with code {code}")

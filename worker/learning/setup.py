@@ -17,6 +17,7 @@ from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
 
 if TYPE_CHECKING:
+    from worker.learning.training import Training
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
@@ -99,8 +100,9 @@ def transition(task: Task, observations: TensorDict) -> Transition:
     return Transition(observations, ended, task.rewards, task.dones, task.time_outs)
 
 
-def describe(job: Job, task: Task, config: TaskConfig, algorithm: str, settings: Any) -> dict[str, Any]:
+def describe(training: Training, task: Task) -> dict[str, Any]:
     """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
+    config = training.config
     names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
     if interface := task.interface():
         names |= dataclasses.asdict(interface)
@@ -109,10 +111,10 @@ def describe(job: Job, task: Task, config: TaskConfig, algorithm: str, settings:
         for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
             names.pop(key, None)
     return {
-        "task": job.section["task"],
-        "train": job.section,
-        "algorithm": algorithm,
-        "settings": dataclasses.asdict(settings),
+        "task": training.job.section["task"],
+        "train": training.job.section,
+        "algorithm": training.algorithm,
+        "settings": dataclasses.asdict(training.settings),
         "policy": {
             "observation_shape": list(task.observation_shape),
             **({"observation_size": task.observation_shape[0]} if len(task.observation_shape) == 1 else {}),

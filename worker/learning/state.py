@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -35,7 +35,21 @@ from worker.learning.saving import Saver
 from worker.learning.shards import Shards, read_file
 
 if TYPE_CHECKING:
+    from worker.learning.reporter import Reporter
     from worker.tasks.task import Task
+
+
+class Ended(NamedTuple):
+    """What ended in one iteration, in the worlds of all ranks."""
+
+    steps: int
+    """Control steps of each world."""
+    episodes: float
+    """How many episodes ended."""
+    returns: float
+    """The sum of their returns."""
+    squares: float = math.nan
+    """The sum of the squares of their returns; unknown in checkpoints that were saved before there were squares."""
 
 
 @dataclass
@@ -57,8 +71,7 @@ class Progress:
     score_episodes: int = 0
     """How many episodes the score is a mean of."""
     recent: list[list[float]] = field(default_factory=list)
-    """The newest iterations, as many as the score needs: steps of each world, episodes that ended, the sum of their returns, and the
-    sum of the squares of these."""
+    """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists, which checkpoints can hold."""
 
     def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
         """Note what ended in an iteration, and work out the score and its error.
@@ -74,14 +87,12 @@ class Progress:
             worlds: Of all ranks.
             longest: Steps of the longest episode.
         """
-        self.recent.append([steps, episodes, returns, squares])
+        self.recent.append(list(Ended(steps, episodes, returns, squares)))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
-            entry = self.recent[index]
-            span, ended, total = span + entry[0], ended + entry[1], total + entry[2]
-            spread += (
-                entry[3] if len(entry) > 3 else math.nan
-            )  # of a checkpoint that was saved before there were squares
+            entry = Ended(*self.recent[index])
+            span, ended = span + entry.steps, ended + entry.episodes
+            total, spread = total + entry.returns, spread + entry.squares
             if span >= longest and ended >= max(EPISODES, worlds):
                 self.score, self.score_episodes = total / ended, int(ended)
                 variance = max(0.0, spread - total * total / ended) / (ended - 1) if math.isfinite(spread) else None
@@ -107,7 +118,7 @@ class TrainingState:
         facts: dict[str, Any],
         keep: int,
     ) -> None:
-        """``facts``: what the manifest says besides (task, configuration), for those who read a checkpoint without the job."""
+        """``facts``: extra manifest fields (task, configuration), so that a checkpoint can be read on its own."""
         self.job, self.gang, self.share, self.task, self.algorithm, self.facts = (
             job,
             gang,
@@ -127,12 +138,18 @@ class TrainingState:
         self.learning_rate: float | None = None
         """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
         self.set_anew: Sequence[str] = ()
-        """What this job's settings put in place of the checkpoint's, a line each."""
+        """One log line for each value that this job's settings replace in the checkpoint."""
 
-    def save(self) -> None:
+    def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
-        Raises StaleEpoch where a newer attempt owns the run.
+        Args:
+            reporter: The checkpoint is committed after what ``reporter`` has been given so far: a run that goes on from it has the
+                metrics records before it.
+            wait: For earlier saves that are still being written, as long as they take.
+
+        Raises:
+            StaleEpoch: A newer attempt owns the run.
         """
         worlds = {"first": self.share.first, "count": self.share.count}
         files: dict[str, Callable[[], Any]] = {
@@ -143,11 +160,15 @@ class TrainingState:
         }
         if self.gang.is_main:
             files["learner.pt"] = lambda: {"algorithm": self.algorithm.state_dict(), "progress": asdict(self.progress)}
-        self.saver.save(self.progress.iteration, files, self._manifest() if self.gang.is_main else None)
-        self.ordered_at = self.progress.iteration
+        iteration = self.progress.iteration
+        if reporter:
+            reporter.do(self.saver.note_records, iteration)
+        facts = self._manifest() if self.gang.is_main else None
+        self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
+        self.ordered_at = iteration
 
     def _of_algorithm(self) -> dict[str, torch.Tensor]:
-        """What the algorithm keeps for each world, beside what the task does."""
+        """Per-world state of the algorithm, named apart from the task's."""
         return {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
 
     def finish(self) -> list[str]:
@@ -248,7 +269,7 @@ class TrainingState:
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
-        """What tensors alone would not show, or only in many lines. Raises UserError with the first thing that differs."""
+        """Compare the manifest with this job, before any tensor is loaded. Raises UserError with the first difference."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
         if "algorithm" not in there:
             raise UserError(
@@ -286,7 +307,7 @@ class TrainingState:
 
 
 _OF_ALGORITHM = "algorithm/"
-"""Begins the names of what an algorithm keeps for each world."""
+"""Prefix of the names of an algorithm's per-world state."""
 
 
 def _called(path: tuple[str, ...], manifest: Any) -> str:

@@ -1,4 +1,4 @@
-"""Named numbers that are added up over the ranks once an iteration, in one buffer."""
+"""Named numbers that are added up over the ranks in one buffer."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ class Totals:
     [0.0, 0.5, 0.0]
     """
 
-    def __init__(self, sizes: Mapping[str, int], device: str) -> None:
+    def __init__(self, sizes: Mapping[str, int], device: str, *, pinned: bool = False) -> None:
+        """``pinned``: in host memory that a GPU copies from without the host waiting."""
         self.layout = dict(sizes)
-        self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device)
+        self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device, pin_memory=pinned)
         """All parts, one behind the other, shape (n,)."""
         self._parts = dict(zip(sizes, self.values.split(list(sizes.values())), strict=True))
 

@@ -86,7 +86,7 @@ def clipped_action(episodes: EpisodeArrays, world: int, action: int) -> float:
 
 @wp.func
 def numbered_stream(episodes: EpisodeArrays, world: int, number: int) -> wp.uint32:
-    """The generator ``number`` of one world. Episodes draw from 0 up, what is drawn once in the life of a world from -1 down."""
+    """The generator ``number`` of one world. Non-negative numbers are per-episode streams; negative ones are drawn once per world."""
     key = wp.rand_init(episodes.random[world, 0], episodes.random[world, 1])
     return wp.rand_init(int(key), number)
 
@@ -129,7 +129,7 @@ def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
 
 
 def read_mishap(code: int, observations: Sequence[str]) -> tuple[int, str]:
-    """The world of this task, and what was wrong with it, of a ``code`` that is not :data:`NO_MISHAP`."""
+    """World and cause in a ``code`` other than :data:`NO_MISHAP`: the index of the world in this task, and what was wrong with it."""
     causes = [f"its observation {name} was not finite" for name in observations]
     causes += ["its physics failed (a joint faster than `fastest`, or not finite)", "its reward was not finite"]
     world, cause = divmod(code, len(causes))
@@ -152,8 +152,8 @@ def end_step(
         overflow: Solver overflow bits since the last call, cleared here, shape ``(worlds,)``.
         world: Row.
         terminated: Whether the task ended the episode.
-        valid: Whether the physics is finite. A world of which it is not, or whose observation before or reward now is not, is
-            reset and counted, and not as a finished episode.
+        valid: Whether the physics is finite. A world whose physics, last observation or reward is not finite is reset and counted,
+            but not as a finished episode.
         max_age: Steps after which the clock ends an episode.
 
     Returns:
@@ -189,7 +189,7 @@ def end_step(
 
 @wp.kernel
 def check_observations(episodes: EpisodeArrays):
-    """Whatever a task's kernel computed, the policy sees finite numbers; a world of which that was not so ends with the next step."""
+    """Replace non-finite observations by 0; that world's episode ends at the next step."""
     world = wp.tid()
     broken = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
     for column in range(episodes.observations.shape[1]):

@@ -43,7 +43,7 @@ def _observations(task: Any, config: Any) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Print the tasks ``names``, or all; returns the exit code: 2 where a named one is none.
+    """Print the tasks ``names``, or all; returns the exit code: 2 where there is no task of a given name.
 
     Without names, one that can't be imported (of a package that is broken) is listed with its ``error``.
     """
@@ -65,5 +65,5 @@ def main(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    gc.disable()  # importing the simulation parses hundreds of kernels: collecting garbage meanwhile takes half as long again
+    gc.disable()  # Importing the simulation parses hundreds of kernels; garbage collection would make that half as long again.
     sys.exit(main(sys.argv[1:]))

@@ -184,8 +184,8 @@ class _Common:
     randomize: Annotated[Randomization, from_mapping(Randomization)] = Randomization()
     """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
-    """What changes in the course of training: points ``[iteration, value]`` in the order of the iterations, between which the
-    value changes in proportion, and outside of which it stays. By the name of a reward term: its weight; ``level``: how hard the
+    """What changes in the course of training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated
+    and held constant outside their range. By the name of a reward term: its weight; ``level``: how hard the
     task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
     fastest: Positive = 1000.0
     """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""

@@ -11,26 +11,13 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidato
 from pydantic.errors import PydanticUserError
 from pydantic_core import ArgsKwargs
 
-from shared_store.wording import explain
+from shared_store.wording import Path, explain
+from shared_store.wording import Refused as Refused
 
 C = TypeVar("C")
-Path = tuple[str | int, ...]
 
 TRAINING = ("ppo", "sac", "rsl_rl")
 """Fields that say how a task is trained: the job's YAML changes them in sections of their own."""
-
-
-class Refused(ValueError):
-    """A value can't be used.
-
-    Args:
-        path: Keys to it, from the configuration on.
-        words: One line: what was expected, what was found.
-    """
-
-    def __init__(self, path: Path, words: str) -> None:
-        super().__init__(": ".join(filter(None, (".".join(map(str, path)), words))))
-        self.path, self.words = path, words
 
 
 def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:

@@ -1,4 +1,4 @@
-"""A four-legged robot that walks as it is told: forward, sideways and turning velocities on flat ground."""
+"""A four-legged robot that follows velocity commands on flat ground: forward, sideways and turning."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def has_fallen(parameters: QuadrupedParameters, worlds: WorldArrays, world: int)
 
 @wp.func
 def add_rewards(parameters: QuadrupedParameters, worlds: WorldArrays, episodes: EpisodeArrays, world: int):
-    """Every reward term of a step, as long as the step took."""
+    """Every reward term of a step, times the length of the step [s]."""
     rotation = root_rotation(worlds, world)
     linear, angular = root_velocities(worlds, world)
     gravity = wp.quat_rotate_inv(rotation, wp.vec3(0.0, 0.0, -1.0))

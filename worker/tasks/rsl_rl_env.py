@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class TaskVecEnv(VecEnv):
-    """A task as rsl_rl wants it; the simulation's step stays the recorded one.
+    """A task as rsl_rl's ``VecEnv``; its control step stays a CUDA graph.
 
     Args:
         task: Its buffers stay its own: all that is handed out is a copy.
@@ -53,7 +53,7 @@ class TaskVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps on the clock of each running episode, shape (worlds,), int32. Who sets it sets the task's clocks."""
+        """Steps on the clock of each running episode, shape (worlds,), int32. Setting it sets the task's clocks."""
         return self.task.episode_length
 
     @episode_length_buf.setter
@@ -126,7 +126,7 @@ def as_floats(observations: Mapping[str, torch.Tensor] | TensorDict, groups: Ite
 
 
 def _plain(value: Any) -> Any:
-    """A configuration as dictionaries, lists and numbers, for whoever logs it."""
+    """A configuration as dictionaries, lists and numbers, for logs."""
     if dataclasses.is_dataclass(value):
         return {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -167,7 +167,7 @@ class Task:
         raise NotImplementedError
 
     def read_model(self, parameters: Any) -> None:
-        """Fill the fields of the kernels' parameters that the built model (``self.worlds``) tells; by default none."""
+        """Fill the kernel parameters that depend on the built model (``self.worlds``); by default none."""
 
     def interface(self) -> Interface | None:
         """What the policy's numbers mean on a robot, in the order of ``observation_names`` and ``action_names``; None: not declared.
@@ -177,7 +177,7 @@ class Task:
         return None
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Called before every iteration of training, outside the recorded work: the place for a curriculum.
+        """Called before every training iteration, outside the CUDA graph: the place for a curriculum.
 
         As it stands it sets what ``config.curriculum`` names. A subclass may do more: fill its own device arrays, which its kernels
         read. What it does must follow from the arguments alone, which are the same on every rank and after a restart.
@@ -206,7 +206,7 @@ class Task:
             self._launch_observe(RESET)
 
     def seed(self, seed: int) -> None:
-        """Start all random streams afresh from another seed; the worlds change at their next reset.
+        """Restart all random streams from another seed; the worlds change at their next reset.
 
         The physics that ``randomize`` drew for each world stays that of the seed at construction.
 
@@ -224,7 +224,7 @@ class Task:
         self._random[:, 2] = 0
 
     def set_random_episode_length(self) -> None:
-        """Give every world's clock a random age, so that their time-outs do not fall in the same step."""
+        """Set the clock of every world to a random age, so that the worlds do not all time out in the same step."""
         with on_torch_stream(self.device):
             wp.launch(
                 randomize_ages,
@@ -239,7 +239,7 @@ class Task:
         self.mishap.fill_(int(NO_MISHAP))
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
-        """The value of :attr:`mishap` taken apart: the world (among these) and what of it was not finite; None: nothing was."""
+        """Decode a value of :attr:`mishap`: the index of the world in this task and its cause; None where no world failed."""
         return None if code == NO_MISHAP else read_mishap(code, self.observation_names)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
@@ -283,7 +283,7 @@ class Task:
             tensor.copy_(state[name])
 
     def _check(self, config: TaskConfig, world_count: int, seed: int, first_world: int) -> None:
-        """Refuse impossible arguments, each with one sentence."""
+        """Raise an error of one sentence for an argument that is not valid."""
         task = type(self).__name__
         if not isinstance(config, self.config_type):
             raise ValueError(
@@ -320,7 +320,7 @@ class Task:
             raise ValueError(f"config.randomize.observation_noise: {error}") from error
 
     def _allocate(self) -> None:
-        """Allocate every buffer once and let torch see it."""
+        """Allocate every buffer once, as views that torch and Warp share."""
         count, device = self.world_count, self.device
 
         def buffer(name: str, shape: tuple[int, ...], dtype: Any) -> torch.Tensor:
@@ -365,7 +365,7 @@ class Task:
         return seen, before
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Live views of all that outlasts a control step; what is absent is recomputed in the next one."""
+        """Views of all state that persists between control steps."""
         arrays = self.worlds.arrays
         memory = {"memory": self._memory} if self.memory_size else {}
         images = {"images": self._camera.images} if self._camera else {}
@@ -385,7 +385,7 @@ class Task:
         }
 
     def _assert_captured(self) -> None:
-        """Replay once and see that it rewards: a graph that recorded nothing would step for ever without a sound.
+        """Replay the graph once and check that it writes rewards: an empty graph would step for ever without an error.
 
         Raises:
             RuntimeError: The replay left a reward as it was.

@@ -84,12 +84,13 @@ def train() -> int:
     from worker.distributed import Placement, connect, use_cpu_threads
     from worker.learning.job import Job, StopRequest
     from worker.learning.loop import Loop
+    from worker.learning.training import Training
 
     stop = StopRequest().listen()
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
     gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
-    code = Loop(job, gang, Point, stop).train()  # type: ignore[arg-type]
+    code = Loop(Training.of(job, Point), gang, stop).train()  # type: ignore[arg-type]
     gang.close()
     return code
 

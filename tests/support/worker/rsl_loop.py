@@ -10,10 +10,12 @@ from tensordict import TensorDict
 
 from tests.support.worker.point_task import Point, PointConfig
 from worker.distributed import Gang, Placement
+from worker.learning import algorithms
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.settings import read_settings
+from worker.learning.rsl.settings import RslRlConfig
+from worker.tasks.config import TaskConfig
 
 
 class GroupedPoint(Point):
@@ -35,12 +37,18 @@ def spaces_of(task: Any) -> Spaces:
     return Spaces({name: tuple(group.shape[1:]) for name, group in task.groups.items()}, task.action_size)
 
 
+def settings(section: dict[str, Any]) -> RslRlConfig:
+    """The settings of a job's ``rsl_rl`` section, as a rank reads them."""
+    read: RslRlConfig = algorithms.settings(RslRl, "rsl_rl", TaskConfig(), {"rsl_rl": section})  # type: ignore[type-abstract]
+    return read
+
+
 def build(task: Any, section: dict[str, Any], gang: Gang | None = None, share: Share | None = None) -> RslRl:
     """The algorithm that a job's ``rsl_rl`` section describes, for ``task``."""
     gang, count = gang or alone(), task.world_count
     share = share or Share(0, count, count)
     setting = Setting(spaces_of(task), share, gang, seed=1, control_seconds=1.0 / task.config.control_hz)
-    return RslRl(read_settings(section), setting)
+    return RslRl(settings(section), setting)
 
 
 def seen(task: Any) -> TensorDict:

@@ -14,6 +14,7 @@ from tests.support.worker.point_task import Point
 from worker.distributed import Gang, Placement
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
+from worker.learning.training import Training
 
 
 def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | None = None) -> Loop:
@@ -21,7 +22,8 @@ def runner(env: dict[str, str], gang: Gang | None = None, stop: StopRequest | No
     job = Job.from_env(env, "train")
     if (gang is None or gang.is_main) and read_epoch(job.run) < job.epoch:
         raise_epoch(job.run, job.epoch)
-    return Loop(job, gang or Gang(Placement(), "cpu", None, ["here"]), Point, stop or StopRequest())
+    training = Training.of(job, Point)  # type: ignore[arg-type]
+    return Loop(training, gang or Gang(Placement(), "cpu", None, ["here"]), stop or StopRequest())
 
 
 def train(env: dict[str, str], gang: Gang | None = None) -> Loop:

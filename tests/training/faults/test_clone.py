@@ -151,10 +151,11 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> loops.Loop:
     from shared_store.epoch import raise_epoch
     from worker.distributed import Gang, Placement
     from worker.learning.job import Job, StopRequest
+    from worker.learning.training import Training
 
     job = Job.from_env(training(store, run="clone", **settings), "train")
     raise_epoch(job.run, 1)
-    return loops.Loop(job, Gang(Placement(), "cpu", None, ["here"]), task, StopRequest())
+    return loops.Loop(Training.of(job, task), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,8 @@ import torch
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.extensions import RandomNetworkDistillation
 
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
@@ -273,6 +276,19 @@ def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_p
 def test_how_often_is_saved_and_how_much_is_kept_apply_at_once(store: Path) -> None:
     loop = go_on(store, "sac", SAC_RUN, every=7, keep=3)
     assert loop.state.saver.keep == 3 and loop.cadence.due(7, {}) and not loop.cadence.due(6, {})
+
+
+def test_a_teacher_of_an_older_muster_is_refused_in_one_line(store: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(store, tmp_path / "store"))
+    (checkpoint,) = list_checkpoints(Store(copy).run("rsl"))
+    manifest = checkpoint.path / "manifest.json"
+    content = json.loads(manifest.read_text())
+    del content["algorithm"]
+    manifest.write_text(json.dumps(content))
+    with pytest.raises(
+        UserError, match=rf"^teacher_checkpoint: checkpoint {checkpoint.name} of run rsl is of an older"
+    ):
+        runner(training(copy, run="late", algorithm="rsl_rl", rsl_rl=PUPIL_RUN))
 
 
 def test_a_clone_of_a_pupil_keeps_its_teacher_unless_it_names_another(store: Path, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ REFUSED: dict[str, Any] = {
 def test_every_setting_is_in_one_of_the_two_tables(unchanged: Loop) -> None:
     refused = {"task", "algorithm", "seed", "config", "worlds"}  # test_refusals.py
     assert Train.model_fields.keys() == {*refused, "iterations", "settings", *ALGORITHMS}
-    assert unchanged.iterations == 4, "the run was started with 2"
+    assert unchanged.training.iterations == 4, "the run was started with 2"
     names = {item.name for item in dataclasses.fields(PPOConfig)}
     assert names == {*APPLIED, *REFUSED, "weight_decay"}, "which is AdamW's; a run of Adam can't become one of it"
     assert set(PPOConfig.fixed) == REFUSED.keys()
@@ -148,4 +148,4 @@ def test_a_task_whose_own_configuration_is_wrong_is_refused_in_one_line() -> Non
 
     with pytest.raises(UserError) as error:
         algorithms.settings(PPO, "ppo", configure(Task, {}), {})  # type: ignore[arg-type]
-    assert str(error.value) == "ppo.schedule: Input should be 'adaptive' or 'fixed', got 'linear'"
+    assert str(error.value) == "train.ppo.schedule: expected 'adaptive' or 'fixed', found 'linear'"

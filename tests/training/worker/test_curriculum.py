@@ -15,6 +15,7 @@ from worker.distributed import Gang, Placement
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure
 from worker.learning.loop import Loop
+from worker.learning.training import Training
 from worker.tasks.ant import Ant
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.config import value_at
@@ -86,7 +87,7 @@ def test_a_tasks_own_hook_is_called_before_every_iteration_and_goes_on_after_a_r
         env = training(tmp_path, iterations=iterations, epoch=epoch, worlds=8, task="Cartpole")
         job = Job.from_env(env, "train")
         raise_epoch(job.run, epoch)
-        Loop(job, Gang(Placement(), "cpu", None, ["here"]), Watched, StopRequest()).train()
+        Loop(Training.of(job, Watched), Gang(Placement(), "cpu", None, ["here"]), StopRequest()).train()
     # before each iteration, and before the evaluation at the end, which is of the last one's task
     assert [call[0] for call in calls] == [0, 1, 1, 2, 3, 3] and calls[0][1] is None
     assert calls[-1][1] is not None and calls[-1][2] > 1

@@ -52,8 +52,8 @@ def test_it_learns_cartpole_as_it_is_shipped(mine: type) -> None:
 
 def test_its_settings_are_checked(mine: type) -> None:
     for given, said in (
-        ({"gama": 0.9}, "settings.gama: there is no such setting; did you mean gamma?"),
-        ({"gamma": 2.0}, "settings.gamma: Input should be less than or equal to 1, got 2.0"),
+        ({"gama": 0.9}, "train.settings.gama: there is no such setting; did you mean gamma?"),
+        ({"gamma": 2.0}, "train.settings.gamma: expected a value less than or equal to 1, found 2.0"),
     ):
         with pytest.raises(UserError) as caught:
             settings(mine, OWN, PointConfig(), {"settings": given})  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from worker.distributed import Gang, Placement
 from worker.errors import TrainingError
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
+from worker.learning.training import Training
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 
 STILL = torch.zeros(4, 1)
@@ -69,7 +70,7 @@ def runner(path: Path, limit: float) -> Loop:
     )
     job = Job.from_env(env, "train")
     raise_epoch(job.run, job.epoch)
-    return Loop(job, Gang(Placement(), "cpu", None, ["here"]), Rooted, StopRequest())
+    return Loop(Training.of(job, Rooted), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
 
 
 def test_training_goes_on_below_the_limit_and_tells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from worker.learning import algorithms
 from worker.learning.job import Job, StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
+from worker.learning.training import Training
 from worker.tasks.ant import Ant, AntConfig
 from worker.tasks.cartpole_pixels import CartpolePixels, CartpolePixelsConfig
 from worker.tasks.config import Randomization
@@ -127,7 +128,7 @@ def run(path: Path, name: str, iterations: int, epoch: int = 1) -> Loop:
     env = training(path, run=name, iterations=iterations, epoch=epoch, worlds=4, task="CartpolePixels")
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)
-    started = Loop(job, Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+    started = Loop(Training.of(job, CartpolePixels), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
     assert started.train() == 0
     return started
 
@@ -176,7 +177,11 @@ def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: P
     with pytest.raises(
         UserError, match=r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
     ):
-        Loop(Job.from_env(env, "train"), Gang(Placement(), "cpu", None, ["here"]), CartpolePixels, StopRequest())
+        Loop(
+            Training.of(Job.from_env(env, "train"), CartpolePixels),
+            Gang(Placement(), "cpu", None, ["here"]),
+            StopRequest(),
+        )
 
 
 def test_layers_of_the_network_have_to_match() -> None:

@@ -225,10 +225,18 @@ def test_sigterm_to_one_rank_has_all_leave_with_a_checkpoint(tmp_path: Path) -> 
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
         ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
         ({"config": {"ppo": {}}}, "train.config.ppo: not a key of PointConfig; settings of ppo stand under train.ppo"),
-        ({"ppo": {"steps": 1.5}}, "ppo.steps: Input should be a valid integer, got 1.5"),
-        ({"ppo": {"normalize_observations": 1}}, "ppo.normalize_observations: Input should be a valid boolean"),
-        ({"ppo": {"learning_rate": "fast"}}, "ppo.learning_rate: Input should be a valid number, got 'fast'"),
-        ({"algorithm": "pppo"}, "train.algorithm: there is no 'pppo'; there are ppo, rsl_rl, sac, and module:Class"),
+        ({"ppo": {"steps": 1.5}}, "train.ppo.steps: expected a whole number, found a number (1.5)"),
+        ({"ppo": {"normalize_observations": 1}}, "train.ppo.normalize_observations: expected true or false, found a "),
+        ({"ppo": {"hidden_sizes": []}}, "train.ppo.hidden_sizes: expected at least one number, found []"),
+        (
+            {"ppo": {"minibatches": 9}},
+            "train.ppo: minibatches: 9 minibatches need as many steps of each world, there are 8",
+        ),
+        ({"ppo": {"learning_rate": "fast"}}, "train.ppo.learning_rate: expected a number, found a text ('fast')"),
+        (
+            {"algorithm": "pppo"},
+            "train.algorithm: no algorithm is called 'pppo'; known: ppo, rsl_rl, sac, and module:Class",
+        ),
         (
             {"algorithm": "tests.support.worker.point_task:Point"},
             "is no algorithm: it lacks captures_rollout, begin, act",

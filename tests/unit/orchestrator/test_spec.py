@@ -389,7 +389,12 @@ def test_the_worker_accepts_of_each_setting_of_ppo_what_the_job_file_accepts(nam
             # the job file can't know what the task sets besides
             made = any(
                 text in str(error)
-                for text in ("channels, kernel_sizes and strides", "adam has none", "the least, then the greatest")
+                for text in (
+                    "channels, kernel_sizes and strides",
+                    "adam has none",
+                    "the least, then the greatest",
+                    "minibatches need",
+                )
             )
         assert written == made, value
 

@@ -18,6 +18,7 @@ from worker.learning.evaluation import evaluate
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.state import Progress
+from worker.learning.training import Training
 from worker.tasks.cartpole import Cartpole
 
 
@@ -92,7 +93,7 @@ def cartpole(store: Path, epoch: int = 1, **train: Any) -> Loop:
     env = training(store, epoch=epoch, task="Cartpole", worlds=16, iterations=2, **train)
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)
-    return Loop(job, Gang(Placement(), "cpu", None, ["here"]), Cartpole, StopRequest())
+    return Loop(Training.of(job, Cartpole), Gang(Placement(), "cpu", None, ["here"]), StopRequest())
 
 
 def test_a_policy_is_evaluated_on_physics_that_training_did_not_see(tmp_path: Path) -> None:

@@ -176,10 +176,8 @@ def test_shares_cover_all_worlds_once() -> None:
 
 
 def test_more_minibatches_than_steps_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"ppo.minibatches: 9 minibatches need as many steps of each world, there are 8"
-    ):
-        make(1, minibatches=9)
+    with pytest.raises(ValueError, match=r"minibatches: 9 minibatches need as many steps of each world, there are 8"):
+        PPOConfig(steps=8, minibatches=9)
 
 
 def test_seeds_differ() -> None:

@@ -13,14 +13,14 @@ import pytest
 import torch
 from onnx import load_from_string
 from onnx.reference import ReferenceEvaluator
+from rsl_rl import algorithms
 from rsl_rl.models import MLPModel
 from rsl_rl.runners import DistillationRunner, OnPolicyRunner
 from torch import nn
 
-from tests.support.worker.rsl_loop import Seen, alone, build, restore, save, seen, spaces_of, train
+from tests.support.worker.rsl_loop import Seen, alone, build, restore, save, seen, settings, spaces_of, train
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.settings import read_settings
 from worker.tasks.rsl_rl_env import TaskVecEnv
 
 torch.set_num_threads(1)
@@ -123,6 +123,23 @@ def assert_same(one: Any, other: Any, where: str = "") -> None:
 # -- what is refused --------------------------------------------------------------------------------------------------
 
 
+class OwnPPO(algorithms.PPO):
+    """A class of the user's own, whose settings only the rank can check."""
+
+
+class OwnDistillation(algorithms.Distillation):
+    """As :class:`OwnPPO`."""
+
+
+def own(kind: str = "PPO", **keys: Any) -> dict[str, Any]:
+    return {"algorithm": {"class_name": f"tests.unit.worker.test_rsl_rl:Own{kind}", **keys}}
+
+
+def turn(obs: Any, actions: Any) -> tuple[Any, Any]:
+    """A symmetry function with other arguments than rsl_rl's."""
+    return obs, actions
+
+
 TAUGHT = {"teacher_checkpoint": "taught"}
 
 
@@ -132,8 +149,9 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         ({"algorithm": {"class_name": "PPOO"}}, r"algorithm\.class_name: Could not resolve 'PPOO'"),
         ({"algorithm": {"class_name": "torch:nn"}}, r"algorithm\.class_name: torch:nn is not an algorithm"),
         ({"algorithm": {"clip": 0.1}}, r"algorithm: .* unexpected keyword argument 'clip'"),
-        ({"algorithm": {"gamma": "99e-2"}}, r"algorithm\.gamma: expected a number, got the text '99e-2'; in YAML"),
-        ({"algorithm": {"num_mini_batches": 0}}, r"algorithm\.num_mini_batches: expected at least 1, got 0$"),
+        (own(gamma="99e-2"), r"algorithm\.gamma: expected a number, found a text \('99e-2'\)$"),
+        (own(num_mini_batches=2.5), r"algorithm\.num_mini_batches: expected a whole number, found a number \(2\.5\)$"),
+        (own(max_grad_norm=None), r"algorithm\.max_grad_norm: expected a number, found nothing$"),
         ({"algorithm": {"optimizer": "adamm"}}, r"algorithm: Invalid optimizer 'adamm'"),
         ({"algorithm": {"num_mini_batches": 65}}, r"algorithm\.num_mini_batches: 65 .* samples; a rank has 64"),
         (
@@ -161,13 +179,20 @@ TAUGHT = {"teacher_checkpoint": "taught"}
             r"algorithm: Symmetry augmentation is not supported for recurrent",
         ),
         ({"algorithm": {"symmetry_cfg": {"data_augmentation_func": "nowhere:f"}}}, r"algorithm: No module named"),
-        ({"algorithm": {"rnd_cfg": {"weight": 1.0}}}, r"algorithm: .* missing 3 required positional arguments"),
-        ({"student": GRU}, r"student: PPO has the networks actor and critic$"),
-        (TAUGHT, r"teacher_checkpoint: PPO has no teacher"),
-        ({"algorithm": DISTILLATION}, r"teacher_checkpoint: name the run that trained the teacher"),
+        (
+            {
+                "algorithm": {
+                    "symmetry_cfg": {**SYMMETRY, "data_augmentation_func": "tests.unit.worker.test_rsl_rl:turn"}
+                }
+            },
+            r"algorithm\.symmetry_cfg\.data_augmentation_func: turn is called with env, obs and actions: ",
+        ),
+        ({**own(), "student": GRU}, r"student: .*:OwnPPO has the networks actor and critic$"),
+        ({**own(), **TAUGHT}, r"teacher_checkpoint: .*:OwnPPO has no teacher"),
+        (own("Distillation"), r"teacher_checkpoint: name the run that trained the teacher"),
         ({"algorithm": {**DISTILLATION, "rnd_cfg": RND}, **TAUGHT}, r"algorithm: The RND extension is not compatible"),
         (
-            {"algorithm": {**DISTILLATION, "gradient_length": 9}, **TAUGHT},
+            {**own("Distillation", gradient_length=9), **TAUGHT},
             r"algorithm\.gradient_length: .* 8 steps .*, 9 are needed",
         ),
         ({"torch_compile_mode": "reduce-overhead"}, r"algorithm: torch_compile_mode='reduce-overhead'"),
@@ -184,7 +209,7 @@ def test_what_rsl_rl_refuses_is_told_in_one_line_with_its_place(section: dict[st
 def test_choices_are_refused() -> None:
     setting = Setting(Spaces({"policy": (2,)}, 3, discrete=True), Share(0, 8, 8), alone(), 1)
     with pytest.raises(ValueError, match=r"^rsl_rl: .* actions of this task are choices$"):
-        RslRl(read_settings({}), setting)
+        RslRl(settings({}), setting)
 
 
 # -- learning ---------------------------------------------------------------------------------------------------------
@@ -197,7 +222,7 @@ def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
     weights = copy.deepcopy(dict(algorithm.algorithm.save()))
 
     own = Seen(seed=3)
-    config = read_settings({"num_steps_per_env": 8, **CASES[name]})
+    config = settings({"num_steps_per_env": 8, **CASES[name]})
     distils = "teacher_checkpoint" in CASES[name]
     names = ("student", "teacher") if distils else ("actor", "critic")
     stock: dict[str, Any] = {each: config.section(each) for each in ("algorithm", *names)}
@@ -316,7 +341,7 @@ def test_a_policy_acts_like_the_one_that_is_trained_and_like_its_export(name: st
     algorithm, task = made(name)
     train(algorithm, task, 1)
     before = copy.deepcopy(dict(algorithm.world_state()))
-    config = read_settings({"num_steps_per_env": 8, **CASES[name]})
+    config = settings({"num_steps_per_env": 8, **CASES[name]})
     policy = RslRl.build_policy(config, spaces_of(task), "cpu")
     policy.load_state_dict(algorithm.policy().state_dict())
     exported = policy.module()

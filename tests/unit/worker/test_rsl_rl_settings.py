@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from typing import Any
 
 import pytest
 
-from worker.learning.rsl.settings import REFUSED, RslRlConfig, read_settings
+from tests.support.worker.rsl_loop import settings
+from worker.errors import UserError
+from worker.learning.rsl.settings import REFUSED, RslRlConfig
 
 
 def test_settings_are_read_without_torch() -> None:
-    code = "import sys; from worker.learning.rsl.settings import read_settings; read_settings({}); print('torch' in sys.modules)"
+    code = (
+        "import sys; from worker.learning.rsl.settings import RslRlConfig; RslRlConfig(); print('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
 def test_a_section_with_a_class_is_taken_as_it_is_and_one_without_changes_the_defaults() -> None:
     given = {"class_name": "MLPModel", "hidden_dims": [7]}
-    config = read_settings({"critic": given, "actor": {"hidden_dims": [5], "distribution_cfg": {"init_std": 0.3}}})
+    config = settings({"critic": given, "actor": {"hidden_dims": [5], "distribution_cfg": {"init_std": 0.3}}})
     assert config.section("critic") == given
     normal = {"class_name": "GaussianDistribution", "init_std": 0.3}
     expected = {"class_name": "MLPModel", "hidden_dims": [5], "activation": "elu", "obs_normalization": True}
@@ -30,24 +35,88 @@ def test_a_section_with_a_class_is_taken_as_it_is_and_one_without_changes_the_de
     assert json.loads(json.dumps(dataclasses.asdict(config)))["critic"] == given
 
 
+def ppo(**keys: Any) -> dict[str, Any]:
+    return {"algorithm": keys}
+
+
+without_weight = {"num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}
+
+
+def scheduled(**keys: Any) -> dict[str, Any]:
+    return {**without_weight, "weight": 0.5, "weight_schedule": keys}
+
+
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"max_iterations": 3}, r"rsl_rl\.max_iterations: .* use train\.iterations$"),
-        ({"logger": "wandb"}, r"rsl_rl\.logger: .* metrics\.jsonl"),
-        ({"policy": {}}, r"rsl_rl\.policy: .* actor and critic$"),
-        ({"actr": {}}, r"rsl_rl\.actr: there is no such key; did you mean actor\?$"),
-        ({"num_steps_per_env": 0}, r"rsl_rl\.num_steps_per_env: .*greater than or equal to 1$"),
-        ({"num_steps_per_env": True}, r"rsl_rl\.num_steps_per_env: .*integer"),
-        ({"obs_groups": {"actor": "policy"}}, r"rsl_rl\.obs_groups\.actor: .*list"),
-        ({"actor": [64]}, r"rsl_rl\.actor: .*dictionary"),
+        ({"max_iterations": 3}, r"max_iterations: there is no such setting; use train\.iterations$"),
+        ({"logger": "wandb"}, r"logger: .* metrics\.jsonl"),
+        ({"policy": {}}, r"policy: .* actor and critic$"),
+        ({"actr": {}}, r"actr: there is no such setting; did you mean actor\?$"),
+        ({"num_steps_per_env": 0}, r"num_steps_per_env: expected a value greater than or equal to 1, found 0$"),
+        ({"num_steps_per_env": True}, r"num_steps_per_env: expected a whole number, found true or false"),
+        ({"obs_groups": {"actor": "policy"}}, r"obs_groups\.actor: expected a list, found a text"),
+        ({"actor": [64]}, r"actor: expected a mapping, found a list$"),
+        (
+            {"actor": {"distribution_cfg": {"init_std": math.inf}}},
+            r"actor\.distribution_cfg\.init_std: .*finite.*, found inf$",
+        ),
+        ({"critic": {"hidden_dims": [8, math.nan]}}, r"critic\.hidden_dims\.1: .*finite number, found nan$"),
+        (ppo(max_grad_norm=math.inf), r"algorithm\.max_grad_norm: expected a finite number, found inf$"),
+        (
+            ppo(class_name="own:PPO", anything=[math.inf]),
+            r"algorithm\.anything\.0: expected a finite number, found inf$",
+        ),
+        (ppo(max_grad_norm=None), r"algorithm\.max_grad_norm: expected a number, found nothing$"),
+        (ppo(num_mini_batches=2.5), r"algorithm\.num_mini_batches: expected a whole number, found a number \(2\.5\)$"),
+        (ppo(num_learning_epochs=0), r"algorithm\.num_learning_epochs: .* greater than or equal to 1, found 0$"),
+        (
+            ppo(num_learning_epochs=2.5),
+            r"algorithm\.num_learning_epochs: expected a whole number, found a number \(2\.5\)$",
+        ),
+        (ppo(class_name="rsl_rl.algorithms:PPO", num_learning_epochs=0), r"algorithm\.num_learning_epochs: "),
+        (ppo(gamma="99e-2"), r"algorithm\.gamma: .* found a text \('99e-2'\); in YAML it is written 99\.0e-2$"),
+        (ppo(schedule="linear"), r"algorithm\.schedule: expected 'adaptive' or 'fixed', found 'linear'$"),
+        (ppo(class_name=5), r"algorithm\.class_name: expected a text, found 5$"),
+        (ppo(rnd_cfg={"weight": 1.0}), r"algorithm\.rnd_cfg\.num_outputs: is required$"),
+        (ppo(rnd_cfg=without_weight), r"algorithm\.rnd_cfg\.weight: is required$"),
+        (
+            ppo(rnd_cfg=scheduled(mode="cosine")),
+            r"algorithm\.rnd_cfg\.weight_schedule\.mode: expected constant, step, linear, ",
+        ),
+        (
+            ppo(rnd_cfg=scheduled(mode="step", final_step=3)),
+            r"algorithm\.rnd_cfg\.weight_schedule\.final_value: is required$",
+        ),
+        (ppo(symmetry_cfg={}), r"algorithm\.symmetry_cfg\.data_augmentation_func: is required$"),
+        (ppo(class_name="Distillation"), r"teacher_checkpoint: name the run that trained the teacher$"),
+        ({"teacher_checkpoint": "taught"}, r"teacher_checkpoint: PPO has no teacher; leave it out$"),
+        ({"student": {"hidden_dims": [8]}}, r"student: PPO has the networks actor and critic$"),
+        (
+            {"num_steps_per_env": 4, **ppo(class_name="Distillation"), "teacher_checkpoint": "taught"},
+            r"algorithm\.gradient_length: nothing is learnt in 4 steps an iteration, 15 are needed$",
+        ),
     ],
 )
 def test_settings_that_are_refused(section: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as refusal:
-        read_settings(section)
+    with pytest.raises(UserError, match=rf"^train\.rsl_rl\.{message}") as refusal:
+        settings(section)
     assert "\n" not in str(refusal.value)
 
 
 def test_no_key_is_known_and_refused() -> None:
     assert not REFUSED.keys() & {item.name for item in dataclasses.fields(RslRlConfig)}
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        {"algorithm": {"class_name": "Distillation"}, "teacher_checkpoint": "taught"},
+        {"algorithm": {"class_name": "own:PPO", "num_mini_batches": 2.5}},
+        ppo(desired_kl=None, learning_rate=1, symmetry_cfg=None, rnd_cfg=scheduled(mode="constant")),
+        ppo(rnd_cfg=scheduled(mode="linear", initial_step=0, final_step=9, final_value=0.0)),
+        {"algorithm": {"class_name": "Distillation", "max_grad_norm": None}, "teacher_checkpoint": "taught"},
+    ],
+)
+def test_settings_that_rsl_rl_takes_are_taken(section: dict[str, Any]) -> None:
+    assert settings(section).section("algorithm").items() >= section["algorithm"].items()

@@ -16,6 +16,7 @@ from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Run, Store
 from tests.support.shared_store.operations import durable_operations
 from worker.checkpoint_writer import Orders, save
+from worker.learning import saving
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.saving import Saver
@@ -149,3 +150,32 @@ def test_the_beacon_never_waits_and_survives_a_supervisor_that_is_gone() -> None
     beacon.tell(iteration=2)
     Beacon({}).tell(iteration=3)
     os.close(write)
+
+
+def test_a_commit_waits_for_the_metrics_before_it_for_a_while(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    saver = Saver(run, 1, 0, 1, keep=None)
+    saver.save(1, content(1), {}, after_records=True)
+    time.sleep(0.5)
+    assert saver.poll() == [] and list_checkpoints(run) == []
+    saver.note_records(1)
+    assert saver.wait() == ["checkpoint 00000001-e1"]
+    monkeypatch.setattr(saving, "RECORDS_SECONDS", 0.2)
+    saver.save(2, content(2), {}, after_records=True)
+    told = saver.wait()
+    assert told[0] == "checkpoint 00000002-e1" and "was committed before the metrics up to it were written" in told[1]
+    saver.close()
+
+
+def test_a_save_does_not_wait_for_a_volume_that_hangs(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(saving, "PATIENCE", 0.3)
+    saver = Saver(run, 1, 0, 2, keep=None)  # the second rank never comes: as if its volume hung
+    for iteration in (1, 2, 3):
+        saver.save(iteration, content(iteration), {}, wait=False)
+    assert saver.is_busy and saver.failures == 1 and 0.1 < saver.stall < 5
+    why = "earlier saves are still being written"
+    assert saver.poll() == [f"warning: iteration 3 could not be saved ({why}); training goes on"]
+    started = time.monotonic()
+    saver.save(4, content(4), {}, wait=False)
+    assert time.monotonic() - started < 0.2, "the oldest was waited for already"
+    saver.abandon()
+    saver.close()

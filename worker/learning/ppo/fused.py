@@ -7,7 +7,7 @@ Networks are rsl-rl's. What differs from rsl-rl 5.5.1, and why:
   number of ranks changes nothing but rounding. One collective an iteration, one a minibatch; they stand between graphs, where NCCL's
   watchdog sees them.
 - A time-out bootstraps from the value of the observation *after* the step, before the reset; rsl-rl takes the one before the step.
-  (Of images there is none after the step: there it is as in rsl-rl.)
+  Images are rendered only after the reset, so image tasks bootstrap from V(s_t), as rsl-rl does.
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws new minibatches (rsl-rl draws once and repeats the same minibatches in all epochs).
 - The Gaussian's objective and its gradient are one kernel (:mod:`worker.learning.ppo.objective`), and on CUDA actor and critic run
@@ -36,6 +36,7 @@ from worker.learning.ppo.loss import LOSSES, Clipping
 from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.learning.ppo.rollout import Rollout, View
 from worker.learning.ppo.settings import PPOConfig
+from worker.learning.totals import Totals
 
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within its limits."""
@@ -51,10 +52,6 @@ class PPO:
 
     def __init__(self, config: PPOConfig, setting: Setting, *, plain: bool = False) -> None:
         """``plain``: the loss in plain torch where there is a kernel for it. Raises ValueError for what it can't do."""
-        if config.minibatches > config.steps:
-            raise ValueError(
-                f"ppo.minibatches: {config.minibatches} minibatches need as many steps of each world, there are {config.steps}"
-            )
         self.config, self.setting, self.gang = config, setting, setting.gang
         self.steps, self.device = config.steps, setting.gang.device
         spaces, worlds = setting.spaces, setting.share.count
@@ -87,10 +84,11 @@ class PPO:
             self.gang.broadcast(parameter.data)
 
     def _allocate_sums(self) -> None:
-        """Count, sum and sum of squares of the advantages, then the sums of every observation normaliser."""
-        sizes = [2 * view.latents.shape[-1] if self._is_normalised(view) else 0 for view in self.rollout.views]
-        self._sums = torch.zeros(3 + sum(sizes), device=self.device, dtype=torch.float64)
-        self._observation_sums = self._sums[3:].split(sizes)
+        """What the ranks add up before the minibatches: moments of the advantages, and the sums of every observation normaliser."""
+        views = self.rollout.views
+        sizes = {view.group: 2 * view.latents.shape[-1] if self._is_normalised(view) else 0 for view in views}
+        self._sums = Totals({"count": 1, "advantages": 1, "squared_advantages": 1, **sizes}, self.device)
+        self._observation_sums = [self._sums[view.group] for view in views]
 
     def _allocate_gradients(self) -> None:
         """One flat buffer: all gradients, then what else a minibatch shares. The parameters' gradients are views of it.
@@ -178,7 +176,7 @@ class PPO:
     def _learn(self) -> None:
         estimate, normalize, compute, apply, close = self._parts
         estimate()
-        self.gang.sum(self._sums)
+        self.gang.sum(self._sums.values)
         normalize()
         for rows in self._orders:
             self._rows.copy_(rows.view(-1))
@@ -198,9 +196,9 @@ class PPO:
         rollout.log_prob.copy_(self._head.log_prob(rollout))
         rollout.estimate_advantages(last, self.config.gamma, self.config.lam)
         advantages = rollout.advantages
-        self._sums[0].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
-        self._sums[1] = advantages.sum(dtype=torch.float64)
-        self._sums[2] = advantages.double().square().sum()
+        self._sums["count"].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
+        self._sums["advantages"].copy_(advantages.sum(dtype=torch.float64))
+        self._sums["squared_advantages"].copy_(advantages.double().square().sum())
         for view, sums in zip(rollout.views, self._observation_sums, strict=True):
             if len(sums):
                 moments.gather(view.observations, view.model.obs_normalizer, sums)
@@ -209,7 +207,7 @@ class PPO:
     @torch.no_grad()
     def _normalize(self) -> None:
         """Advantages by the moments over all ranks; then all is ready for the minibatches."""
-        count, total, squares = self._sums[0], self._sums[1], self._sums[2]
+        count, total, squares = (self._sums[name][0] for name in ("count", "advantages", "squared_advantages"))
         mean = total / count
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
         self.rollout.advantages.sub_(mean).div_(deviation + 1e-8)
@@ -241,7 +239,7 @@ class PPO:
         """After the last minibatch: the normalisers move on, and the numbers are gathered."""
         for view, sums in zip(self.rollout.views, self._observation_sums, strict=True):
             if len(sums):
-                moments.merge(view.model.obs_normalizer, self._sums[0], sums)
+                moments.merge(view.model.obs_normalizer, self._sums["count"][0], sums)
         torch.div(self._loss_sums, len(self._orders), out=self._metrics[: len(LOSSES)])
         self._metrics[len(LOSSES)].copy_(self._rate)
         self._metrics[len(LOSSES) + 1].copy_(self._head.spread())

@@ -96,6 +96,10 @@ class PPOConfig:
     def _agree(self) -> PPOConfig:
         if len({len(self.channels), len(self.kernel_sizes), len(self.strides)}) > 1:
             raise ValueError("channels, kernel_sizes and strides: give one number of each for every convolution")
+        if self.minibatches > self.steps:
+            raise ValueError(
+                f"minibatches: {self.minibatches} minibatches need as many steps of each world, there are {self.steps}"
+            )
         if self.learning_rate_limits[0] > self.learning_rate_limits[1]:
             raise ValueError("learning_rate_limits: expected the least, then the greatest")
         if self.weight_decay and self.optimizer != "adamw":

@@ -38,6 +38,7 @@ class RslRl:
     def __init__(self, config: RslRlConfig, setting: Setting) -> None:
         """Build what ``config`` names. Raises ValueError, in one line that says where, for what rsl_rl refuses."""
         self.steps = config.num_steps_per_env
+        self.teacher_checkpoint = config.teacher_checkpoint
         self.graphs: Sequence[CudaGraphFunction] = ()
         self.algorithm, seen, self._groups = building.build_algorithm(config, setting)
         self._gang, self._worlds = setting.gang, setting.share.count
@@ -139,10 +140,7 @@ class RslRl:
     # -- the teacher --------------------------------------------------------------------------------------------------
 
     def load_teacher(self, state: Mapping[str, Any]) -> None:
-        """Take the teacher's weights from the :meth:`state_dict` of the run that trained it; before the first :meth:`begin`, on all ranks.
-
-        A run that is resumed has them in its checkpoint. Raises ValueError where there is no teacher, or the weights are not its.
-        """
+        """See :class:`worker.learning.algorithm.Student`. Raises ValueError where there is no teacher, or the weights are not its."""
         if not self._distils:
             raise ValueError("rsl_rl.teacher_checkpoint: only Distillation has a teacher")
         try:

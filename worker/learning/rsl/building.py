@@ -19,13 +19,12 @@ from rsl_rl.utils import resolve_callable, resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import nn
 
+from shared_store.wording import Refused, kind_of
 from worker.errors import is_out_of_memory
 from worker.learning.algorithm import Setting, Share, Spaces
-from worker.learning.rsl.settings import RslRlConfig
+from worker.learning.rsl.checks import check_gradient_length, check_networks
+from worker.learning.rsl.settings import NETWORKS, RslRlConfig
 from worker.tasks.rsl_rl_env import as_floats
-
-NETWORKS = ("actor", "critic", "student", "teacher")
-"""Names of networks, of configuration sections and of observation sets alike."""
 
 
 class Surroundings(VecEnv):
@@ -64,14 +63,9 @@ def algorithm_type(config: RslRlConfig) -> tuple[Any, tuple[str, str]]:
         if not hasattr(found, "construct_algorithm"):
             raise ValueError(f"{name} is not an algorithm: it has no construct_algorithm")
     distils = isinstance(found, type) and issubclass(found, Distillation)
-    names = ("student", "teacher") if distils else ("actor", "critic")
-    for other in NETWORKS:
-        if other not in names and getattr(config, other) is not None:
-            raise ValueError(f"rsl_rl.{other}: {name} has the networks {' and '.join(names)}")
-    if bool(config.teacher_checkpoint) != distils:
-        text = "name the run that trained the teacher" if distils else f"{name} has no teacher; leave it out"
-        raise ValueError(f"rsl_rl.teacher_checkpoint: {text}")
-    return found, names
+    given = {each: getattr(config, each) for each in NETWORKS}
+    with _named():
+        return found, check_networks(name, distils, given, config.teacher_checkpoint)
 
 
 def observation_sets(config: RslRlConfig, names: tuple[str, str], example: TensorDict) -> dict[str, list[str]]:
@@ -136,13 +130,16 @@ def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[st
 
 
 def _check_numbers(found: Any, section: dict[str, Any]) -> None:
-    """Refuse a text in the place of a number, which rsl_rl would only notice when it reckons with it."""
+    """Refuse what is no number in the place of one, and a fraction in the place of a count: a class of one's own would only notice
+    when it reckons with it."""
     for name, parameter in inspect.signature(found).parameters.items():
-        number = isinstance(parameter.default, int | float) and not isinstance(parameter.default, bool)
-        if number and isinstance(section.get(name), str):
-            raise ValueError(
-                f"rsl_rl.algorithm.{name}: expected a number, got the text {section[name]!r}; in YAML 1e-3 is written 1.0e-3"
-            )
+        default, given = parameter.default, section.get(name, parameter.default)
+        if not isinstance(default, int | float) or isinstance(default, bool):
+            continue
+        kind = int if isinstance(default, int) and name != "grad_reduce_bucket_mb" else int | float
+        if not isinstance(given, kind) or isinstance(given, bool):
+            expected = "a whole number" if kind is int else "a number"
+            raise ValueError(f"rsl_rl.algorithm.{name}: expected {expected}, found {kind_of(given)}")
 
 
 def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> None:
@@ -157,8 +154,6 @@ def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> 
     if isinstance(built, PPO):
         if networks[0].distribution is None:
             raise ValueError("rsl_rl.actor.distribution_cfg: PPO needs a distribution to draw actions from")
-        if built.num_mini_batches < 1:
-            raise ValueError(f"rsl_rl.algorithm.num_mini_batches: expected at least 1, got {built.num_mini_batches}")
         recurrent = any(network.is_recurrent for network in networks)
         parts, there = built.num_mini_batches, worlds if recurrent else worlds * steps
         if parts > there:
@@ -166,10 +161,22 @@ def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> 
             raise ValueError(
                 f"rsl_rl.algorithm.num_mini_batches: {parts} minibatches need as many {what}; a rank has {there}"
             )
-    if isinstance(built, Distillation) and built.gradient_length > (whole := built.num_learning_epochs * steps):
+        if built.symmetry:
+            _check_symmetry(built.symmetry.data_augmentation_func)
+    if isinstance(built, Distillation):
+        with _named():
+            check_gradient_length(built.gradient_length, built.num_learning_epochs, steps)
+
+
+def _check_symmetry(function: Any) -> None:
+    """Refuse a function that rsl_rl could not call."""
+    try:
+        inspect.signature(function).bind(env=None, obs=None, actions=None)
+    except (TypeError, ValueError) as error:
+        name = getattr(function, "__qualname__", type(function).__name__)
         raise ValueError(
-            f"rsl_rl.algorithm.gradient_length: nothing is learnt in {whole} steps an iteration, {built.gradient_length} are needed"
-        )
+            f"rsl_rl.algorithm.symmetry_cfg.data_augmentation_func: {name} is called with env, obs and actions: {error}"
+        ) from error
 
 
 def _find(name: Any) -> Any:
@@ -185,6 +192,15 @@ def _quiet() -> Iterator[None]:
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "optimizer contains a parameter group with duplicate parameters")
         yield
+
+
+@contextlib.contextmanager
+def _named() -> Iterator[None]:
+    """In here a refusal begins with ``rsl_rl``."""
+    try:
+        yield
+    except Refused as refused:
+        raise ValueError(f"rsl_rl.{refused}") from refused
 
 
 @contextlib.contextmanager

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import field
 from typing import Annotated, Any, ClassVar
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
-from pydantic_core import ArgsKwargs
+
+from worker.learning.rsl.checks import check_algorithm, check_finite, check_gradient_length, check_networks, class_of
 
 _NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu", "obs_normalization": True}
 _ACTOR = {**_NETWORK, "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
@@ -22,6 +22,10 @@ DEFAULTS: Mapping[str, dict[str, Any]] = {
     "teacher": _ACTOR,
 }
 """The sections that a job does not give. What is not in them is as in rsl_rl."""
+
+NETWORKS = ("actor", "critic", "student", "teacher")
+"""Names of networks, of configuration sections and of observation sets alike."""
+Network = Annotated[dict[str, Any], AfterValidator(check_finite)]
 
 _LOGS = "every run writes metrics.jsonl and TensorBoard's files by itself"
 _RESUME = "a run goes on from its checkpoint with `muster resume RUN`"
@@ -61,7 +65,7 @@ class RslRlConfig:
     ``distribution_cfg`` in it. Sections may have any key that the class which they name knows.
 
     Raises:
-        ValidationError: A key is unknown or not for here, or a value has the wrong type; :func:`read_settings` makes it one line.
+        ValidationError: A key is unknown, or a value has the wrong type or is out of range.
     """
 
     num_steps_per_env: Annotated[int, Field(strict=True, ge=1)] = 24
@@ -69,15 +73,15 @@ class RslRlConfig:
     obs_groups: dict[str, list[str]] = field(default_factory=dict)
     """Which of the task's observation groups each set has: ``actor``, ``critic``, ``rnd_state``, ``student``, ``teacher``. A set that is
     missing is the group of the same name, or else ``policy``, which is rsl_rl's rule: the critic sees the group ``critic``."""
-    algorithm: dict[str, Any] = field(default_factory=dict)
+    algorithm: Annotated[dict[str, Any], AfterValidator(check_algorithm)] = field(default_factory=dict)
     """``PPO``, ``Distillation`` or ``module:Class``, with ``rnd_cfg``, ``symmetry_cfg`` and the rest."""
-    actor: dict[str, Any] | None = None
+    actor: Network | None = None
     """The policy's network, of PPO."""
-    critic: dict[str, Any] | None = None
+    critic: Network | None = None
     """The value's network, of PPO."""
-    student: dict[str, Any] | None = None
+    student: Network | None = None
     """The network that learns, of Distillation."""
-    teacher: dict[str, Any] | None = None
+    teacher: Network | None = None
     """The network that is imitated, of Distillation: the ``actor`` of the run that trained it."""
     teacher_checkpoint: str | None = None
     """Where the teacher's weights come from, of Distillation: ``RUN`` or ``RUN@ITERATION``. A key of Muster's, not of rsl_rl's."""
@@ -100,36 +104,20 @@ class RslRlConfig:
     elsewhere: ClassVar[Mapping[str, str]] = REFUSED
     """What people look for here, and what to use instead."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _known(cls, given: Any) -> Any:
-        """Name each key that is refused, and each that is unknown, with what to write instead."""
-        values = (given.kwargs or {}) if isinstance(given, ArgsKwargs) else given
-        known = [item.name for item in fields(cls)]
-        for key in values if isinstance(values, Mapping) else ():
-            if key in REFUSED:
-                raise ValueError(f"{key}: Muster does what rsl_rl's runner needs this for; {REFUSED[key]}")
-            if key not in known:
-                near = difflib.get_close_matches(str(key), known, n=1)
-                hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-                raise ValueError(f"{key}: there is no such key; {hint}")
-        return given
+    @model_validator(mode="after")
+    def _agree(self) -> RslRlConfig:
+        section = self.section("algorithm")
+        if kind := class_of(section):
+            given = {name: getattr(self, name) for name in NETWORKS}
+            check_networks(kind, kind == "Distillation", given, self.teacher_checkpoint)
+        if kind == "Distillation":
+            epochs, length = section.get("num_learning_epochs", 1), section.get("gradient_length", 15)
+            check_gradient_length(length, epochs, self.num_steps_per_env)
+        return self
 
     def section(self, name: str) -> dict[str, Any]:
         """Section ``name`` as rsl_rl takes it: with its ``class_name``. Nothing of it is shared with these settings."""
         return _changed(DEFAULTS[name], getattr(self, name) or {})
-
-
-def read_settings(section: Mapping[str, Any]) -> RslRlConfig:
-    """The settings of a job's ``rsl_rl`` section. Raises ValueError, in one line with the name of the key."""
-    try:
-        return RslRlConfig(**section)
-    except ValidationError as error:
-        first = error.errors()[0]
-        text = first["msg"].removeprefix("Value error, ")
-        if where := ".".join(map(str, first["loc"])):
-            text = f"{where}: {text[:1].lower()}{text[1:]}"
-        raise ValueError(f"rsl_rl.{text}") from error
 
 
 def _changed(default: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

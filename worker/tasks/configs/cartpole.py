@@ -38,9 +38,14 @@ class CartpoleConfig(TaskConfig):
     rewards: Mapping[str, float] = reward_weights(
         alive=0.1, angle=-0.1, position=-0.05, velocity=-0.05, effort=-0.001, fall=-2.0
     )
-    """Weights of: each step that does not end in a fall; the squared tilt [1/rad^2]; the squared distance from the middle
-    [1/m^2]; the cart's squared velocity [s^2/m^2] (a cart that drifts meets the end of the rail too late to learn why); the
-    squared action; leaving the rail or dropping the pole, once."""
+    """Weights of these terms:
+
+    - ``alive``: each step that does not end in a fall;
+    - ``angle``: squared tilt [1/rad^2];
+    - ``position``: squared distance from the middle [1/m^2];
+    - ``velocity``: squared velocity of the cart [s^2/m^2], since a cart that drifts meets the end of the rail too late to learn why;
+    - ``effort``: squared action;
+    - ``fall``: leaving the rail or dropping the pole, once."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=16, hidden_sizes=(32, 32), epochs=4, minibatches=2, learning_rate=1.0e-3, desired_kl=0.01

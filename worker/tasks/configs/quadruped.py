@@ -69,12 +69,18 @@ class QuadrupedConfig(TaskConfig):
         limits=-5.0,
         fall=-2.0,
     )
-    """Weights of, per second: exp(-4 e^2) of the error e of the horizontal velocity [m/s]; exp(-4 e^2) of that of the turning
-    velocity [rad/s]; the squared vertical velocity [s^2/m^2]; the squared rolling and pitching velocities [s^2/rad^2]; the
-    squared horizontal part of the vertical in the trunk's frame; the sum of squared torques [1/(N m)^2]; the sum of squared
-    changes of the action; the sum of squared distances to the standing angles [1/rad^2]; the sum of distances into the last
-    twentieth at the ends of the joints' ranges [1/rad]. And, once: a fall, which must not be cheaper than the costs of the
-    first clumsy seconds."""
+    """Weights of these terms, each per second but the last:
+
+    - ``track_linear``: exp(-4 e^2), with the error e of the horizontal velocity [m/s];
+    - ``track_angular``: exp(-4 e^2), with the error e of the turning velocity [rad/s];
+    - ``lin_vel_z``: squared vertical velocity [s^2/m^2];
+    - ``ang_vel_xy``: squared rolling and pitching velocities [s^2/rad^2];
+    - ``orientation``: squared horizontal part of the vertical in the trunk's frame;
+    - ``torques``: sum of squared torques [1/(N m)^2];
+    - ``action_rate``: sum of squared changes of the action;
+    - ``pose``: sum of squared distances to the standing angles [1/rad^2];
+    - ``limits``: sum of distances into the last twentieth at the ends of the joints' ranges [1/rad];
+    - ``fall``: fall penalty, once; large enough that early falling never pays."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=24,

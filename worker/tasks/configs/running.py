@@ -16,11 +16,18 @@ from worker.tasks.config import STRICT, Count, Positive, TaskConfig, reward_weig
 class RunningConfig(TaskConfig):
     """Run fast, straight and upright; do not fall.
 
-    ``rewards`` weighs: the torso's velocity along +x [s/m]; facing +x (whole where the cosine is above 0.8, in proportion below);
-    an upright torso (cosine to vertical above 0.93); each step that does not end in a fall; the sum of squared actions; the sum
-    over joints of |action x scaled joint velocity| x strength; the sum over joints of how far each is into the last hundredth at
-    an end of its range (0 to 1) x strength; a fall, which replaces every other term of that step. A joint's strength is its
-    motor's full torque over that of the strongest.
+    ``rewards`` weighs these terms:
+
+    - ``forward``: velocity of the torso along +x [s/m];
+    - ``heading``: 1 where the cosine to +x is above 0.8, in proportion below;
+    - ``up``: 1 where the cosine of the torso to the vertical is above 0.93;
+    - ``alive``: 1 in each step that does not end in a fall;
+    - ``action``: sum of squared actions;
+    - ``energy``: sum over joints of |action x scaled joint velocity| x strength;
+    - ``limits``: sum over joints of how far each is into the last hundredth at an end of its range (0 to 1) x strength;
+    - ``fall``: 1 in the step of a fall, in which every other term is 0.
+
+    The strength of a joint is the full torque of its motor over that of the strongest motor.
     """
 
     control_hz: Positive = 60.0

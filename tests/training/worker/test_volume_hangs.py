@@ -1,0 +1,120 @@
+"""A volume that hangs: training goes on, and what was to be written comes afterwards."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Run, Store
+from tests.support.worker.ranks import training
+from tests.support.worker.runs import runner
+from worker.learning import saving
+from worker.learning.loop import Loop
+
+ITERATIONS = 60
+PIPE = 4096
+"""Bytes that the metrics file takes before a write to it blocks: a few records."""
+
+
+@contextmanager
+def hanging_metrics(run: Run) -> Iterator[int]:
+    """A metrics file that blocks whoever writes to it until somebody reads from the descriptor: a pipe."""
+    run.metrics.mkdir(parents=True)
+    path = run.metrics / "metrics-e1.jsonl"
+    os.mkfifo(path)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE)
+    yield descriptor
+    os.close(descriptor)
+
+
+def until(loop: Loop, iteration: int, seconds: float) -> None:
+    """Wait until training is so far."""
+    deadline = time.monotonic() + seconds
+    while loop.state.progress.iteration < iteration:
+        assert time.monotonic() < deadline, f"only iteration {loop.state.progress.iteration} after {seconds:g} s"
+        time.sleep(0.005)
+
+
+def read_all(descriptor: int, ended: threading.Event) -> list[dict[str, float]]:
+    """What the reporter writes, until training has ended."""
+    content = b""
+    while True:
+        try:
+            chunk = os.read(descriptor, 65536)
+        except BlockingIOError:
+            chunk = None
+        if chunk:
+            content += chunk
+        elif ended.is_set():
+            return [json.loads(line) for line in content.splitlines()]
+        else:
+            time.sleep(0.002)
+
+
+def test_training_goes_on_while_the_volume_hangs_and_what_was_written_comes_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(saving, "RECORDS_SECONDS", 60.0)
+    monkeypatch.setattr(saving, "PATIENCE", 0.2)
+    run = Store(tmp_path).run("run")
+    with hanging_metrics(run) as descriptor:
+        loop = runner(training(tmp_path, iterations=ITERATIONS, every=5))
+        ended, codes = threading.Event(), []
+
+        def train() -> None:
+            codes.append(loop.train())
+            ended.set()
+
+        threading.Thread(target=train, daemon=True).start()
+        # 12 saves are due meanwhile; the records of the first of them do not fit into the pipe
+        until(loop, ITERATIONS, seconds=20.0)
+        assert not ended.is_set(), "the end of a training waits for its last checkpoint"
+        records = [json.loads(line) for line in os.read(descriptor, PIPE).splitlines()]  # a line is written whole
+        assert len(records) < 20, "the metrics hang"
+        assert all(each.iteration <= len(records) for each in list_checkpoints(run)), "no commit before its records"
+        records += read_all(descriptor, ended)
+    assert codes == [0]
+    told = {each["iteration"]: each["iteration_seconds"] for each in records if "iteration" in each}
+    assert list(told) == list(range(1, ITERATIONS + 1)), "every record came, in order"
+    assert max(told.values()) < 2.0 and sum(told.values()) < 10.0, "training waited for the volume"
+    assert list_checkpoints(run)[-1].iteration == ITERATIONS
+
+
+def test_a_commit_follows_the_records_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that goes on from a checkpoint has the metrics up to it."""
+    loop = runner(training(tmp_path, iterations=6, every=3))
+    run = Store(tmp_path).run("run")
+    seen: dict[int, int] = {}
+    slow = loop.reporter.do
+
+    def watch() -> None:
+        while not ended.is_set():
+            for each in list_checkpoints(run):
+                lines = (run.metrics / "metrics-e1.jsonl").read_text().splitlines()
+                seen.setdefault(
+                    each.iteration, max((json.loads(line).get("iteration", 0) for line in lines), default=0)
+                )
+            time.sleep(0.001)
+
+    def late(function, *arguments) -> None:  # type: ignore[no-untyped-def]
+        slow(time.sleep, 0.3)
+        slow(function, *arguments)
+
+    monkeypatch.setattr(loop.reporter, "do", late)
+    ended = threading.Event()
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    assert loop.train() == 0
+    ended.set()
+    watcher.join()
+    assert seen.keys() == {3, 6} and all(recorded >= iteration for iteration, recorded in seen.items())

@@ -1,0 +1,97 @@
+"""The threads that read and write the volume for a training: reports, and the look at the epoch."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from shared_store.epoch import StaleEpoch, raise_epoch
+from shared_store.layout import Run, Store
+from tests.support.waiting import wait_for
+from worker.learning import reporter as reporting
+from worker.learning.reporter import Fence, Reporter
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.setattr(reporting, "_EVERY", 0.01)
+    run = Store(tmp_path).open().run("r")
+    run.create({})
+    raise_epoch(run, 1)
+    return run
+
+
+def test_reports_are_made_in_order_and_nobody_waits_for_them() -> None:
+    reporter, gate, done = Reporter(), threading.Event(), []
+    reporter.do(gate.wait)
+    started = time.monotonic()
+    for number in range(1000):
+        reporter.do(done.append, number)
+    assert time.monotonic() - started < 1.0 and done == []
+    gate.set()
+    reporter.close()
+    assert done == list(range(1000))
+
+
+def test_a_report_that_fails_is_told_once_and_later_ones_are_made(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter, done = Reporter(), []
+    for _ in range(3):
+        reporter.do({}.__getitem__, "reward")
+    reporter.do(done.append, 1)
+    reporter.close()
+    told = capsys.readouterr().out
+    assert done == [1]
+    assert told.count("warning: a report failed (KeyError: 'reward'); training goes on without it\n") == 1
+    assert "warning: 3 reports failed and were lost" in told
+
+
+def test_what_a_hanging_volume_does_not_take_is_dropped_and_counted(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "_MOST", 2)
+    monkeypatch.setattr(reporting, "_FAREWELL", 0.05)
+    reporter, gate, entered = Reporter(), threading.Event(), threading.Event()
+    reporter.do(lambda: (entered.set(), gate.wait()))
+    entered.wait()
+    for _ in range(5):
+        reporter.do(print)
+    reporter.close()
+    gate.set()
+    assert "warning: the volume did not take the last metrics (4 were dropped)" in capsys.readouterr().out
+
+
+def test_a_fence_tells_of_a_newer_attempt(run: Run) -> None:
+    fence = Fence(run, 1)
+    time.sleep(0.05)
+    fence.check()
+    raise_epoch(run, 2)
+    with pytest.raises(StaleEpoch, match="now belongs to epoch 2"):
+        wait_for(fence.check)
+    fence.close()
+
+
+def test_a_fence_reads_again_what_cannot_be_read(run: Run) -> None:
+    path = run.path / "EPOCH"
+    whole = path.read_text()
+    path.write_text("damaged")
+    fence = Fence(run, 1)
+    time.sleep(0.05)
+    fence.check()
+    path.write_text(whole)
+    raise_epoch(run, 2)
+    with pytest.raises(StaleEpoch):
+        wait_for(fence.check)
+    fence.close()
+
+
+def test_a_defect_of_the_fence_is_seen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(reporting, "check_epoch", broken)
+    fence = Fence(run, 1)
+    with pytest.raises(RuntimeError, match="a defect"):
+        wait_for(fence.check)

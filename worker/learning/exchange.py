@@ -1,0 +1,71 @@
+"""What the ranks tell each other once an iteration, and the one transfer that brings it to the host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+
+from worker.distributed import Gang
+from worker.learning.cuda_graph import Readback
+from worker.learning.totals import Totals
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+SIGNALS = ("stopping", "save_now", "failed_saves", "busy", "stall", "iteration_seconds")
+"""Per-rank flags summed over the ranks each iteration: stop requests, save requests, failed saves, ranks whose earlier saves the
+volume does not take, save stall [s], iteration time [s]."""
+
+
+class Exchange:
+    """Sums over the ranks: the task's statistics, its mishaps and the :data:`SIGNALS`."""
+
+    def __init__(self, gang: Gang, task: Task) -> None:
+        self._gang, self._task = gang, task
+        signals = dict.fromkeys(SIGNALS, 1)
+        self._totals = Totals(
+            {
+                "collected": gang.size,  # [s], of each rank in the iteration before
+                "mishap": gang.size,  # of each rank, see Task.read_mishap
+                "statistics": len(task.statistic_names),
+                **signals,
+            },
+            gang.device,
+        )
+        self._own = Totals({"collected": 1, **signals}, "cpu", pinned=gang.device != "cpu")
+        self._readback = Readback(gang.device)
+
+    def gather(self, collected: float, signals: Mapping[str, float]) -> None:
+        """Add up over the ranks what happened in the rollout, and what each rank has to tell; clears the task's statistics.
+
+        Args:
+            collected: How long this rank collected in the iteration before [s].
+            signals: This rank's :data:`SIGNALS`.
+        """
+        totals, own, rank = self._totals, self._own, self._gang.rank
+        totals.values.zero_()
+        totals["mishap"][rank].copy_(self._task.mishap[0])
+        totals["statistics"].copy_(self._task.statistics)
+        self._task.clear_statistics()
+        # the device has copied the values of the iteration before: read() waited for it
+        own["collected"].fill_(collected)
+        totals["collected"][rank : rank + 1].copy_(own["collected"], non_blocking=True)
+        for name in SIGNALS:
+            own[name].fill_(signals[name])
+            totals[name].copy_(own[name], non_blocking=True)
+        self._gang.sum(totals.values)
+
+    def read(self, metrics: Mapping[str, torch.Tensor]) -> tuple[dict[str, float], dict[str, list[float]]]:
+        """``metrics`` and the totals by name, on the host. Waits for the device.
+
+        Args:
+            metrics: Each of shape (), on the device.
+        """
+        numbers = torch.cat([torch.stack([value.double() for value in metrics.values()]), self._totals.values])
+        known = self._readback.read(numbers)
+        return (
+            dict(zip(metrics, known, strict=False)),
+            Totals.named(self._totals.layout, known[len(metrics) :]),
+        )

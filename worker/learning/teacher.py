@@ -1,0 +1,46 @@
+"""The teacher of an algorithm that imitates another run's policy (:class:`worker.learning.algorithm.Student`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from shared_store.checkpoints import Checkpoint
+from worker.distributed import Gang
+from worker.errors import UserError
+from worker.learning.algorithm import Algorithm, Student
+from worker.learning.job import Job, user_errors
+from worker.learning.trained import choose_checkpoint, load_learner
+
+
+def give_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint | None) -> None:
+    """Load the weights of the teacher that a new run's settings name. All ranks call it.
+
+    Args:
+        job: Names the store in which the teacher's run is.
+        gang: The ranks.
+        algorithm: Asks for a teacher, or does not.
+        adopted: The checkpoint with whose weights the run begins: where it was made with the same teacher, it holds the teacher.
+
+    Raises:
+        UserError: There is no such checkpoint, it is of an older Muster, or the weights do not fit.
+    """
+    if not isinstance(algorithm, Student) or not (reference := algorithm.teacher_checkpoint):
+        return
+    if adopted and (adopted.manifest.get("settings") or {}).get("teacher_checkpoint") == reference:
+        return
+    learnt = _learnt(job, gang, reference)
+    with user_errors("train"):
+        algorithm.load_teacher(learnt)
+
+
+def _learnt(job: Job, gang: Gang, reference: str) -> dict[str, Any]:
+    """The algorithm's state in the checkpoint ``RUN`` or ``RUN@ITERATION``."""
+    name, _, iteration = reference.partition("@")
+    checkpoint = choose_checkpoint(gang, job.store.run(name), iteration or None)
+    if "algorithm" not in checkpoint.manifest:
+        raise UserError(
+            f"teacher_checkpoint: checkpoint {checkpoint.name} of run {name} is of an older Muster, which knew no algorithms; "
+            "train the teacher again"
+        )
+    learnt: dict[str, Any] = load_learner(checkpoint, gang.device)["algorithm"]
+    return learnt
