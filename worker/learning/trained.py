@@ -64,7 +64,7 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
         settings = algorithm.config_type(**facts["settings"])
         policy = algorithm.build_policy(settings, spaces_from(facts["policy"]), device)
     except (TypeError, ValueError) as error:
-        refused = refusal("settings", error)
+        refused = refusal("settings", error).removeprefix("train.")
         raise UserError(
             f"checkpoint {checkpoint.name}: algorithm {facts['algorithm']} refuses what it was trained with: {refused}"
         ) from error

@@ -90,8 +90,8 @@ def test_a_policy_without_a_memory_is_exported(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"steps": 8, "momentum": 0.9}, r"settings\.momentum: .*, got 0\.9"),
-        ({"steps": 0}, r"settings\.steps: .*, got 0"),
+        ({"steps": 8, "momentum": 0.9}, r"settings\.momentum: .*, found 0\.9"),
+        ({"steps": 0}, r"settings\.steps: .*, found 0"),
         ({"critic_observations": "policy", "kernel_sizes": [9]}, r"settings: channels, kernel_sizes and strides: give"),
     ],
 )

@@ -14,6 +14,7 @@ from tests.support.worker.tasks import observe, put
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.learning.setup import describe
+from worker.learning.training import Training
 from worker.tasks import BUILT_IN, find_task
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.interface import Interface
@@ -122,9 +123,15 @@ def test_an_episode_begins_at_the_declared_positions(task: Task) -> None:
         assert torch.allclose(q[:, first_q + index], torch.tensor(action.default_position)), action.name
 
 
+def described(task: Task) -> dict[str, Any]:
+    job: Any = SimpleNamespace(
+        spec={}, section={"task": type(task).__name__}, setting=lambda name, default, **_: default
+    )
+    return describe(Training.of(job, type(task)), task)
+
+
 def test_a_checkpoint_holds_what_a_robot_needs(task: Task) -> None:
-    job: Any = SimpleNamespace(section={"task": type(task).__name__})
-    policy = json.loads(json.dumps(describe(job, task, task.config, "ppo", task.config.ppo)))["policy"]
+    policy = json.loads(json.dumps(described(task)))["policy"]
     assert policy["control_hz"] == task.config.control_hz
     assert [seen["name"] for seen in policy["observations"]] == policy["observation_names"]
     if isinstance(task.config, QuadrupedConfig):
@@ -139,8 +146,7 @@ def test_every_built_in_task_declares_its_interface_and_images_stand_for_themsel
     assert SETTINGS.keys() | {"CartpolePixels"} == BUILT_IN.keys()
     kind = find_task("CartpolePixels")
     task = kind(kind.config_type(), 1)
-    job: Any = SimpleNamespace(section={"task": "CartpolePixels"})
-    policy = describe(job, task, task.config, "ppo", task.config.ppo)["policy"]
+    policy = described(task)["policy"]
     assert "camera" in policy and "observations" not in policy
     assert [action["name"] for action in policy["actions"]] == ["slider"]
 
