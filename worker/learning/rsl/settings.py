@@ -115,6 +115,28 @@ class RslRlConfig:
                 raise ValueError(f"{key}: there is no such key; {hint}")
         return given
 
+    @model_validator(mode="after")
+    def _has_its_teacher(self) -> RslRlConfig:
+        """Of rsl_rl's own classes it is known which one has a teacher."""
+        name = self.section("algorithm").get("class_name")
+        if name == "Distillation" and not self.teacher_checkpoint:
+            raise ValueError("teacher_checkpoint: name the run that trained the teacher")
+        if name == "PPO" and self.teacher_checkpoint:
+            raise ValueError("teacher_checkpoint: PPO has no teacher; leave it out")
+        return self
+
+    def check_observations(self, groups: Mapping[str, bool]) -> None:
+        """Raises ValueError where a set names a group that the task does not have.
+
+        Args:
+            groups: Those of the task, and of each whether it is of images.
+        """
+        for name, wanted in self.obs_groups.items():
+            for group in wanted:
+                if group not in groups:
+                    known = ", ".join(groups)
+                    raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
+
     def section(self, name: str) -> dict[str, Any]:
         """Section ``name`` as rsl_rl takes it: with its ``class_name``. Nothing of it is shared with these settings."""
         return _changed(DEFAULTS[name], getattr(self, name) or {})
