@@ -19,6 +19,7 @@ from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
 from shared_store.layout import Run, Store, StoreError
+from shared_store.parent import NewRun, TeacherCopy
 from shared_store.wording import nearest
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
@@ -35,6 +36,10 @@ class Context:
     session: Session
     controller: Controller
     idempotency_key: str | None = None
+    making: NewRun | None = None
+    """The run that a submission makes, of a clone."""
+    teacher: TeacherCopy | None = None
+    """The weights that the submitted job's policy will imitate, copied already (:func:`orchestrator.api.sources.with_teacher`)."""
 
     def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""

@@ -123,7 +123,10 @@ class Loop:
     def _weights_of(self, reference: str) -> dict[str, Any]:
         """What the algorithm of another run has learnt, ``RUN`` or ``RUN@ITERATION``. All ranks call it."""
         name, _, iteration = reference.partition("@")
-        checkpoint = choose_checkpoint(self.gang, self.job.store.run(name), iteration or None)
+        run = self.job.store.run(name)
+        copy = self.job.run.teacher(name)  # made when the job was submitted, unless the teacher's run was yet to come
+        held = self.gang.tell(copy.checkpoints.is_dir())
+        checkpoint = choose_checkpoint(self.gang, copy if held else run, iteration or None)
         learnt: dict[str, Any] = load_learner(checkpoint, self.gang.device)["algorithm"]
         return learnt
 

@@ -14,6 +14,9 @@ import torch
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.extensions import RandomNetworkDistillation
 
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Store
+from shared_store.parent import TeacherCopy
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
@@ -267,6 +270,24 @@ def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_p
     copy = Path(shutil.copytree(store, tmp_path / "store"))
     shutil.rmtree(copy / "runs" / "rsl")
     assert go_on(copy, "pupil", PUPIL_RUN).algorithm.algorithm.teacher_loaded  # type: ignore[attr-defined]
+
+
+def test_a_pupil_begins_with_the_copy_of_its_teacher_that_its_run_holds(store: Path, tmp_path: Path) -> None:
+    opened = Store(Path(shutil.copytree(store, tmp_path / "store")))
+    copy = TeacherCopy(opened, "test", "rsl", list_checkpoints(opened.run("rsl"))[-1])
+    copy.copy("teacher")
+    copy.publish(opened.run("waited").path)
+    copy.close()
+    shutil.rmtree(opened.run("rsl").path)  # while the job waited
+    for reference in ("rsl", "rsl@1"):
+        settings = {**PUPIL_RUN, "teacher_checkpoint": reference}
+        begun = runner(training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl=settings)).algorithm
+        original = go_on(store, "pupil", PUPIL_RUN).algorithm.state_dict()["teacher_state_dict"]["mlp.0.weight"]
+        assert torch.equal(begun.state_dict()["teacher_state_dict"]["mlp.0.weight"], original)
+    with pytest.raises(UserError, match="run rsl has no checkpoint 2; there are: 1"):
+        runner(
+            training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl={**settings, "teacher_checkpoint": "rsl@2"})
+        )
 
 
 def test_how_often_is_saved_and_how_much_is_kept_apply_at_once(store: Path) -> None:
