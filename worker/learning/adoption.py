@@ -72,7 +72,7 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
     """What tensors alone would not show, or only in many lines. Raises UserError with the first setting that differs."""
     there = checkpoint.manifest
     if (learnt := there.get("algorithm")) != here["algorithm"]:
-        if ":" not in f"{learnt}{here['algorithm']}":
+        if not any(":" in str(name) for name in (learnt, here["algorithm"])):
             raise UserError(
                 f"the weights of checkpoint {checkpoint.name} are of algorithm {learnt}, which {here['algorithm']} can't read; set "
                 f"train.algorithm: {learnt}, or a module:Class of your own whose load_state_dict reads them"

@@ -7,8 +7,10 @@ import importlib
 import os
 import re
 import sys
+import tomllib
 from collections.abc import Mapping
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -23,7 +25,11 @@ DEFAULT = "ppo"
 
 def installed() -> dict[str, str]:
     """Where the class of each installed algorithm is (``module:Class``), by its name: the entry points ``muster.algorithms``."""
-    return {point.name: point.value for point in entry_points(group="muster.algorithms")}
+    found = {point.name: point.value for point in entry_points(group="muster.algorithms")}
+    source = Path(__file__).parents[2] / "pyproject.toml"
+    if not found and source.exists():  # a source tree on the path, which nobody installed
+        found = tomllib.loads(source.read_text())["project"]["entry-points"]["muster.algorithms"]
+    return found
 
 
 def section_of(name: str) -> str:
@@ -41,7 +47,7 @@ def find_algorithm(name: str) -> type[Algorithm]:
     place = name if ":" in name else known.get(name, "")
     module, _, attribute = place.partition(":")
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", place):
-        there = ", ".join(sorted(known)) or "none, since Muster is not installed here,"
+        there = ", ".join(sorted(known)) or "none, since no package is installed here that names any,"
         raise UserError(f"train.algorithm: there is no {shown(name)}; there are {there} and module:Class of your own")
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as a task of the user's own is found (worker.tasks)

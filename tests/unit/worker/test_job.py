@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from worker.errors import UserError
+from worker.learning import algorithms
 from worker.learning.algorithms import find_algorithm
 from worker.learning.job import Job
 
@@ -48,3 +49,9 @@ def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) 
     assert str(refused.value) == (
         f"train.algorithm: there is no {name!r}; there are ppo, rsl_rl, sac and module:Class of your own"
     )
+
+
+def test_a_source_tree_that_nobody_installed_has_the_algorithms_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = algorithms.installed()
+    monkeypatch.setattr(algorithms, "entry_points", lambda group: ())
+    assert algorithms.installed() == there and there["ppo"] == "worker.learning.ppo.fused:PPO"
