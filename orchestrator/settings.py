@@ -82,9 +82,9 @@ def effective_problem(
 
 def _named(words: str, settings: Any) -> tuple[tuple[str, ...], str]:
     """A rule over several fields begins its words with the name of one: that is the key."""
-    found = re.match(r"(\w+): ", words)
-    if found and found[1] in settings.__pydantic_fields__:
-        return (found[1],), words[found.end() :]
+    found = re.match(r"([\w.]+): ", words)
+    if found and (path := tuple(found[1].split(".")))[0] in settings.__pydantic_fields__:
+        return path, words[found.end() :]
     return (), words
 
 
