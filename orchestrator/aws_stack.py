@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import sys
 import time
@@ -19,6 +18,7 @@ from botocore.parsers import ResponseParserError
 
 from orchestrator.engines.aws_config import AwsConfig, config_path, save_config
 from orchestrator.errors import ServerError
+from shared_store.wording import nearest
 
 _PLACES = (
     Path(__file__).parent.parent / "containers" / "aws" / "muster.yaml",
@@ -74,8 +74,7 @@ class Stack:
         known = _parameters(template)
         for key in given:
             if key not in known:
-                nearest = difflib.get_close_matches(key, known, 1, cutoff=0.4)
-                hint = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(sorted(known))}"
+                hint = nearest(key, sorted(known))
                 raise ServerError(f"--parameter {key}: the template has no such parameter; {hint}")
         request: list[dict[str, Any]] = [{"ParameterKey": key, "ParameterValue": value} for key, value in given.items()]
         if existing:

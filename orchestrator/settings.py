@@ -1,7 +1,7 @@
 """What the installed algorithms and tasks accept: classes that the installation names and that are imported without torch.
 
 Algorithms (entry-point group ``muster.settings``): pydantic dataclasses. A job's YAML gives some of the fields; the others are the
-task's own, which only the rank knows. So each field is checked by itself here, and all of them together by the rank.
+task's own. Each field is checked by itself; where the class of the task's configuration is installed, all of them together, too.
 
 Tasks (entry-point group ``muster.task_settings``): the class of a task's whole configuration, by the name of the task. It has all
 defaults, so that it is made here as the rank will make it.
@@ -10,11 +10,16 @@ defaults, so that it is made here as the rank will make it.
 from __future__ import annotations
 
 import copy
+import re
+from collections.abc import Mapping
+from dataclasses import fields
 from importlib.metadata import entry_points
 from typing import Any
 
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, Field, ValidationError, create_model
 from pydantic.dataclasses import is_pydantic_dataclass
+
+from shared_store.wording import explain
 
 
 def settings_classes() -> dict[str, Any]:
@@ -43,6 +48,44 @@ def task_config(task: str) -> Any | None:
         if hasattr(loaded, "problem_with"):
             return loaded
     return None
+
+
+def effective_problem(
+    settings: Any, name: str, config: Any, given: Mapping[str, Any]
+) -> tuple[tuple[str | int, ...], str] | None:
+    """What is wrong with an algorithm's settings as its rank puts them together; None where nothing is.
+
+    Args:
+        settings: Class of the settings.
+        name: Of the algorithm.
+        config: The task's configuration, whose field of that name has the task's own settings.
+        given: By the job, in place of the task's.
+
+    Returns:
+        Keys to the value, and one line.
+    """
+    own = getattr(config, name, None)
+    base = {item.name: getattr(own, item.name) for item in fields(own) if item.init} if own is not None else {}
+    try:
+        made = settings(**{**base, **given})
+        if hasattr(made, "check_observations"):
+            made.check_observations(config.observation_groups)
+    except ValidationError as error:
+        first: Any = error.errors(include_url=False)[0]
+        if first["loc"]:
+            return first["loc"], explain(first)
+        return _named(str(first["ctx"]["error"]) if "ctx" in first else first["msg"], settings)
+    except ValueError as error:
+        return _named(str(error), settings)
+    return None
+
+
+def _named(words: str, settings: Any) -> tuple[tuple[str, ...], str]:
+    """A rule over several fields begins its words with the name of one: that is the key."""
+    found = re.match(r"([\w.]+): ", words)
+    if found and (path := tuple(found[1].split(".")))[0] in settings.__pydantic_fields__:
+        return path, words[found.end() :]
+    return (), words
 
 
 def section_of(name: str, settings: Any, base: type[BaseModel]) -> type[BaseModel]:

@@ -6,7 +6,7 @@ job model. It is carried whole in the definition's environment, so that a run ca
 
 from __future__ import annotations
 
-import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -24,7 +24,7 @@ from pydantic import (
 
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
-from orchestrator.settings import section_of, settings_classes, task_config, train_section
+from orchestrator.settings import effective_problem, section_of, settings_classes, task_config, train_section
 from orchestrator.spec_values import (
     Argument,
     Duration,
@@ -32,12 +32,11 @@ from orchestrator.spec_values import (
     JobName,
     Memory,
     RunName,
-    Settings,
     Size,
     TaskName,
 )
 from shared_store.log_files import LEAST_LIMIT, LIMIT
-from shared_store.wording import explain, kind_of, path_of
+from shared_store.wording import explain, kind_of, nearest, path_of
 
 KINDS = ("train", "evaluate", "export", "command")
 """What a job can do: exactly one of these keys is in a spec."""
@@ -88,8 +87,7 @@ def _algorithm_name(value: str) -> str:
     known = list(ALGORITHMS)
     if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
         return value
-    nearest = difflib.get_close_matches(value, known, 1)
-    hint = f"did you mean {nearest[0]}?" if nearest else f"there are {', '.join(known)}, and module:Class of your own"
+    hint = nearest(value, known, f"there are {', '.join(known)}, and module:Class of your own")
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 
@@ -103,29 +101,25 @@ class _Train(_Section):
     algorithm: Annotated[str, AfterValidator(_algorithm_name)] = Field(
         default="ppo", description="what learns: a name, or module:Class of your own; its settings stand under its name"
     )
-    settings: Settings = Field(default_factory=dict, description="of an algorithm of your own")
-    config: Settings = Field(default_factory=dict, description="overrides of the task's own configuration")
+    settings: dict[str, Any] = Field(default_factory=dict, description="of an algorithm of your own")
+    config: dict[str, Any] = Field(default_factory=dict, description="overrides of the task's own configuration")
 
-    @model_validator(mode="after")
-    def _of_one_algorithm(self) -> _Train:
-        given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(self, name)).values())]
-        given += ["settings"] if self.settings else []
-        wanted = self.algorithm if self.algorithm in ALGORITHMS else "settings"
-        if others := [name for name in given if name != wanted]:
-            raise ValueError(f"{others[0]} is not of algorithm {self.algorithm}, whose settings stand under {wanted}")
-        return self
+    @property
+    def section(self) -> str:
+        """Where the algorithm's settings belong."""
+        return self.algorithm if self.algorithm in ALGORITHMS else "settings"
 
     @model_serializer(mode="wrap")
     def _without_other_algorithms(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        others = {"settings", *ALGORITHMS} - {self.algorithm if self.algorithm in ALGORITHMS else "settings"}
+        others = {"settings", *ALGORITHMS} - {self.section}
         written: dict[str, Any] = write(self)
         return {name: value for name, value in written.items() if name not in others}
 
     def given(self) -> dict[str, Any]:
         """The algorithm's settings that the job gives."""
-        if self.algorithm not in ALGORITHMS:
+        if self.section == "settings":
             return self.settings
-        section: BaseModel = getattr(self, self.algorithm)
+        section: BaseModel = getattr(self, self.section)
         return {name: value for name, value in section.model_dump(mode="json").items() if value is not None}
 
 
@@ -225,13 +219,20 @@ class Spec(_Section):
         return max(1, self.resources.gpus)
 
 
-def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], int] | None = None) -> Spec:
+def validate(
+    value: object,
+    source: str,
+    lines: Mapping[tuple[str | int, ...], int] | None = None,
+    *,
+    merged: bool = True,
+) -> Spec:
     """A spec from a plain mapping.
 
     Args:
         value: What the YAML or a request holds.
         source: What to call it in an error (a file name).
         lines: Line of each key path in the file, for errors; 0 of one that ``--set`` gave.
+        merged: Whether what is given is also checked together with the defaults of task and algorithm, as far as they are known here.
 
     Raises:
         SpecError: One line naming the file, line and key, what was expected, and the nearest valid name.
@@ -247,19 +248,62 @@ def validate(value: object, source: str, lines: Mapping[tuple[str | int, ...], i
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
         path = tuple(part for part in path_of(first) if isinstance(part, str | int))
         raise SpecError(f"{_place(path, source, lines)}{_explain(first, path)}{more}") from None
-    if spec.train and (problem := _problem_of(spec.train)):
+    problem = _not_finite(value)
+    if not problem and spec.train:
+        problem = _of_another_algorithm(spec.train) or (_problem_of(spec.train) if merged else None)
+    if problem:
         path, words = problem
-        raise SpecError(f"{_place(('train', 'config', *path), source, lines)}{words}")
+        raise SpecError(f"{_place(path, source, lines)}{words}")
     return spec
 
 
-def _problem_of(train: _Train) -> tuple[tuple[str | int, ...], str] | None:
-    """What is wrong with the overrides of a task's configuration: the key path and the words; a task that is not installed says it on its rank."""
-    kind = task_config(train.task) if train.config else None
+_Problem = tuple[tuple[str | int, ...], str]
+"""Keys to a value of the spec, and what is wrong with it in one line."""
+
+
+def _not_finite(document: object) -> _Problem | None:
+    """The spec travels as JSON, which has no infinity."""
+    left: list[tuple[tuple[str | int, ...], Any]] = [((), document)]
+    while left:
+        path, value = left.pop()
+        if isinstance(value, float) and not math.isfinite(value):
+            return path, f"expected a finite number, found {kind_of(value)}"
+        items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        left += [((*path, key), each) for key, each in items]
+    return None
+
+
+def _of_another_algorithm(train: _Train) -> _Problem | None:
+    """Settings of an algorithm that is not the chosen one would change nothing."""
+    given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
+    given += ["settings"] if train.settings else []
+    for name in given:
+        if name != train.section:
+            words = f"the algorithm is {train.algorithm}, so its settings belong under train.{train.section}"
+            return ("train", name), words
+    return None
+
+
+def _problem_of(train: _Train) -> _Problem | None:
+    """What the rank would refuse of the task's configuration or of the algorithm's settings.
+
+    A task that is not installed says it on its rank: what it sets of the algorithm is not known here.
+    """
+    kind = task_config(train.task)
+    if kind is None:
+        return None
     try:
-        return kind.problem_with(train.config) if kind else None
+        if train.config and (problem := kind.problem_with(train.config)):
+            path, words = problem
+            return ("train", "config", *path), words
+        if settings := ALGORITHMS.get(train.algorithm):
+            problem = effective_problem(settings, train.algorithm, kind.configured(train.config), train.given())
+            if problem:
+                path, words = problem
+                return ("train", train.algorithm, *path), words
     except Exception:  # a defect of somebody's class: its rank shows the traceback
         return None
+    return None
 
 
 def override(document: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
@@ -299,8 +343,7 @@ def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
         valid, algorithm = _keys_at(path[:-1]), ALGORITHMS.get(str(path[-2])) if len(path) == 3 else None
         if other := getattr(algorithm, "elsewhere", {}).get(str(path[-1])):
             return f"{path[-2]} has no such setting; {other}"
-        nearest = difflib.get_close_matches(str(path[-1]), valid, 1, cutoff=0.5)
-        hint = f"did you mean {nearest[0]}?" if nearest else f"valid here: {', '.join(valid)}"
+        hint = nearest(path[-1], valid, "valid here: " + ", ".join(valid))
         return f"unknown key; {hint}"
     return explain(problem)
 

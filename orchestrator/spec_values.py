@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
-import math
 import re
 from importlib.metadata import entry_points
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator
 
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
 from shared_store.layout import NAME
+from shared_store.wording import nearest
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -74,9 +73,8 @@ def _task_name(value: str) -> str:
     known = known_tasks()
     if ":" in value or value in known:
         return value
-    nearest = difflib.get_close_matches(value, known, 1, cutoff=0.4)
-    hint = f"; did you mean {nearest[0]}?" if nearest else ""
-    raise ValueError(f"no task is called {shown(value)}{hint} (known: {', '.join(known)}; your own: module:Class)")
+    hint = nearest(value, known)
+    raise ValueError(f"no task is called {shown(value)}; {hint} (your own: module:Class)")
 
 
 def _environment(value: dict[str, str]) -> dict[str, str]:
@@ -96,17 +94,6 @@ def _argument(value: str) -> str:
     return value
 
 
-def _finite(value: dict[str, Any]) -> dict[str, Any]:
-    """The spec travels as JSON, which has no infinity."""
-    left: list[object] = [value]
-    while left:
-        each = left.pop()
-        if isinstance(each, float) and not math.isfinite(each):
-            raise ValueError(f"expected finite numbers, found {each}")
-        left += each.values() if isinstance(each, dict) else each if isinstance(each, list) else ()
-    return value
-
-
 def known_tasks() -> list[str]:
     """Names of the installed tasks, from the entry-point group ``muster.tasks``; nothing is imported."""
     return sorted({entry.name for entry in entry_points(group="muster.tasks")})
@@ -120,5 +107,3 @@ JobName = Annotated[str, AfterValidator(_job_name)]
 TaskName = Annotated[str, AfterValidator(_task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
 Argument = Annotated[str, AfterValidator(_argument)]
-Settings = Annotated[dict[str, Any], AfterValidator(_finite)]
-"""Settings that the class of an algorithm or a task checks."""

@@ -47,6 +47,10 @@ class Run:
     def parent(self) -> Path:
         return self.path / "parent"
 
+    def teacher(self, name: str) -> Run:
+        """Where the run holds a copy of the weights of run ``name``, which its policy imitates; they lie there as in a run."""
+        return Run(self.path / "teachers" / name)
+
     @property
     def evaluations(self) -> Path:
         return self.path / "evaluations"
@@ -70,7 +74,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent"):
+        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent", "teachers"):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:

@@ -1,8 +1,10 @@
-"""The weights with which a clone begins: the run holds a copy of them, so that nothing which befalls the source matters to it.
+"""The weights with which a clone begins: the run holds a copy of them, so the source may change or be deleted.
 
 ``parent/<checkpoint>/`` of the run has the ``learner.pt`` of the source's checkpoint and a manifest of that file alone;
 ``parent`` in ``run.json`` says where they come from. The copy is made before the run exists, under a hidden name among the runs,
 and appears with ``run.json`` by one rename.
+
+A run that imitates a teacher holds a copy of the teacher's weights in the same way: ``teachers/<run>/checkpoints/<checkpoint>/``.
 """
 
 from __future__ import annotations
@@ -30,70 +32,98 @@ class RunExists(Exception):
     """There is a run, or something else, of that name."""
 
 
-class NewRun:
-    """A run in the making that will begin with the weights of ``source``, a checkpoint of run ``parent``.
+class WeightsCopy:
+    """A copy of the weights of ``source``, a checkpoint, in the making: under a hidden name among the runs.
 
     Args:
-        store: Where both runs are.
-        owner: Of the hidden directory; the next run that the same owner makes clears away what a crash left of earlier ones.
+        store: Where the runs are.
+        owner: Of the hidden directory; the next copy that the same owner makes clears away what a crash left of earlier ones.
+        source: Whose weights.
     """
 
     _in_progress: set[Path] = set()
 
-    def __init__(self, store: Store, owner: str, parent: str, source: Checkpoint) -> None:
-        self._store, self._owner, self._parent, self._source = store, owner, parent, source
-        self._hidden = store.path / "runs" / f".{owner}.{uuid.uuid4().hex[:12]}.clone"
+    def __init__(self, store: Store, owner: str, source: Checkpoint) -> None:
+        self._store, self._owner, self.source = store, owner, source
+        self.hidden = store.path / "runs" / f".{owner}.{uuid.uuid4().hex[:12]}.clone"
         self._published: Path | None = None
 
-    def copy(self) -> None:
-        """Copy the weights, durably, and prove that they are what the source's manifest says.
+    def copy(self, place: str = "parent") -> None:
+        """Copy the weights into directory ``place``, durably, and prove that they are what the source's manifest says.
 
         Raises:
             DamagedCheckpoint: The source is missing, truncated or altered.
             OSError: The volume is full or gone.
         """
-        manifest = self._source.manifest
+        manifest = self.source.manifest
         if WEIGHTS not in manifest["files"]:
             raise DamagedCheckpoint(
-                f"checkpoint {self._source.name}: it has no {WEIGHTS}, so there are no weights in it"
+                f"checkpoint {self.source.name}: it has no {WEIGHTS}, so there are no weights in it"
             )
-        self._in_progress.add(self._hidden)
+        self._in_progress.add(self.hidden)
         self._clear_leftovers()
-        target = self._hidden / "parent" / self._source.name
+        target = self.hidden / place / self.source.name
         target.mkdir(parents=True)
         try:
-            with open_regular(self._source.path / WEIGHTS) as there, open(target / WEIGHTS, "wb") as here:
+            with open_regular(self.source.path / WEIGHTS) as there, open(target / WEIGHTS, "wb") as here:
                 shutil.copyfileobj(there, here, 1 << 20)
                 here.flush()
                 os.fsync(here.fileno())
         except DamagedFile:
-            raise DamagedCheckpoint(f"checkpoint {self._source.name}: {WEIGHTS} is not a regular file") from None
+            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is not a regular file") from None
         except (FileNotFoundError, NotADirectoryError):
-            raise DamagedCheckpoint(f"checkpoint {self._source.name}: {WEIGHTS} is missing") from None
+            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is missing") from None
         write_json(target / "manifest.json", {**manifest, "files": {WEIGHTS: manifest["files"][WEIGHTS]}})
-        Checkpoint(target, self._source.iteration, self._source.epoch).verify()
-        for each in (target, target.parent, self._hidden):
+        Checkpoint(target, self.source.iteration, self.source.epoch).verify()
+        for each in (target, target.parent, self.hidden):
             sync_directory(each)
+
+    def discard(self) -> None:
+        """Take back what was made, where it came to nothing."""
+        with suppress(OSError):
+            shutil.rmtree(self.hidden, ignore_errors=True)
+            if self._published is not None:
+                os.rename(self._published, self.hidden)
+        self.close()
+
+    def close(self) -> None:
+        """Nothing of it is under a hidden name any more."""
+        shutil.rmtree(self.hidden, ignore_errors=True)
+        self._in_progress.discard(self.hidden)
+
+    def _clear_leftovers(self) -> None:
+        with suppress(OSError):
+            for path in (self._store.path / "runs").glob(f".{self._owner}.*.clone"):
+                if path not in self._in_progress:
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+class NewRun(WeightsCopy):
+    """A run in the making that will begin with the weights of ``source``, a checkpoint of run ``parent``."""
+
+    def __init__(self, store: Store, owner: str, parent: str, source: Checkpoint) -> None:
+        super().__init__(store, owner, source)
+        self._parent = parent
 
     @property
     def lineage(self) -> dict[str, Any]:
         """``parent`` of the new run's ``run.json``."""
-        numbers = {name: self._source.manifest.get(name) for name in FACTS}
+        numbers = {name: self.source.manifest.get(name) for name in FACTS}
         return {
             "run": self._parent,
-            "checkpoint": self._source.name,
-            "iteration": self._source.iteration,
+            "checkpoint": self.source.name,
+            "iteration": self.source.iteration,
             **{name: value for name, value in numbers.items() if isinstance(value, int | float)},
         }
 
     def publish(self, name: str, description: Mapping[str, Any]) -> Run:
         """Make it the run ``name`` with this ``run.json`` (and :attr:`lineage`), by one rename. Raises RunExists, OSError."""
         run = self._store.run(name)
-        write_json(self._hidden / "run.json", {**description, "parent": self.lineage})
+        write_json(self.hidden / "run.json", {**description, "parent": self.lineage})
         if os.path.lexists(run.path):
             raise RunExists
         try:
-            os.rename(self._hidden, run.path)
+            os.rename(self.hidden, run.path)
         except OSError as error:
             if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
                 raise RunExists from None  # another controller was faster
@@ -102,24 +132,32 @@ class NewRun:
         sync_directory(run.path.parent)
         return run
 
+
+class TeacherCopy(WeightsCopy):
+    """A copy of the weights of a teacher, a checkpoint of run ``teacher``, for a run that will imitate it."""
+
+    def __init__(self, store: Store, owner: str, teacher: str, source: Checkpoint) -> None:
+        super().__init__(store, owner, source)
+        self.teacher = teacher
+
+    def publish(self, run: Path) -> None:
+        """Give it to the run in directory ``run``, by one rename; again, to another one instead. Raises OSError."""
+        place = Run(run).teacher(self.teacher).checkpoints
+        target = place / self.source.name
+        if not target.exists():
+            place.mkdir(parents=True, exist_ok=True)
+            os.rename(self._published or self.hidden / "teacher" / self.source.name, target)
+            self._published = target
+            for each in (place, *place.parents[:4]):
+                sync_directory(each)
+
     def discard(self) -> None:
-        """Take back what was made, where it came to nothing."""
-        with suppress(OSError):
-            shutil.rmtree(self._hidden, ignore_errors=True)
-            if self._published is not None:
-                os.rename(self._published, self._hidden)
-                shutil.rmtree(self._hidden, ignore_errors=True)
-        self.close()
-
-    def close(self) -> None:
-        """Nothing of it is under a hidden name any more."""
-        self._in_progress.discard(self._hidden)
-
-    def _clear_leftovers(self) -> None:
-        with suppress(OSError):
-            for path in (self._store.path / "runs").glob(f".{self._owner}.*.clone"):
-                if path not in self._in_progress:
-                    shutil.rmtree(path, ignore_errors=True)
+        """Take back what was made, and the directories that were made for it."""
+        super().discard()
+        if self._published is not None:
+            with suppress(OSError):  # one that is not empty: a run's
+                for each in self._published.parents[:4]:
+                    each.rmdir()
 
 
 def parent_checkpoint(run: Run) -> Checkpoint | None:
@@ -129,11 +167,18 @@ def parent_checkpoint(run: Run) -> Checkpoint | None:
         DamagedCheckpoint: They are missing, truncated or altered.
         DamagedFile, OSError: ``run.json`` can't be read.
     """
+    found = named_parent(run)
+    if found is not None:
+        found.verify()
+    return found
+
+
+def named_parent(run: Run) -> Checkpoint | None:
+    """:func:`parent_checkpoint`, which nobody has verified."""
     lineage = (run.description() or {}).get("parent")
     if lineage is None:
         return None
     found = checkpoint_called(run.parent, str(lineage.get("checkpoint")))
     if found is None:
         raise DamagedCheckpoint(f"run {run.name}: run.json names no checkpoint as its parent")
-    found.verify()
     return found

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 _EXPECTED = {
@@ -78,6 +79,13 @@ def explain(problem: Mapping[str, Any]) -> str:
         return f"{_EXPECTED[kind]}, found {kind_of(found)}"
     message = str(problem["msg"])
     return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
+
+
+def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:
+    """What to say of a name that is none of ``known``: the nearest of them, else ``otherwise``, or all that there are."""
+    names = list(known)
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)
+    return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
 
 
 def kind_of(value: object) -> str:

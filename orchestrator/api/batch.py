@@ -19,7 +19,9 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.models import service_model
 from orchestrator.api.permissions import Operation
+from orchestrator.api.sources import with_teacher
 from orchestrator.controller import Controller
+from shared_store.parent import TeacherCopy
 
 OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
     "RegisterJobDefinition": definitions.register_job_definition,
@@ -99,13 +101,15 @@ def call(controller: Controller, operation: str, request: object, idempotency_ke
             answer: dict[str, Any] = permissions.shown(handler(Context(session, controller), checked))
             return answer
 
-    def carry_out(session: Session) -> dict[str, Any]:
-        return handler(Context(session, controller, idempotency_key), checked)
+    def carry_out(session: Session, teacher: TeacherCopy | None = None) -> dict[str, Any]:
+        return handler(Context(session, controller, idempotency_key, teacher=teacher), checked)
 
     controller.check_writable(adds=operation.startswith(_ADDING))
     try:
         if operation == "SubmitJob":
-            response = controller.submissions.call(carry_out)
+            response = with_teacher(
+                controller, lambda teacher: controller.submissions.call(lambda session: carry_out(session, teacher))
+            )
         else:
             with controller.writing, controller.database.session() as session:
                 response = carry_out(session)

@@ -1,91 +1,98 @@
 """The rules of cloning: a new run that begins with the weights of a checkpoint, and with nothing else of it.
 
-The weights are copied when the clone is submitted (:mod:`shared_store.parent`): its job may wait for days, and the source's
-retention, or somebody who deletes the source, need not know of it.
+The weights are copied when the clone is submitted (:mod:`shared_store.parent`): its job may wait for days, so pruning or deleting
+the source does no harm.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.admission import fit_in_queue
-from orchestrator.api import batch, definitions, limits, permissions, submission
+from orchestrator.api import submission
 from orchestrator.api.context import Context
+from orchestrator.api.continuing import CONFLICT, Changes, answered, check, choose, refusal, submit
 from orchestrator.api.errors import ClientError
-from orchestrator.api.runs import CONFLICT, resized, setting_at, spec_of
+from orchestrator.api.runs import spec_of
+from orchestrator.api.sources import with_teacher
 from orchestrator.controller import Controller
-from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import shown
 from orchestrator.ownership import first_description, forget_gone_run
 from orchestrator.spec import ALGORITHMS, Spec, override, validate
 from orchestrator.tables import Job
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_checkpoint, list_checkpoints
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
-from shared_store.parent import NewRun, RunExists
+from shared_store.parent import NewRun, RunExists, TeacherCopy
+from shared_store.settings import first_difference, fixed_settings, setting_at
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What a clone is to be."""
-
-    name: str
-    """Of the new run, and of its job."""
-    checkpoint: int | Literal["best"] | None = None
-    """Iteration, or the one with the greatest score; the newest where None."""
-    assignments: tuple[str, ...] = ()
-    """``key.path=value`` changes of the source's spec."""
-    directory: str = ""
-    """Working directory of the job."""
-    nodes: int | None = None
-    """Another number of nodes."""
-
-
-def clone(controller: Controller, source: Run, wanted: Wanted, idempotency_key: str | None = None) -> dict[str, Any]:
+def clone(
+    controller: Controller, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+) -> dict[str, Any]:
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; what can be refused is refused before a job exists.
+
+    Args:
+        controller: The controller.
+        source: Whose weights.
+        name: Of the new run, and of its job.
+        changes: What is different in it, and which checkpoint is meant.
+        idempotency_key: A second call with it answers what the first one did.
 
     Raises:
         ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
+    return with_teacher(controller, lambda teacher: _clone(controller, source, name, changes, idempotency_key, teacher))
+
+
+def _clone(
+    controller: Controller,
+    source: Run,
+    name: str,
+    changes: Changes,
+    idempotency_key: str | None,
+    teacher: TeacherCopy | None,
+) -> dict[str, Any]:
     with controller.database.session() as session:
-        if earlier := _answered(Context(session, controller, idempotency_key), wanted):
+        context = Context(session, controller, idempotency_key)
+        if earlier := _answered(context, name):
             return earlier
-        spec = _changed(session, source, wanted)
-        new = Context(session, controller).run(wanted.name)
-    _check_free(new)
-    chosen = _choose(source, wanted)
-    _check_weights(source, chosen, spec)
+        spec = _changed(session, source, name, changes)
+        new = context.run(name)
+        _check_free(session, new)
+        chosen = _choose(source, changes)
+        _check_weights(source, chosen, spec)
     controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    with controller.database.session() as session:  # before the copy: not for who may not submit it
+        check(Context(session, controller), spec, changes.directory, f"clone {name}")
     controller.check_writable(adds=True)
     if shortage := controller.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
     making = NewRun(controller.store, controller.peers.id, source.name, chosen)
+    environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
     try:
         try:
             making.copy()
         except DamagedCheckpoint as error:
-            raise ClientError(
-                f"run {source.name}: {error}; choose another{_others(source, chosen)}", CONFLICT
-            ) from None
+            raise refusal(source, chosen, error) from None
         with controller.writing, controller.database.session() as session:
-            context = Context(session, controller, idempotency_key)
-            if earlier := _answered(context, wanted):
+            context = Context(session, controller, idempotency_key, making, teacher)
+            if earlier := _answered(context, name):
                 making.discard()
                 return earlier
-            _check_free(new)
+            _check_free(session, new)
             forget_gone_run(session, new)
-            answer, job = _submit(context, spec, wanted, making.lineage)
+            answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
             # before the commit: a job without its weights must not start
             making.publish(new.name, first_description(new, job, job.owner, job.queue))
     except RunExists:
         making.discard()
-        raise _exists(new) from None
+        raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         making.discard()
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
@@ -97,29 +104,26 @@ def clone(controller: Controller, source: Run, wanted: Wanted, idempotency_key: 
     return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
 
 
-def _answered(context: Context, wanted: Wanted) -> dict[str, Any] | None:
+def _answered(context: Context, name: str) -> dict[str, Any] | None:
     """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
-    job = submission.answered(context)
+    job = answered(context, name)
     if job is None:
         return None
-    if job.run != wanted.name:
-        raise ClientError(f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", 409)
     parent = (context.run(job.run).description() or {}).get("parent")
     return {**submission.answer(job), "run": job.run, "parent": parent, "kind": "train"}
 
 
-def _changed(session: Session, source: Run, wanted: Wanted) -> Spec:
+def _changed(session: Session, source: Run, name: str, changes: Changes) -> Spec:
     """The spec of the new run. Raises ClientError."""
     document = spec_of(session, source)
     if document is None:
         raise ClientError(f"run {source.name} was not started from a YAML spec: there is nothing to clone")
-    named = next((each for each in wanted.assignments if each.partition("=")[0] == "name"), None)
+    named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)
     if named is not None:
         raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")
-    changes = [*wanted.assignments, *resized(wanted.assignments, wanted.nodes), f"name={json.dumps(wanted.name)}"]
     try:
-        before = validate(document, f"run {source.name}")
-        spec = validate(override(document, changes), f"clone of run {source.name}")
+        before = validate(document, f"run {source.name}", merged=False)
+        spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
     except SpecError as error:
         raise ClientError(str(error)) from None
     for which in (before, spec):
@@ -130,38 +134,16 @@ def _changed(session: Session, source: Run, wanted: Wanted) -> Spec:
     return spec
 
 
-def _choose(source: Run, wanted: Wanted) -> Checkpoint:
-    """Raises ClientError where there is no such checkpoint."""
-    checkpoints = list_checkpoints(source)
-    there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
-    if not checkpoints:
-        raise ClientError(f"run {source.name} has no checkpoint yet, so there are no weights to begin with", 404)
-    if wanted.checkpoint is None:
-        chosen: Checkpoint | None = checkpoints[-1]
-    elif wanted.checkpoint == "best":
-        chosen = best_checkpoint(source)
-        if chosen is None:
-            raise ClientError(
-                f"run {source.name}: no checkpoint has a score yet, which is a mean over at least 100 episodes; "
-                f"name an iteration: {there}",
-                404,
-            )
-    else:
-        chosen = next((each for each in reversed(checkpoints) if each.iteration == wanted.checkpoint), None)
+def _choose(source: Run, changes: Changes) -> Checkpoint:
+    """Raises ClientError where there is no such checkpoint, or what it says of itself can't be read."""
+    chosen = choose(source, changes.checkpoint)
     if chosen is None:
-        raise ClientError(f"run {source.name} has no checkpoint of iteration {wanted.checkpoint}; it has: {there}", 404)
+        raise ClientError(f"run {source.name} has no checkpoint yet, so there are no weights to begin with", 404)
     try:
         _ = chosen.manifest
-    except NewerFormat as error:
-        raise ClientError(f"run {source.name}: {error}", CONFLICT) from None
     except DamagedCheckpoint as error:
-        raise ClientError(f"run {source.name}: {error}; choose another{_others(source, chosen)}", CONFLICT) from None
+        raise refusal(source, chosen, error) from None
     return chosen
-
-
-def _others(source: Run, chosen: Checkpoint) -> str:
-    others = [str(each.iteration) for each in list_checkpoints(source) if each.name != chosen.name]
-    return f" ({', '.join(others) or 'there is none'})"
 
 
 def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
@@ -180,45 +162,24 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
             )
         return  # whether a class of the user's own reads them, or is read, only the rank can say
     settings, given = manifest["settings"], spec.train.given()
-    may_change = getattr(ALGORITHMS.get(name), "clone_may_change", ())
-    for key in getattr(ALGORITHMS.get(name), "fixed", ()):
-        if key in may_change or (asked := setting_at(given, key)) is None or not _knows(settings, key):
-            continue
-        if asked != (there := setting_at(settings, key)):
-            raise ClientError(
-                f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(asked)}; leave the setting out"
-            )
+    fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
+    asked = [key for key in fixed if setting_at(given, key) is not None]
+    if difference := first_difference(settings, given, asked):
+        key, there, here = difference
+        raise ClientError(
+            f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
+        )
 
 
-def _knows(settings: dict[str, Any], key: str) -> bool:
-    """Whether the manifest tells the setting at all: an older Muster may not have had it."""
-    return key.partition(".")[0] in settings
+_EXISTS = "run {} exists already: give the clone another --name"
 
 
-def _check_free(new: Run) -> None:
+def _check_free(session: Session, new: Run) -> None:
     """Raises ClientError where the name is taken."""
-    if new.path.is_symlink() or new.path.exists():
-        raise _exists(new)
-
-
-def _exists(new: Run) -> ClientError:
-    return ClientError(f"run {new.name} exists already: give the clone another --name", CONFLICT)
-
-
-def _submit(context: Context, spec: Spec, wanted: Wanted, lineage: dict[str, Any]) -> tuple[dict[str, Any], Job]:
-    """Register and submit the job; nothing is committed. Raises ClientError."""
-    definition = compile_definition(spec, wanted.directory)
-    shape = gang_needs(definition["nodeProperties"]).shape
-    queue = context.queue(spec.queue)
-    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
-    if problem := fit_in_queue(context.session, context.controller.engine, queue, shape).problem:
-        raise ClientError(f"clone {wanted.name}: {problem}")
-    limits.check_document("RegisterJobDefinition", definition)
-    registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
-    environment = {"MUSTER_RUN": wanted.name, "MUSTER_PARENT": f"{lineage['run']}@{lineage['iteration']}"}
-    request = compile_submission(spec, registered["jobDefinitionArn"], environment)
-    answer = submission.submit_job(context, batch.validate("SubmitJob", request))
-    context.session.flush()
-    job = context.session.get(Job, answer["jobId"])
-    assert job is not None
-    return answer, job
+    if not (new.path.is_symlink() or new.path.exists()):
+        return
+    hint = ""
+    if session.scalars(select(Job.id).where(Job.run == new.name).limit(1)).first() is None:
+        # as after a crash between the run and its job
+        hint = f"; no job has begun it: `muster resume {new.name}` does, or delete {new.path}"
+    raise ClientError(_EXISTS.format(new.name) + hint, CONFLICT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from itertools import islice
 
@@ -20,6 +19,8 @@ from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
 from shared_store.layout import Run, Store, StoreError
+from shared_store.parent import NewRun, TeacherCopy
+from shared_store.wording import nearest
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 """Makes a submission safe to repeat after a lost answer."""
@@ -35,6 +36,10 @@ class Context:
     session: Session
     controller: Controller
     idempotency_key: str | None = None
+    making: NewRun | None = None
+    """The run that a submission makes, of a clone."""
+    teacher: TeacherCopy | None = None
+    """The weights that the submitted job's policy will imitate, copied already (:func:`orchestrator.api.sources.with_teacher`)."""
 
     def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
@@ -107,10 +112,9 @@ def find_run(controller: Controller, name: str) -> Run:
             if named is not None and is_visible(named):
                 raise ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
             runs = [each.name for each in visible_runs(session, controller.store, most=_COMPARED)]
-        nearest = difflib.get_close_matches(name, runs, 1, cutoff=0.3)
-        others = "; `muster show JOB` names a job's run" if runs else "; no run exists yet"
-        hint = f"; did you mean {nearest[0]}?" if nearest else others
-        raise ClientError(f"run {name} does not exist in {controller.store.path}{hint}", 404)
+        others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
+        hint = nearest(name, runs, others, cutoff=0.3)
+        raise ClientError(f"run {name} does not exist in {controller.store.path}; {hint}", 404)
     return run
 
 

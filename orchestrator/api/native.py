@@ -20,6 +20,7 @@ from orchestrator.admission import fit_in_queue, node_records
 from orchestrator.api import permissions, rules, run_routes, runs
 from orchestrator.api.batch import validate
 from orchestrator.api.context import controller_of, permitted_run, queue_names
+from orchestrator.api.continuing import CONFLICT
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation
@@ -272,7 +273,7 @@ def _running(controller: Controller, reference: str, operation: Operation) -> tu
         job = _job(session, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
-            raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", runs.CONFLICT)
+            raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", CONFLICT)
         with reading(job):
             main = int(job.node_properties["mainNode"])
             nodes = sorted((node["index"] for node in attempt.nodes), key=lambda index: index != main)

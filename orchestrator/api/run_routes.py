@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api import clones, permissions, runs
 from orchestrator.api.context import IDEMPOTENCY_HEADER, controller_of, permitted_run
+from orchestrator.api.continuing import Changes
 from orchestrator.api.permissions import Operation
 from shared_store.checkpoints import list_checkpoints
 from shared_store.metrics import history_of
@@ -19,25 +20,29 @@ RUNS_A_PAGE = 100
 METRICS_A_PAGE = 10_000
 
 
-class ResumeRequest(BaseModel):
-    """What to change when a run goes on."""
-
-    checkpoint: int | None = Field(default=None, description="iteration; the newest where absent")
+class _ChangesRequest(BaseModel):
     nodes: int | None = Field(default=None, ge=1, description="another number of nodes; the worlds are dealt out anew")
     set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
     directory: str = Field(default="", description="working directory of the job")
+    checkpoint: int | Literal["best"] | None = None
+
+    def changes(self) -> Changes:
+        return Changes(self.checkpoint, tuple(self.set), self.directory, self.nodes)
 
 
-class CloneRequest(BaseModel):
+class ResumeRequest(_ChangesRequest):
+    """What to change when a run goes on."""
+
+    checkpoint: int | None = Field(default=None, description="iteration; the newest where absent")
+
+
+class CloneRequest(_ChangesRequest):
     """What the new run is called, from which checkpoint it has its weights, and what is different in it."""
 
     name: str = Field(max_length=128, description="of the new run, and of its job")
     checkpoint: int | Literal["best"] | None = Field(
         default=None, description="iteration; best: the one with the greatest score; the newest where absent"
     )
-    nodes: int | None = Field(default=None, ge=1, description="another number of nodes")
-    set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
-    directory: str = Field(default="", description="working directory of the job")
 
 
 @router.get("/runs")
@@ -99,9 +104,7 @@ def resume_run(
     """Submit a job that continues the run; a second call with the same idempotency key answers what the first one did."""
     controller = controller_of(request)
     run = permitted_run(controller, name, Operation.RESUME_RUN)
-    return runs.resume(
-        controller, run, body.checkpoint, body.set, body.directory, body.nodes, idempotency_key=idempotency_key
-    )
+    return runs.resume(controller, run, body.changes(), idempotency_key)
 
 
 @router.post("/runs/{name}/clone")
@@ -114,5 +117,4 @@ def clone_run(
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key answers what the first one did."""
     controller = controller_of(request)
     run = permitted_run(controller, name, Operation.CLONE_RUN)
-    wanted = clones.Wanted(body.name, body.checkpoint, tuple(body.set), body.directory, body.nodes)
-    return clones.clone(controller, run, wanted, idempotency_key)
+    return clones.clone(controller, run, body.name, body.changes(), idempotency_key)

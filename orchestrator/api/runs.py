@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from orchestrator.admission import fit_in_queue
-from orchestrator.api import batch, definitions, limits, submission
+from orchestrator.api import submission
 from orchestrator.api.context import Context, visible_runs
+from orchestrator.api.continuing import CONFLICT, Changes, answered, choose, refusal, submit
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import visible_queues
+from orchestrator.api.sources import with_teacher
 from orchestrator.controller import Controller
-from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.definition import gang_needs
 from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
@@ -27,9 +29,8 @@ from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat,
 from shared_store.files import DamagedFile, read_json
 from shared_store.layout import LARGEST_DESCRIPTION, Run
 from shared_store.metrics import history_of
-
-CONFLICT = 409
-"""The request is well formed, but the state of things refuses it."""
+from shared_store.parent import TeacherCopy
+from shared_store.settings import first_difference, fixed_settings, setting_at
 
 
 def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
@@ -120,38 +121,38 @@ def _shown_spec(session: Session, run: Run, created: Any) -> Any:
         return created
 
 
-def resume(
-    controller: Controller,
-    run: Run,
-    checkpoint: int | None,
-    assignments: Sequence[str],
-    directory: str,
-    nodes: int | None = None,
-    idempotency_key: str | None = None,
-) -> dict[str, Any]:
+def resume(controller: Controller, run: Run, changes: Changes, idempotency_key: str | None = None) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
     Args:
         controller: The controller.
         run: The run.
-        checkpoint: Iteration to go on from; the newest checkpoint where None.
-        assignments: ``key.path=value`` changes of the spec.
-        directory: Working directory of the job.
-        nodes: Another number of nodes; the run's worlds stay the same and are dealt out anew.
+        changes: What is different from now on. The run's worlds stay the same and are dealt out anew to other nodes.
         idempotency_key: A second call with it answers what the first one did.
 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
+    return with_teacher(controller, lambda teacher: _resume(controller, run, changes, idempotency_key, teacher))
+
+
+def _resume(
+    controller: Controller, run: Run, changes: Changes, idempotency_key: str | None, teacher: TeacherCopy | None
+) -> dict[str, Any]:
     with controller.database.session() as session:
-        if earlier := _resumed(Context(session, controller, idempotency_key), run):
+        if earlier := _answered(Context(session, controller, idempotency_key), run):
             return earlier
-    chosen = _choose(run, checkpoint)  # reads all of a checkpoint: before anybody has to wait for it
+    chosen = choose(run, changes.checkpoint)
+    if chosen and changes.checkpoint is not None:
+        try:
+            chosen.verify()  # reads all of it: before anybody has to wait for it
+        except DamagedCheckpoint as error:
+            raise refusal(run, chosen, error) from None
     controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     controller.check_writable(adds=True)
     with controller.writing, controller.database.session() as session:
-        context = Context(session, controller, idempotency_key)
-        if earlier := _resumed(context, run):
+        context = Context(session, controller, idempotency_key, teacher=teacher)
+        if earlier := _answered(context, run):
             return earlier
         document = spec_of(session, run)
         if document is None:
@@ -159,38 +160,29 @@ def resume(
                 f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
             )
         try:
-            before = validate(document, f"run {run.name}")
-            spec = validate(override(document, [*assignments, *resized(assignments, nodes)]), f"run {run.name}")
+            before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
+            spec = validate(override(document, changes.all()), f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
         _check_changes(run, before, spec)
         environment = {"MUSTER_RUN": run.name}
         if spec.train:
             if chosen:
-                _check_rate(run, before, spec, assignments)
+                _check_rate(run, chosen, spec, changes.assignments)
                 _check_progress(session, run, spec, chosen)
             environment["MUSTER_WORLDS"] = str(_worlds(session, run, before, spec, chosen))
-        definition = compile_definition(spec, directory)
-        shape = gang_needs(definition["nodeProperties"]).shape
-        if problem := fit_in_queue(session, controller.engine, context.queue(spec.queue), shape).problem:
-            raise ClientError(f"run {run.name}: {problem}")
-        limits.check_document("RegisterJobDefinition", definition)
-        registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
-        if chosen and checkpoint is not None:
+        if chosen and changes.checkpoint is not None:
             environment["MUSTER_CHECKPOINT"] = chosen.name
-        request = compile_submission(spec, registered["jobDefinitionArn"], environment)
-        submitted = submission.submit_job(context, batch.validate("SubmitJob", request))
+        submitted, _ = submit(context, spec, changes.directory, f"run {run.name}", environment)
     controller.wake()
     return {**submitted, "run": run.name, "iteration": chosen.iteration if chosen else 0, "kind": spec.kind}
 
 
-def _resumed(context: Context, run: Run) -> dict[str, Any] | None:
+def _answered(context: Context, run: Run) -> dict[str, Any] | None:
     """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
-    job = submission.answered(context)
+    job = answered(context, run.name)
     if job is None:
         return None
-    if job.run != run.name:
-        raise ClientError(f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", 409)
     saved = list_checkpoints(run)
     kind = "train" if (spec_of(context.session, run) or {}).get("train") else "command"
     return {
@@ -215,82 +207,56 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't go on as {after.kind}")
         return
-    for key in ("task", "algorithm", "seed", "config"):
-        old, new = getattr(before.train, key), getattr(after.train, key)
-        if old != new:
-            raise ClientError(
-                f"run {run.name}: train.{key} is {shown(old)} and can't become {shown(new)}; start a new run for that: "
-                f"muster clone {run.name} --name NEW begins one with its weights"
-            )
-    name = after.train.algorithm
-    was, wanted = before.train.given(), after.train.given()
-    for key in getattr(ALGORITHMS.get(name), "fixed", ()):
-        if (there := setting_at(was, key)) != (here := setting_at(wanted, key)):
-            old, new = ("the task's own" if each is None else shown(each) for each in (there, here))
-            may = key in getattr(ALGORITHMS.get(name), "clone_may_change", ())
-            raise ClientError(
-                f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
-                "start a new run for that"
-                + (f": muster clone {run.name} --name NEW begins one with its weights" if may else "")
-            )
-
-
-def resized(assignments: Sequence[str], nodes: int | None) -> list[str]:
-    """The change that sets the number of ``nodes``. Raises ClientError where the ``assignments`` set it, too."""
-    if nodes is None:
-        return []
-    for assignment in assignments:
-        if assignment.partition("=")[0].partition(".")[0] == "nodes":
-            raise ClientError(
-                f"--set {excerpt(assignment, 100)}: --nodes {nodes} sets the number of nodes; give one of them"
-            )
-    return [f"nodes={nodes}"]
-
-
-def setting_at(settings: Any, key: str) -> Any:
-    """The setting ``key``, in which a dot leads into a section; None where it is not given."""
-    for part in key.split("."):
-        settings = settings.get(part) if isinstance(settings, dict) else None
-    return settings
-
-
-def _check_rate(run: Run, before: Spec, after: Spec, assignments: Sequence[str]) -> None:
-    """Refuse a learning rate that is set to what it is: an adapted rate goes on from the checkpoint, unless the setting differs."""
-    if before.train is None or after.train is None:
-        return
-    name, given = after.train.algorithm, after.train.given()
-    if name not in _RATES or (name == "ppo" and given.get("schedule") == "fixed"):
-        return
-    key, hint = _RATES[name]
-    asked = any(assignment.partition("=")[0] == f"train.{name}.{key}" for assignment in assignments)
-    rate = setting_at(given, key)
-    if asked and setting_at(before.train.given(), key) == rate:
+    was, wanted = (dict(each.train) for each in (before, after))  # type: ignore[arg-type]
+    if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
+        key, old, new = difference
         raise ClientError(
-            f"run {run.name}: train.{name}.{key} is {rate!r} already, so that the run would go on with "
-            f"the rate that its checkpoint has adapted; set another value{hint}"
+            f"run {run.name}: train.{key} is {_shown(old)} and can't become {_shown(new)}; start a new run for that: "
+            f"muster clone {run.name} --name NEW begins one with its weights"
+        )
+    name = after.train.algorithm
+    kind = ALGORITHMS.get(name)
+    if difference := first_difference(before.train.given(), after.train.given(), fixed_settings(kind)):
+        key, *values = difference
+        old, new = ("the task's own" if value is None else shown(value) for value in values)
+        may = key not in fixed_settings(kind, of_clone=True)
+        raise ClientError(
+            f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
+            "start a new run for that"
+            + (f": muster clone {run.name} --name NEW begins one with its weights" if may else "")
+        )
+
+
+def _shown(value: Any) -> str:
+    return shown({} if value is None else value)
+
+
+def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence[str]) -> None:
+    """Refuse a learning rate that would have no effect: an adapted one goes on from the checkpoint, unless the setting differs."""
+    if after.train is None or after.train.algorithm not in _RATES:
+        return
+    name = after.train.algorithm
+    key, hint = _RATES[name]
+    asked = setting_at(override({}, assignments), f"train.{name}.{key}")  # whatever section the assignment gives whole
+    if asked is None or (name == "ppo" and after.train.given().get("schedule") == "fixed"):
+        return
+    try:
+        saved = chosen.manifest
+    except DamagedCheckpoint:
+        return  # the worker uses the one before
+    rate = saved.get("learning_rate")
+    if not isinstance(asked, int | float) or not isinstance(rate, int | float):
+        return
+    differs = setting_at(saved, f"train.{name}.{key}") != asked  # then it counts
+    if not differs and not math.isclose(rate, asked, rel_tol=1e-6):  # a rate may be a float32
+        raise ClientError(
+            f"run {run.name}: train.{name}.{key} is {asked!r} already, so that the run would go on with "
+            f"the rate of its checkpoint, which is {rate:.3g} now; set another value{hint}"
         )
 
 
 _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": ("algorithm.learning_rate", "")}
 """Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
-
-
-def _choose(run: Run, iteration: int | None) -> Checkpoint | None:
-    checkpoints = list_checkpoints(run)
-    if iteration is None:
-        return checkpoints[-1] if checkpoints else None
-    matching = [checkpoint for checkpoint in checkpoints if checkpoint.iteration == iteration]
-    if not matching:
-        there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
-        raise ClientError(f"run {run.name} has no checkpoint of iteration {iteration}; it has: {there}", 404)
-    try:
-        matching[-1].verify()
-    except DamagedCheckpoint as error:
-        others = [str(each.iteration) for each in checkpoints if each.iteration != iteration]
-        raise ClientError(
-            f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT
-        ) from None
-    return matching[-1]
 
 
 def _check_progress(session: Session, run: Run, after: Spec, chosen: Checkpoint) -> None:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from orchestrator.api import permissions
 from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
+from orchestrator.controller import Controller
 from orchestrator.definition import GangNeeds
 from orchestrator.excerpts import shown
 from orchestrator.ownership import owner_of
 from orchestrator.tables import RunRecord
-from shared_store.checkpoints import list_checkpoints
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.layout import NAME
+from shared_store.parent import TeacherCopy, named_parent
 
 _TEACHER = "train.rsl_rl.teacher_checkpoint"
 
@@ -30,6 +34,8 @@ class Source:
     """Of the spec, which names it."""
     checkpoint: str = ""
     """Of a teacher: the iteration or the name of its checkpoint; the newest one where empty."""
+    reference: str = ""
+    """Of a teacher: run and checkpoint as the spec has them."""
 
 
 def sources_of(needs: GangNeeds) -> list[Source]:
@@ -38,16 +44,27 @@ def sources_of(needs: GangNeeds) -> list[Source]:
     return sorted({source for text in specs for source in _sources(text)})
 
 
-def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> None:
+class TeacherNeeded(ClientError):
+    """The job's run has to hold a copy of these weights: :func:`with_teacher` makes it and submits again."""
+
+    def __init__(self, run: str, checkpoint: Checkpoint) -> None:
+        super().__init__(f"{_TEACHER}: the weights of run {run} are not copied yet; submit it again", 503)
+        self.run, self.checkpoint = run, checkpoint
+
+
+def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> TeacherNeeded | None:
     """The runs are there and have what is read of them, unless the job waits for another one that makes them.
 
-    The caller may read them. A job that goes on with a training has its teacher in the training's checkpoint, and needs that run no
-    more. Raises ClientError.
+    The caller may read them. A run that holds its teacher already needs the teacher's run no more. Raises ClientError.
+
+    Returns:
+        The teacher's weights, where the job's run has to hold a copy of them.
     """
+    teacher = None
+    mains = set(_sources(needs.setting("MUSTER_SPEC")))
     for source in sources_of(needs):
-        run = context.run(source.run)
         is_teacher = source.key == _TEACHER
-        if is_teacher and run.is_missing() and _goes_on(context, needs):
+        if is_teacher and _is_held(context, needs, source):
             continue
         if not is_waiting:
             try:
@@ -56,25 +73,95 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> None:
                 raise ClientError(f"{source.key}: {error}" if is_teacher else str(error), error.status) from None
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source.run, queue="")
-            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, run) or nobodys)
+            permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
         if is_teacher and not is_waiting:
-            _check_checkpoint(context, source)
+            needed = TeacherNeeded(source.run, _checkpoint(context, source))
+            teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take
+    return teacher
 
 
-def _goes_on(context: Context, needs: GangNeeds) -> bool:
+def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], dict[str, Any]]) -> dict[str, Any]:
+    """Submit a job; the weights that its policy will imitate are copied first, while nobody waits for the database.
+
+    Raises ClientError.
+
+    Args:
+        controller: The controller.
+        submit: Submits it with a copy, or raises :class:`TeacherNeeded`.
+    """
+    try:
+        return submit(None)
+    except TeacherNeeded as error:
+        needed = error
+    if shortage := controller.disk.shortage("store"):
+        raise ClientError(f"{shortage}; the run has a copy of its teacher's weights", 503)
+    copy = TeacherCopy(controller.store, controller.peers.id, needed.run, needed.checkpoint)
+    try:
+        copy.copy("teacher")
+        answer = submit(copy)
+    except DamagedCheckpoint as error:
+        copy.discard()
+        raise ClientError(f"{_TEACHER}: run {needed.run}: {error}") from None
+    except OSError as error:
+        copy.discard()
+        raise ClientError(f"{_TEACHER}: the weights can't be copied ({error.strerror or error})", 503) from None
+    except BaseException:
+        copy.discard()
+        raise
+    copy.close()
+    return answer
+
+
+def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:
+    """Give the copy of its teacher to the run of a job that is being submitted. Raises TeacherNeeded where there is no copy yet, OSError."""
+    copy = context.teacher
+    if copy is None or copy.teacher != needed.run:
+        raise needed
+    if context.making is not None:
+        copy.publish(context.making.hidden)
+        return
+    there = context.run(run)
+    there.check_links()
+    copy.publish(there.path)
+
+
+def _is_held(context: Context, needs: GangNeeds, source: Source) -> bool:
+    """Whether the run has the teacher: in a checkpoint of its own, in the weights with which it begins, or as a copy."""
+    if context.making is not None:
+        return _has_teacher(context.making.source, source)
     named = needs.setting("MUSTER_RUN")
-    return bool(named) and bool(list_checkpoints(context.run(named)))
+    if not named:
+        return False
+    run = context.run(named)
+    if list_checkpoints(run):
+        return True
+    with contextlib.suppress(OSError, ValueError, DamagedCheckpoint):
+        if (parent := named_parent(run)) and _has_teacher(parent, source):
+            return True
+    return any(_is_meant(each, source) for each in list_checkpoints(run.teacher(source.run)))
 
 
-def _check_checkpoint(context: Context, source: Source) -> None:
+def _has_teacher(weights: Checkpoint, source: Source) -> bool:
+    settings = weights.manifest.get("settings")
+    return isinstance(settings, dict) and settings.get("teacher_checkpoint") == source.reference
+
+
+def _is_meant(checkpoint: Checkpoint, source: Source) -> bool:
+    return source.checkpoint in ("", str(checkpoint.iteration), checkpoint.name)
+
+
+def _checkpoint(context: Context, source: Source) -> Checkpoint:
+    """The newest checkpoint that a teacher's reference means. Raises ClientError."""
     checkpoints = list_checkpoints(context.run(source.run))
     if not checkpoints:
         raise ClientError(f"{source.key}: run {source.run} has no checkpoint yet; train it first")
-    if source.checkpoint and not any(source.checkpoint in (str(c.iteration), c.name) for c in checkpoints):
+    meant = [checkpoint for checkpoint in checkpoints if _is_meant(checkpoint, source)]
+    if not meant:
         there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
         raise ClientError(
             f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {there}"
         )
+    return meant[-1]
 
 
 def _sources(spec: str) -> Iterator[Source]:
@@ -95,4 +182,4 @@ def _sources(spec: str) -> Iterator[Source]:
         if found is None:
             raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(given)}")
         iteration = found[2] or ""
-        yield Source(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration)
+        yield Source(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(given))

@@ -17,7 +17,7 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.members import check_consumables
 from orchestrator.api.permissions import JobsOf, Operation
-from orchestrator.api.sources import check_sources
+from orchestrator.api.sources import check_sources, hold_teacher
 from orchestrator.database import note_changed
 from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.job_secrets import SecretsError
@@ -47,14 +47,18 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     queue = _queue(context, request)
     definition = context.definition(request["jobDefinition"])
     permissions.check(Operation.SUBMIT_JOB, definition)
-    job = _job(context, request, queue, definition)
+    job, needs = _job(context, request, queue, definition)
+    is_array, is_waiting = bool(request.get("arrayProperties")), bool(request.get("dependsOn"))
+    teacher = check_sources(context, needs, is_waiting)
     job.idempotency_key = _scoped(context.idempotency_key)
-    if request.get("arrayProperties"):
+    if is_array:
         _add_array(context, job, request)
     else:
         for dependency in _dependencies(context, request, None):
             job.dependencies.append(dependency)
         _release(job)
+        if teacher:
+            hold_teacher(context, job.run, teacher)
     context.session.add(job)
     return answer(job)
 
@@ -98,7 +102,9 @@ def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
     return queue
 
 
-def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition: JobDefinition) -> Job:
+def _job(
+    context: Context, request: dict[str, Any], queue: JobQueue, definition: JobDefinition
+) -> tuple[Job, GangNeeds]:
     document, name = definition.document, request["jobName"]
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
     properties = rules.substitute(_properties(document, request), parameters)
@@ -111,8 +117,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
     named = needs.setting("MUSTER_RUN")
     run = named or f"{name[:110]}-{job_id[:8]}"
     _check_run(context, run, bool(named))
-    check_sources(context, needs, is_waiting=bool(request.get("dependsOn")))
-    return Job(
+    job = Job(
         id=job_id,
         name=name,
         queue=queue.name,
@@ -131,6 +136,7 @@ def _job(context: Context, request: dict[str, Any], queue: JobQueue, definition:
         tags=request.get("tags") or {},
         created_at=now(),
     )
+    return job, needs
 
 
 def _check_secrets(context: Context, queue: JobQueue, needs: GangNeeds) -> None:

@@ -254,7 +254,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "took": _took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
         "run": detail["run"],
-        "begun with": begun_with((detail["results"] or {}).get("parent")),
+        "started from": started_from((detail["results"] or {}).get("parent")),
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
     }
     results = detail["results"] or {}
@@ -270,7 +270,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "directory": results.get("path")}
     for name, value in facts.items():
         if value:
-            console.print(f"  {name + ':':12} {value}", markup=False)
+            console.print(f"  {name + ':':13} {value}", markup=False)
     spent = 0
     for attempt in detail["attempts"]:
         started = attempt["startedAt"] is not None
@@ -295,13 +295,13 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             console.print(f"      {node['log']}", markup=False, style="dim")
 
 
-def begun_with(parent: Mapping[str, Any] | None) -> str:
+def started_from(parent: Mapping[str, Any] | None) -> str:
     """Where a clone has its weights from, in one line; nothing of a run that is no clone."""
     if not parent:
         return ""
     score = scored(parent.get("score"), parent.get("score_error"))
     told = f", score {score}" if score != "-" else ""
-    return f"the weights of {parent.get('run')}@{parent.get('iteration')} (checkpoint {parent.get('checkpoint')}{told})"
+    return f"{parent.get('run')}@{parent.get('iteration')} (checkpoint {parent.get('checkpoint')}{told})"
 
 
 def scored(score: float | None, error: float | None) -> str:

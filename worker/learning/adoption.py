@@ -1,4 +1,4 @@
-"""How a clone begins: with the weights of another run's checkpoint, of which its own run holds a copy (:mod:`shared_store.parent`)."""
+"""How a clone begins: from a copy of another run's weights, kept in its own run directory (:mod:`shared_store.parent`)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import torch
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.files import DamagedFile
 from shared_store.parent import parent_checkpoint
+from shared_store.settings import first_difference, fixed_settings
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
-from worker.learning.algorithms import BUILT_IN
+from worker.learning.algorithms import section_of
 from worker.learning.job import Job
 from worker.learning.shards import read_file
 
@@ -71,28 +72,19 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
     """What tensors alone would not show, or only in many lines. Raises UserError with the first setting that differs."""
     there = checkpoint.manifest
     if (learnt := there.get("algorithm")) != here["algorithm"]:
-        if learnt in BUILT_IN and here["algorithm"] in BUILT_IN:
+        if not any(":" in str(name) for name in (learnt, here["algorithm"])):
             raise UserError(
                 f"the weights of checkpoint {checkpoint.name} are of algorithm {learnt}, which {here['algorithm']} can't read; set "
                 f"train.algorithm: {learnt}, or a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads the other's, or is read, only the loading shows
-    may_change = getattr(algorithm.config_type, "clone_may_change", ())
-    for key in getattr(algorithm.config_type, "fixed", ()):
-        old, new = (setting_at(facts.get("settings"), key) for facts in (there, here))
-        if key not in may_change and key.partition(".")[0] in (there.get("settings") or {}) and old != new:
-            section = here["algorithm"] if here["algorithm"] in BUILT_IN else "settings"
-            raise UserError(
-                f"the weights of checkpoint {checkpoint.name} do not fit this job: {section}.{key} is {old!r} there "
-                f"and {new!r} here; leave the setting as it is there"
-            )
-
-
-def setting_at(settings: Any, key: str) -> Any:
-    """The setting ``key``, in which a dot leads into a section; None where there is none, or an empty section."""
-    for part in key.split("."):
-        settings = settings.get(part) if isinstance(settings, dict) else None
-    return None if settings == {} else settings
+    fixed = fixed_settings(algorithm.config_type, there.get("settings") or {}, of_clone=True)
+    if difference := first_difference(there.get("settings"), here["settings"], fixed):
+        key, old, new = difference
+        raise UserError(
+            f"the weights of checkpoint {checkpoint.name} do not fit this job: {section_of(here['algorithm'])}.{key} is {old!r} "
+            f"there and {new!r} here; leave the setting as it is there"
+        )
 
 
 def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:

@@ -5,38 +5,52 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+import re
 import sys
+import tomllib
 from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ArgsKwargs
 
-from shared_store.wording import explain, path_of
+from shared_store.wording import explain, nearest, path_of, shown
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
 from worker.tasks.config import TaskConfig
 
-BUILT_IN = {
-    "ppo": "worker.learning.ppo.fused:PPO",
-    "rsl_rl": "worker.learning.rsl.algorithm:RslRl",
-    "sac": "worker.learning.sac.sac:SAC",
-}
-"""Where each is."""
 DEFAULT = "ppo"
+
+
+def installed() -> dict[str, str]:
+    """Where the class of each installed algorithm is (``module:Class``), by its name: the entry points ``muster.algorithms``."""
+    found = {point.name: point.value for point in entry_points(group="muster.algorithms")}
+    source = Path(__file__).parents[2] / "pyproject.toml"
+    if not found and source.exists():  # a source tree on the path, which nobody installed
+        found = tomllib.loads(source.read_text())["project"]["entry-points"]["muster.algorithms"]
+    return found
+
+
+def section_of(name: str) -> str:
+    """The section of ``train`` that has an algorithm's settings: that of its name, or ``settings`` for a user's own."""
+    return "settings" if ":" in name else name
 
 
 def find_algorithm(name: str) -> type[Algorithm]:
     """The class of an algorithm. Raises UserError for a name of none.
 
     Args:
-        name: One of :data:`BUILT_IN`, or ``module:Class`` of a user's own, importable from the job's directory.
+        name: One of :func:`installed`, or ``module:Class`` of a user's own, importable from the job's directory.
     """
-    place = BUILT_IN.get(name, name)
-    module, sign, attribute = place.partition(":")
-    if not sign:
+    known = installed()
+    place = name if ":" in name else known.get(name, "")
+    module, _, attribute = place.partition(":")
+    if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", place):
+        there = ", ".join(sorted(known)) or "none, since no package is installed here that names any"
         raise UserError(
-            f"train.algorithm: no algorithm is called {name!r}; known: {', '.join(BUILT_IN)}, and module:Class of your own"
+            f"train.algorithm: no algorithm is called {shown(name)}; known: {there}, and module:Class of your own"
         )
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as a task of the user's own is found (worker.tasks)
@@ -65,7 +79,7 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
     Args:
         section: The job's ``train``: settings stand under the algorithm's name, those of a user's own under ``settings``.
     """
-    where = name if name in BUILT_IN else "settings"
+    where = section_of(name)
     given = section.get(where) or {}
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
@@ -92,11 +106,6 @@ def refusal(where: str, error: TypeError | ValueError) -> str:
 
 def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
     """What to say of a setting that an algorithm does not have."""
-    import difflib
-
     if key in elsewhere:
         return f"there is no such setting; {elsewhere[key]}"
-    near = difflib.get_close_matches(key, known, n=1)
-    return (
-        f"there is no such setting; {f'did you mean {near[0]}?' if near else 'there are ' + ', '.join(sorted(known))}"
-    )
+    return f"there is no such setting; {nearest(key, sorted(known))}"

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.checkpoints import DamagedCheckpoint
 from shared_store.epoch import StaleEpoch
 from shared_store.layout import Run, Store, StoreError
+from shared_store.wording import kind_of
 from worker.errors import GangError, TrainingError, UserError
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ class Job:
             raise UserError(
                 f"MUSTER_SPEC, MUSTER_EPOCH or MUSTER_JOB_EPOCH is malformed for `{kind}`: {error!r}"
             ) from error
+        _check_kinds(spec, kind)
         store = Store(env["MUSTER_STORE"])
         run = store.run(env["MUSTER_RUN"])
         chosen = env.get("MUSTER_CHECKPOINT") or None
@@ -105,6 +107,19 @@ class Job:
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise UserError(f"{name}: expected a whole number of at least {least}, got {value!r}")
         return value
+
+
+def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
+    """A job that came through the Batch API was not checked when it was submitted. Raises UserError for a section that is none."""
+    from worker.tasks.overrides import training_sections
+
+    section = spec[kind]
+    if not isinstance(algorithm := section.get("algorithm", ""), str):
+        raise UserError(f"{kind}.algorithm: expected a text, found {kind_of(algorithm)}")
+    places = {f"{kind}.{name}": section.get(name) for name in ("config", "settings", *sorted(training_sections()))}
+    for where, given in {**places, "checkpoint": spec.get("checkpoint")}.items():
+        if not isinstance(given, dict | None):
+            raise UserError(f"{where}: expected a mapping, found {kind_of(given)}")
 
 
 def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:

@@ -25,10 +25,11 @@ from shared_store.checkpoints import (
     sweep,
 )
 from shared_store.epoch import check_epoch
+from shared_store.settings import first_difference, fixed_settings, setting_at
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
-from worker.learning.algorithms import BUILT_IN
+from worker.learning.algorithms import section_of
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
@@ -264,8 +265,8 @@ class TrainingState:
     def _changed(self, checkpoint: Checkpoint) -> set[str]:
         """The algorithm's settings that differ from those of ``checkpoint``, or that the job gives and did not give there."""
         there, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        given = [("train", here["algorithm"]), ("train", "settings"), ("settings",)]
-        pairs = [(_at(there, path) or {}, _at(here, path) or {}) for path in given]
+        given = (f"train.{section_of(here['algorithm'])}", "settings")
+        pairs = [(setting_at(there, key) or {}, setting_at(here, key) or {}) for key in given]
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
@@ -275,16 +276,16 @@ class TrainingState:
             raise UserError(
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
-        fixed = getattr(self.algorithm.config_type, "fixed", ())
-        paths = [key.split(".") for key in fixed]  # a dot leads into a section
-        settings = [("settings", *path) for path in paths if path[0] in there["settings"]]
-        for path in [("task",), ("algorithm",), *(("train", key) for key in ("seed", "config")), *settings]:
-            old, new = _at(there, path), _at(here, path)
-            if old != new:
-                raise UserError(
-                    f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {_called(path, there)} is "
-                    f"{old!r} there and {new!r} here; start a new run for that (`muster clone` begins one with its weights)"
-                )
+        settings = [f"settings.{key}" for key in fixed_settings(self.algorithm.config_type, there["settings"])]
+        difference = first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings])
+        if difference:
+            key, old, new = difference
+            if key in settings:  # as a job's YAML calls it
+                key = f"{section_of(there['algorithm'])}.{key.removeprefix('settings.')}"
+            raise UserError(
+                f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
+                "here; start a new run for that (`muster clone` begins one with its weights)"
+            )
 
     def _load_worlds(self, checkpoint: Checkpoint) -> None:
         total, bounds = checkpoint.manifest["worlds"], checkpoint.manifest["shards"]
@@ -308,15 +309,3 @@ class TrainingState:
 
 _OF_ALGORITHM = "algorithm/"
 """Prefix of the names of an algorithm's per-world state."""
-
-
-def _called(path: tuple[str, ...], manifest: Any) -> str:
-    """How a job's YAML calls it: settings stand under the algorithm's name."""
-    name = manifest["algorithm"]
-    return ".".join((name if part == "settings" and name in BUILT_IN else part) for part in path)
-
-
-def _at(facts: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        facts = facts.get(key) if isinstance(facts, dict) else None
-    return None if facts == {} else facts  # overrides that are empty and overrides that are missing are the same

@@ -36,7 +36,9 @@ def give_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint
 def _learnt(job: Job, gang: Gang, reference: str) -> dict[str, Any]:
     """The algorithm's state in the checkpoint ``RUN`` or ``RUN@ITERATION``."""
     name, _, iteration = reference.partition("@")
-    checkpoint = choose_checkpoint(gang, job.store.run(name), iteration or None)
+    copy = job.run.teacher(name)  # made when the job was submitted, unless the teacher's run was yet to come
+    held = gang.tell(copy.checkpoints.is_dir())
+    checkpoint = choose_checkpoint(gang, copy if held else job.store.run(name), iteration or None)
     if "algorithm" not in checkpoint.manifest:
         raise UserError(
             f"teacher_checkpoint: checkpoint {checkpoint.name} of run {name} is of an older Muster, which knew no algorithms; "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,6 +11,8 @@ import mujoco_warp
 import newton
 import warp as wp
 from newton.solvers import SolverMuJoCo
+
+from shared_store.wording import nearest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -217,9 +218,7 @@ def _check_options(options: Mapping[str, Any]) -> None:
         if name in _SET_HERE:
             raise ValueError(f"solver_options: {name} is always {_SET_HERE[name]} here; leave it out")
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-            raise ValueError(f"solver_options: SolverMuJoCo has no option {name!r}; {hint}")
+            raise ValueError(f"solver_options: SolverMuJoCo has no option {name!r}; {nearest(name, known)}")
 
 
 def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.Control) -> None:

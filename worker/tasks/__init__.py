@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
+
+from shared_store.wording import nearest
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
@@ -41,9 +42,7 @@ def find_task(name: str) -> type[Task]:
     known = task_names()
     where = name if ":" in name else known.get(name)
     if where is None:
-        nearest = difflib.get_close_matches(name.lower(), [task.lower() for task in known], n=1, cutoff=0.5)
-        hint = "".join(f"; did you mean {task}?" for task in known if task.lower() in nearest)
-        raise ValueError(f"no task is called {name!r}{hint or '.'} Known tasks: {', '.join(known)}, or module:Class")
+        raise ValueError(f"no task is called {name!r}; {nearest(name, known)} (your own: module:Class)")
     module_name, _, class_name = where.partition(":")
     if name == where and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a user's module lies where the job was submitted; ours are never hidden by it

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, WrapValidator
 from pydantic.dataclasses import dataclass
 
-from shared_store.wording import shown
+from shared_store.wording import nearest, shown
 from worker.learning.ppo.settings import PPOConfig
-from worker.tasks.overrides import TRAINING, Refused, configured, expecting, from_mapping, nearest
+from worker.tasks.overrides import Refused, configured, expecting, from_mapping, training_sections
 
 STRICT = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
 """How the classes of configurations check: no unknown field, and no value of another type."""
@@ -139,20 +139,6 @@ def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
     return points[0][1] if iteration < points[0][0] else points[-1][1]
 
 
-def nested(where: str, kind: type[Any], value: Any) -> Any:
-    """``value``, or, where it is a mapping of its fields, the ``kind`` of configuration made of it.
-
-    Raises:
-        ValueError: A field is unknown or out of range.
-    """
-    if not isinstance(value, Mapping):
-        return value
-    try:
-        return kind(**value)
-    except TypeError as error:
-        raise ValueError(f"{where}: {error}") from error
-
-
 def reward_weights(**weights: float) -> Any:
     """The ``rewards`` field of a task's configuration: its terms in the order of the kernel's indices, with their weights.
 
@@ -211,17 +197,27 @@ class TaskConfig(_Common):
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
         """What is wrong with a job's ``train.config``: keys to the value, and one line; None where nothing is."""
         try:
-            configured(cls, overrides)
+            cls.configured(overrides)
         except Refused as refused:
             return refused.path, refused.words
         return None
+
+    @classmethod
+    def configured(cls, overrides: Mapping[str, Any]) -> TaskConfig:
+        """The configuration with a job's ``train.config``. Raises Refused."""
+        return configured(cls, overrides)
+
+    @property
+    def observation_groups(self) -> Mapping[str, bool]:
+        """The task's observation groups, and of each whether it is of images."""
+        return {"policy": getattr(self, "camera", None) is not None, "critic": False}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         """JSON Schema of ``train.config``: the names of the terms, without what stands in sections of its own."""
         document: dict[str, Any] = handler.resolve_ref_schema(handler(core_schema))
         properties, known = document["properties"], default_rewards(cls)
-        for name in TRAINING:
+        for name in training_sections():
             properties.pop(name, None)
         points = TypeAdapter(Points).json_schema()
         for name, terms in (

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
+from shared_store.wording import nearest
 from worker.simulation.episodes import ACTION_LIMIT
 
 
@@ -102,9 +102,7 @@ def deviations(noise: float | Mapping[str, float], observations: tuple[Observati
         fitting = [index for index in measured if fnmatchcase(observations[index].name, pattern)]
         if not fitting:
             names = [observations[index].name for index in measured]
-            near = difflib.get_close_matches(pattern, names, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
-            raise ValueError(f"no observation that is measured is called {pattern!r}; {hint}")
+            raise ValueError(f"no observation that is measured is called {pattern!r}; {nearest(pattern, names)}")
         for index in fitting:
             found[index] = deviation * abs(observations[index].scale)
     return found

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-from collections.abc import Callable, Iterable, Mapping
+import functools
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
 from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidator
 from pydantic.errors import PydanticUserError
 from pydantic_core import ArgsKwargs
 
-from shared_store.wording import Path, explain
+from shared_store.wording import Path, explain, nearest
 from shared_store.wording import Refused as Refused
 
 C = TypeVar("C")
 
-TRAINING = ("ppo", "sac", "rsl_rl")
-"""Fields that say how a task is trained: the job's YAML changes them in sections of their own."""
+
+@functools.cache
+def training_sections() -> frozenset[str]:
+    """Fields that say how a task is trained, by the names of the installed algorithms: a job's YAML changes them in sections of their own."""
+    return frozenset(point.name for point in entry_points(group="muster.settings"))
 
 
 def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
@@ -40,9 +44,9 @@ def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
 
 
 def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mapping[str, Any], where: Path) -> C:
-    known = [item.name for item in dataclasses.fields(kind) if item.init and item.name not in TRAINING]  # type: ignore[arg-type]
+    known = [item.name for item in dataclasses.fields(kind) if item.init and item.name not in training_sections()]  # type: ignore[arg-type]
     for key, value in overrides.items():
-        if key in TRAINING and not where:
+        if key in training_sections() and not where:
             raise Refused((key,), f"not a key of {kind.__name__}; settings of {key} stand under train.{key}")
         if key not in known:
             raise Refused((*where, key), f"{kind.__name__} has no such key; {nearest(key, sorted(known))}")
@@ -89,12 +93,6 @@ def _keys(path: Path, value: Any) -> Path:
             return path[: max(place, 1)]
         value = value[key]
     return path
-
-
-def nearest(name: object, known: Iterable[str]) -> str:
-    """What to say of a name that is none of ``known``."""
-    near = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(known) or 'none'}"
 
 
 def expecting(words: str) -> WrapValidator:

@@ -12,7 +12,7 @@ import pytest
 
 from shared_store.checkpoints import FORMAT, list_checkpoints
 from shared_store.layout import Run, Store
-from shared_store.parent import parent_checkpoint
+from shared_store.parent import NewRun, parent_checkpoint
 from tests.conftest import Serving
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
@@ -96,7 +96,7 @@ def test_the_newest_a_named_and_the_best_checkpoint(
 def test_show_and_checkpoints_say_where_the_weights_are_from_and_how_sure_the_score_is(full: Serving) -> None:
     clone(full, "taught@best", "shown")
     said = " ".join(full.muster("show", "shown").stdout.split())
-    assert "begun with: the weights of taught@6 (checkpoint 00000006-e1, score 9.25 ± 0.25)" in said
+    assert "started from: taught@6 (checkpoint 00000006-e1, score 9.25 ± 0.25)" in said
     listed = full.muster("checkpoints", "taught").stdout
     assert "9.25 ± 0.25" in listed and "the best" in next(line for line in listed.splitlines() if "9.25" in line)
     (first, *_) = full.client.get("/api/runs/taught/checkpoints")
@@ -184,6 +184,8 @@ def test_a_second_call_with_the_same_key_answers_what_the_first_did(full: Servin
         ("taught", "x", ("--set", "name=y"), 2, ["--set name=y: a clone has the name that --name gives it"]),
         ("taught", "x", ("--nodes", "9"), 2, ["clone x: "]),
         ("taught", "x", ("--queue", "nowhere"), 2, ["Job queue nowhere does not exist"]),
+        # before the weights are read: those of iteration 4 are damaged
+        ("altered", "x", ("--queue", "nowhere"), 2, ["Job queue nowhere does not exist"]),
         ("taught", "x", ("--queue", "default", "--engine", "local"), 2, ["leave one of them out"]),
     ],
 )
@@ -221,6 +223,19 @@ def test_what_a_crash_left_of_an_earlier_clone_is_cleared_away(full: Serving, st
         (path / "parent").mkdir(parents=True)
     clone(full, "taught", "after-crash")
     assert not leftover.exists() and foreign.exists(), "only the controller that made it knows that nobody works on it"
+
+
+def test_a_run_that_a_crash_left_without_its_job_says_what_to_do(full: Serving, store: Store) -> None:
+    making = NewRun(store, "crashed", "taught", list_checkpoints(store.run("taught"))[0])
+    making.copy()
+    making.publish("orphan", {"run": "orphan", "created": 1, "spec": {**SPEC, "name": "orphan"}, "queue": "default"})
+    making.close()
+    said = refused(full, 1, "taught", "orphan")
+    assert (
+        "run orphan exists already" in said and "no job has begun it: `muster resume orphan` does, or delete " in said
+    )
+    assert full.client.post("/api/runs/orphan/resume", {})["iteration"] == 0
+    assert "no job has begun it" not in refused(full, 1, "taught", "orphan")
 
 
 # -- the teacher ------------------------------------------------------------------------------------------------------
@@ -264,3 +279,71 @@ def test_a_run_that_goes_on_has_its_teacher_and_needs_the_teacher_s_run_no_more(
     add_run(store, "pupil", json.loads(Path(student(tmp_path, "late")).read_text()))
     add_checkpoint(store, "pupil", 1, algorithm="rsl_rl", settings={"teacher_checkpoint": "late"})
     assert full.client.post("/api/runs/pupil/resume", {})["iteration"] == 1
+
+
+def held(run: Run, teacher: str) -> list[bytes]:
+    return [(each.path / "learner.pt").read_bytes() for each in list_checkpoints(run.teacher(teacher))]
+
+
+def test_a_submitted_job_has_its_teacher_s_weights_whatever_becomes_of_the_teacher(
+    full: Serving, store: Store, tmp_path: Path
+) -> None:
+    add_run(store, "mentor")
+    for iteration in (2, 4):
+        add_checkpoint(store, "mentor", iteration, f"weights {iteration}".encode())
+    add_checkpoint(store, "mentor", 6)
+    hidden = {path.name for path in (store.path / "runs").glob(".*.clone")}
+    for reference, expected in (("mentor@4", b"weights 4"), ("mentor@00000002-e1", b"weights 2")):
+        done = full.muster("submit", student(tmp_path, reference), "--json")
+        assert done.returncode == 0, done.stderr
+        job = json.loads(done.stdout)["jobId"]
+        run = store.run(full.detail(job)["run"])
+        assert held(run, "mentor") == [expected] and run.is_missing()
+    shutil.rmtree(store.run("mentor").path)
+    assert held(run, "mentor") == [b"weights 2"]
+    refusal = full.muster("submit", student(tmp_path, "mentor@4"))
+    assert refusal.returncode == 2 and "run mentor does not exist" in refusal.stderr
+    assert {path.name for path in (store.path / "runs").glob(".*.clone")} == hidden
+
+
+def test_a_teacher_whose_weights_are_damaged_is_refused_at_submission(
+    full: Serving, store: Store, tmp_path: Path
+) -> None:
+    add_run(store, "broken")
+    (add_checkpoint(store, "broken", 2).path / "learner.pt").write_bytes(b"WEIGHTS")
+    runs = sorted(path.name for path in (store.path / "runs").iterdir())
+    done = full.muster("submit", student(tmp_path, "broken"))
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert (
+        "train.rsl_rl.teacher_checkpoint: run broken: checkpoint 00000002-e1: the content of learner.pt" in done.stderr
+    )
+    assert sorted(path.name for path in (store.path / "runs").iterdir()) == runs
+
+
+@pytest.mark.parametrize("fate", ["pruned", "deleted"])
+def test_who_has_the_teacher_s_weights_needs_the_teacher_no_more(
+    full: Serving, store: Store, tmp_path: Path, fate: str
+) -> None:
+    teacher, pupil = f"teacher-{fate}", f"pupil-{fate}"
+    if fate == "pruned":
+        add_run(store, teacher)
+        add_checkpoint(store, teacher, 9)
+    add_run(store, pupil, json.loads(Path(student(tmp_path, f"{teacher}@3")).read_text()))
+    settings = {"teacher_checkpoint": f"{teacher}@3"}
+    add_checkpoint(store, pupil, 1, b"pupil", algorithm="rsl_rl", settings=settings)
+    assert full.client.post(f"/api/runs/{pupil}/resume", {})["iteration"] == 1
+    job = clone(full, pupil, f"heir-{fate}")["jobId"]
+    assert weights(store.run(f"heir-{fate}")) == b"pupil"
+    full.client.batch("TerminateJob", jobId=job, reason="test")
+    full.wait(job)
+    assert full.client.post(f"/api/runs/heir-{fate}/resume", {})["iteration"] == 0
+
+
+def test_a_clone_that_names_another_teacher_holds_that_one(full: Serving, store: Store, tmp_path: Path) -> None:
+    add_run(store, "pupil-of-two", json.loads(Path(student(tmp_path, "gone@3")).read_text()))
+    settings = {"teacher_checkpoint": "gone@3"}
+    add_checkpoint(store, "pupil-of-two", 1, b"pupil", algorithm="rsl_rl", settings=settings)
+    clone(full, "pupil-of-two", "of-another", "--set", "train.rsl_rl.teacher_checkpoint=taught@3")
+    assert held(store.run("of-another"), "taught") == [b"three"] and weights(store.run("of-another")) == b"pupil"
+    said = refused(full, 2, "pupil-of-two", "of-none", "--set", "train.rsl_rl.teacher_checkpoint=taught@4")
+    assert "run taught has no checkpoint of iteration 4" in said

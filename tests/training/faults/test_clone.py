@@ -19,7 +19,7 @@ from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
 from worker.errors import UserError
 from worker.learning import loop as loops
-from worker.learning.algorithms import BUILT_IN
+from worker.learning.algorithms import installed
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
 
@@ -231,7 +231,7 @@ def test_an_algorithm_of_ones_own_may_read_another_s_weights(store: Path) -> Non
     begun = begin(store, algorithm=f"{__name__}:Reader", settings=settings)
     weights = learnt(last(store, "ppo"))["policy"]["mlp.0.weight"]
     assert torch.equal(begun.algorithm.actor.layers[0].weight, weights)  # type: ignore[attr-defined]
-    assert "reader" not in BUILT_IN
+    assert "reader" not in installed()
 
 
 @pytest.mark.parametrize("harm", ["missing", "altered", "all of it"])

@@ -90,7 +90,6 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
         ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is the task's own and can't become [8]", "has learnt"]),
         ("train.ppo.activation=relu", ["train.ppo.activation is the task's own and can't become 'relu'"]),
         ("train.ppo.init_std=0.5", ["train.ppo.init_std is the task's own and can't become 0.5", "has learnt"]),
-        ("train.ppo.learning_rate=1.0e-3", ["train.ppo.learning_rate is 0.001 already", "train.ppo.schedule=fixed"]),
         ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 nodes × 1 ranks × 9)", "leave train.worlds"]),
         ("nodes=9", ["8 worlds can't be dealt out to 9 ranks; use fewer nodes"]),
     ],
@@ -100,6 +99,20 @@ def test_another_task_seed_network_or_number_of_worlds(
 ) -> None:
     said = refused(served, 2, "--set", change)
     assert all(part in said for part in (served[1], *parts)), said
+
+
+def test_a_learning_rate_that_the_checkpoint_s_job_had_and_that_has_adapted_since(served: tuple[Serving, str]) -> None:
+    server, run = served
+    newest = list_checkpoints(Store(server.home / "store").run(run))[-1]
+    rate = newest.manifest["learning_rate"]
+    edit_manifest(newest, learning_rate=4e-4)
+    try:
+        for form in ("train.ppo.learning_rate=1.0e-3", "train.ppo={learning_rate: 0.001}"):
+            said = refused(served, 2, "--set", form)
+            assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
+            assert "or train.ppo.schedule=fixed" in said
+    finally:
+        edit_manifest(newest, learning_rate=rate)
 
 
 def test_a_checkpoint_of_a_newer_format(served: tuple[Serving, str]) -> None:

@@ -17,6 +17,7 @@ from rsl_rl.extensions import RandomNetworkDistillation
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
+from shared_store.parent import TeacherCopy
 from tests.support.worker.clones import make_clone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
@@ -229,8 +230,8 @@ def test_a_setting_of_rsl_rl_that_its_state_holds_is_refused(store: Path, run: s
     with pytest.raises(UserError) as error:
         go_on(store, run, with_value(settings, key, value))
     said = str(error.value)
-    if key == "algorithm.class_name" and run == "pupil":  # PPO has no student
-        assert "rsl_rl.student: PPO has the networks actor and critic" in said
+    if key == "algorithm.class_name" and run == "pupil":
+        assert "teacher_checkpoint: PPO has no teacher; leave it out" in said
     else:
         assert f"rsl_rl.{name}" in said and " there and " in said and "start a new run for that" in said, said
 
@@ -271,6 +272,24 @@ def test_a_pupil_that_goes_on_needs_its_teacher_s_run_no_more(store: Path, tmp_p
     copy = Path(shutil.copytree(store, tmp_path / "store"))
     shutil.rmtree(copy / "runs" / "rsl")
     assert go_on(copy, "pupil", PUPIL_RUN).algorithm.algorithm.teacher_loaded  # type: ignore[attr-defined]
+
+
+def test_a_pupil_begins_with_the_copy_of_its_teacher_that_its_run_holds(store: Path, tmp_path: Path) -> None:
+    opened = Store(Path(shutil.copytree(store, tmp_path / "store")))
+    copy = TeacherCopy(opened, "test", "rsl", list_checkpoints(opened.run("rsl"))[-1])
+    copy.copy("teacher")
+    copy.publish(opened.run("waited").path)
+    copy.close()
+    shutil.rmtree(opened.run("rsl").path)  # while the job waited
+    for reference in ("rsl", "rsl@1"):
+        settings = {**PUPIL_RUN, "teacher_checkpoint": reference}
+        begun = runner(training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl=settings)).algorithm
+        original = go_on(store, "pupil", PUPIL_RUN).algorithm.state_dict()["teacher_state_dict"]["mlp.0.weight"]
+        assert torch.equal(begun.state_dict()["teacher_state_dict"]["mlp.0.weight"], original)
+    with pytest.raises(UserError, match="run rsl has no checkpoint 2; there are: 1"):
+        runner(
+            training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl={**settings, "teacher_checkpoint": "rsl@2"})
+        )
 
 
 def test_how_often_is_saved_and_how_much_is_kept_apply_at_once(store: Path) -> None:

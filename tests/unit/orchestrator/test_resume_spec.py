@@ -11,11 +11,15 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
+from orchestrator.api.continuing import Changes
 from orchestrator.api.errors import ClientError
-from orchestrator.api.runs import _check_changes, _check_rate, resized, setting_at
+from orchestrator.api.runs import _check_changes, _check_rate
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.spec import ALGORITHMS, Spec, override, validate
-from shared_store.layout import Run
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Run, Store
+from shared_store.settings import setting_at
+from tests.support.orchestrator.trained import add_checkpoint, add_run
 
 RUN = Run(Path("/store/runs/ant"))
 TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
@@ -116,7 +120,7 @@ def changed(kind: str, *assignments: str, **train: Any) -> tuple[Spec, Spec]:
     document: dict[str, Any] = {"name": "ant", **KINDS[kind]}
     if train:
         document["train"] = {**TRAIN, **train}
-    return validate(document, "run ant"), validate(override(document, assignments), "run ant")
+    return validate(document, "run ant"), validate(override(document, assignments), "run ant", merged=False)
 
 
 def requests_of(spec: Spec) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -162,7 +166,7 @@ def accepted_value(name: str, key: str) -> str:
     for probe in PROBES:
         try:
             document = {"name": "a", "train": {**TRAIN, "algorithm": name}}
-            spec = validate(override(document, [f"train.{name}.{key}={probe}"]), "x")
+            spec = validate(override(document, [f"train.{name}.{key}={probe}"]), "x", merged=False)
         except Exception:
             continue
         assert spec.train is not None
@@ -189,28 +193,80 @@ def test_each_setting_of_an_algorithm_is_carried_to_the_rank_or_refused_by_name(
             assert carried(f"train.{name}.{item.name}")(*requests_of(after)) is not None
 
 
+VALUES = {
+    "num_outputs": 5,
+    "predictor_hidden_dims": [9],
+    "target_hidden_dims": [9],
+    "activation": "tanh",
+    "state_normalization": "true",
+    "reward_normalization": "true",
+    "learning_rate": 0.5,
+    "optimizer": "sgd",
+}
+"""Another one, where a text is none."""
+
+
 @pytest.mark.parametrize("key", [key for key in ALGORITHMS["rsl_rl"].fixed if "." in key])
 def test_what_is_fixed_inside_a_section_is_refused_by_its_whole_name(key: str) -> None:
-    before, after = changed("train", f"train.rsl_rl.{key}=other", algorithm="rsl_rl")
-    with pytest.raises(
-        ClientError, match=rf"train\.rsl_rl\.{key} is the task's own and can't become 'other'.*clone ant"
-    ):
+    required = {"num_outputs": 4, "weight": 1.0, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}
+    curious = {"algorithm": {"rnd_cfg": required}} if "rnd_cfg" in key else {}
+    value = VALUES.get(key.rpartition(".")[2], "other")
+    before, after = changed("train", f"train.rsl_rl.{key}={value}", algorithm="rsl_rl", rsl_rl=curious)
+    with pytest.raises(ClientError, match=rf"train\.rsl_rl\.{key} is .* and can't become .*clone ant"):
         _check_changes(RUN, before, after)
 
 
-@pytest.mark.parametrize(("name", "key"), [("ppo", "learning_rate"), ("rsl_rl", "algorithm.learning_rate")])
-def test_a_learning_rate_that_is_set_already_would_change_nothing_and_is_refused(name: str, key: str) -> None:
-    assignment = f"train.{name}.{key}=0.001"
-    before = changed("train", assignment, algorithm=name)[1]
-    with pytest.raises(ClientError, match=rf"train\.{name}\.{key} is 0.001 already, .* has adapted; set another value"):
-        _check_rate(RUN, before, before, [assignment])
-    _check_rate(RUN, changed("train", algorithm=name)[0], before, [assignment])
+RATES = [("ppo", "learning_rate"), ("rsl_rl", "algorithm.learning_rate")]
+FORMS = {
+    "ppo": ["train.ppo.learning_rate=0.001", "train.ppo={learning_rate: 0.001}"],
+    "rsl_rl": [
+        "train.rsl_rl.algorithm.learning_rate=0.001",
+        "train.rsl_rl.algorithm={learning_rate: 0.001}",
+        "train.rsl_rl={algorithm: {learning_rate: 0.001}}",
+    ],
+}
+"""How ``--set`` may give the rate of each algorithm that adapts it."""
+
+
+def saved_with(path: Path, rate: float, name: str, *assignments: str) -> Checkpoint:
+    """A checkpoint whose rate is this one now, of a job with these settings."""
+    store = Store(path / "store").open()
+    add_run(store, "ant")
+    train = override({"train": {"algorithm": name}}, assignments)["train"]
+    return add_checkpoint(store, "ant", 1, algorithm=name, train=train, learning_rate=rate)
+
+
+@pytest.mark.parametrize(("name", "form"), [(name, form) for name in FORMS for form in FORMS[name]])
+def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_it_is_given(
+    tmp_path: Path, name: str, form: str
+) -> None:
+    key = dict(RATES)[name]
+    chosen = saved_with(tmp_path, 0.0004, name, f"train.{name}.{key}=0.001")
+    after = changed("train", form, algorithm=name)[1]
+    with pytest.raises(ClientError) as refused:
+        _check_rate(RUN, chosen, after, [form])
+    assert str(refused.value).startswith(
+        f"run ant: train.{name}.{key} is 0.001 already, so that the run would go on with the rate of its checkpoint, "
+        "which is 0.0004 now; set another value"
+    )
+    _check_rate(RUN, chosen, after, ["train.iterations=9"])
+
+
+@pytest.mark.parametrize(("name", "key"), RATES)
+def test_a_learning_rate_that_takes_effect_or_is_in_effect_is_accepted(tmp_path: Path, name: str, key: str) -> None:
+    form = f"train.{name}.{key}=0.001"
+    after = changed("train", form, algorithm=name)[1]
+    _check_rate(RUN, saved_with(tmp_path / "new", 0.0004, name), after, [form])
+    _check_rate(RUN, saved_with(tmp_path / "other", 0.0004, name, f"train.{name}.{key}=0.002"), after, [form])
+    # a fixed rate: the checkpoint has the one that is asked for, as ppo keeps it
+    _check_rate(RUN, saved_with(tmp_path / "fixed", 0.0010000000474974513, name, form), after, [form])
 
 
 def test_two_options_that_say_the_same_are_refused() -> None:
-    assert resized(["train.iterations=3"], 4) == ["nodes=4"] and resized(["nodes=2"], None) == []
+    assert Changes(assignments=("train.iterations=3",), nodes=4).all() == ["train.iterations=3", "nodes=4"]
+    assert Changes(assignments=("nodes=2",)).all() == ["nodes=2"]
     for assignment in ("nodes=2", "nodes.max=2"):
         with pytest.raises(
             ClientError, match=rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
         ):
-            resized([assignment], 4)
+            Changes(assignments=(assignment,), nodes=4).all()

@@ -44,7 +44,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
 
 LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
-TASKS = "(known: Ant, Cartpole, CartpolePixels, Humanoid, Quadruped; your own: module:Class)"
+TASKS = "Ant, Cartpole, CartpolePixels, Humanoid, Quadruped"
 TOP = (
     "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, logs, retry, "
     "on_child_failure, timeout, stall_timeout"
@@ -149,10 +149,10 @@ WRONG_VALUES = {
     ),
     "name: a\ntrain: Cartpole\n": "job.yaml:2: train: expected a mapping, found a text ('Cartpole')",
     "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": (
-        f"job.yaml:2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? {TASKS}"
+        "job.yaml:2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class)"
     ),
     "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
-        f"job.yaml:2: train.task: no task is called 'zzz' {TASKS}"
+        f"job.yaml:2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class)"
     ),
     ppo("schedule: adaptiv"): "job.yaml:6: train.ppo.schedule: expected 'adaptive' or 'fixed', found 'adaptiv'",
     ppo("gamma: 1.5"): "job.yaml:6: train.ppo.gamma: expected a value less than or equal to 1, found 1.5",
@@ -279,7 +279,7 @@ def test_overriding_leaves_the_document_as_it_was() -> None:
         ),
         (
             "train.config={a: .inf}",
-            "--set: train.config: expected finite numbers, found inf",
+            "--set: train.config.a: expected a finite number, found a number (inf)",
         ),
         (
             f"{'a.' * 60}a=1",
@@ -385,17 +385,8 @@ def test_the_worker_accepts_of_each_setting_of_ppo_what_the_job_file_accepts(nam
         try:
             PPOConfig(**{name: value})
             made = True
-        except ValueError as error:
-            # the job file can't know what the task sets besides
-            made = any(
-                text in str(error)
-                for text in (
-                    "channels, kernel_sizes and strides",
-                    "adam has none",
-                    "the least, then the greatest",
-                    "minibatches need",
-                )
-            )
+        except ValueError:
+            made = False
         assert written == made, value
 
 

@@ -12,7 +12,7 @@ import pytest
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, retain
 from shared_store.files import DamagedFile
 from shared_store.layout import Store
-from shared_store.parent import NewRun, RunExists, parent_checkpoint
+from shared_store.parent import NewRun, RunExists, TeacherCopy, parent_checkpoint
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 
 
@@ -151,3 +151,59 @@ def test_the_best_goes_by_the_score_and_never_by_the_reward(store: Store) -> Non
     assert best() == "00000003-e1"
     add_run(store, "idle")
     assert best_checkpoint(store.run("idle")) is None
+
+
+# -- the teacher ------------------------------------------------------------------------------------------------------
+
+
+def copy_of_teacher(store: Store) -> TeacherCopy:
+    copy = TeacherCopy(store, "me", "source", list_checkpoints(store.run("source"))[-1])
+    copy.copy("teacher")
+    return copy
+
+
+def test_a_run_holds_its_teacher_before_it_exists_and_after_the_teacher_s_run_is_gone(store: Store) -> None:
+    pupil = store.run("pupil")
+    copy = copy_of_teacher(store)
+    assert len(names(store)) == 2 and not pupil.path.exists()
+    copy.publish(pupil.path)
+    copy.close()
+    assert names(store) == ["pupil", "source"] and pupil.is_missing() and pupil not in store.runs()
+    shutil.rmtree(store.run("source").path)
+    (held,) = list_checkpoints(pupil.teacher("source"))
+    held.verify()
+    assert held.iteration == 3 and (held.path / "learner.pt").read_bytes() == b"weights" * 1000
+    assert sorted(os.listdir(held.path)) == ["learner.pt", "manifest.json"]
+    pupil.create({"run": "pupil"})
+    assert pupil.description() == {"run": "pupil"}
+
+
+def test_a_copy_of_a_teacher_that_came_to_nothing_leaves_nothing(store: Store) -> None:
+    copy = copy_of_teacher(store)
+    copy.discard()
+    published = copy_of_teacher(store)
+    published.publish(store.run("pupil").path)
+    published.publish(store.run("pupil").path)
+    published.discard()
+    assert names(store) == ["source"]
+    (store.run("pupil").path / "logs").mkdir(parents=True)
+    another = copy_of_teacher(store)
+    another.publish(store.run("pupil").path)
+    another.discard()
+    assert os.listdir(store.run("pupil").path) == ["logs"]
+
+
+def test_a_copy_of_a_teacher_moves_on_to_the_run_that_is_published_last(store: Store) -> None:
+    copy = copy_of_teacher(store)
+    for name in ("first", "second"):
+        copy.publish(store.run(name).path)
+    copy.close()
+    assert [len(list_checkpoints(store.run(name).teacher("source"))) for name in ("first", "second")] == [0, 1]
+
+
+def test_a_link_among_the_teachers_is_refused(store: Store) -> None:
+    pupil = store.run("pupil")
+    pupil.path.mkdir()
+    (pupil.path / "teachers").symlink_to(store.run("source").path)
+    with pytest.raises(DamagedFile, match="a link"):
+        pupil.check_links()

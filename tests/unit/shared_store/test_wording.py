@@ -22,7 +22,7 @@ from worker.tasks.configs.cartpole import CartpoleConfig
         ("ppo", "schedule", "linear", "schedule: expected 'adaptive' or 'fixed', found 'linear'"),
         ("sac", "gamma", 2.0, "gamma: expected a value less than or equal to 1, found 2.0"),
         ("rsl_rl", "actor", [64], "actor: expected a mapping, found a list"),
-        ("rsl_rl", "actor", {"init": math.inf}, "actor.init: expected a finite number, found inf"),
+        ("rsl_rl", "actor", {"init": math.inf}, "actor.init: expected a finite number, found a number (inf)"),
         ("rsl_rl", "algorithm", {"max_grad_norm": None}, "algorithm.max_grad_norm: expected a number, found nothing"),
         (
             *("rsl_rl", "algorithm", {"num_mini_batches": 2.5}),

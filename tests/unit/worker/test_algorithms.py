@@ -17,7 +17,7 @@ from tests.support.worker.point_task import Point, PointConfig
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Share
-from worker.learning.algorithms import BUILT_IN, find_algorithm
+from worker.learning.algorithms import find_algorithm, installed
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo import draws, objective
 from worker.learning.sac import kernels
@@ -43,7 +43,7 @@ class Forgetful(PlainPPO):
         pass
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", installed())
 def test_those_that_come_with_muster_are_algorithms(name: str) -> None:
     assert find_algorithm(name)
 

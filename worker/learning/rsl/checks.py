@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Required
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
-from shared_store.wording import Refused, explain, shown
+from shared_store.wording import Refused, explain, kind_of, shown
 
 _CHECKED = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 Count = Annotated[int, Field(ge=1)]
@@ -131,7 +131,7 @@ def check_algorithm(section: dict[str, Any] | None) -> dict[str, Any] | None:
 def check_finite(value: Any, path: tuple[str | int, ...] = ()) -> Any:
     """``value``, a document. Raises Refused for a number in it that is not finite: a job that is sent as JSON can't hold it."""
     if isinstance(value, float) and not math.isfinite(value):
-        raise Refused(path, f"expected a finite number, found {shown(value)}")
+        raise Refused(path, f"expected a finite number, found {kind_of(value)}")
     items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
     for key, item in items:
         check_finite(item, (*path, key))

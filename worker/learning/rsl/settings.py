@@ -115,6 +115,18 @@ class RslRlConfig:
             check_gradient_length(length, epochs, self.num_steps_per_env)
         return self
 
+    def check_observations(self, groups: Mapping[str, bool]) -> None:
+        """Raises ValueError where a set names a group that the task does not have.
+
+        Args:
+            groups: Those of the task, and of each whether it is of images.
+        """
+        for name, wanted in self.obs_groups.items():
+            for group in wanted:
+                if group not in groups:
+                    known = ", ".join(groups)
+                    raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
+
     def section(self, name: str) -> dict[str, Any]:
         """Section ``name`` as rsl_rl takes it: with its ``class_name``. Nothing of it is shared with these settings."""
         return _changed(DEFAULTS[name], getattr(self, name) or {})

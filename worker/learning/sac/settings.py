@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, Strict, model_validator
@@ -110,6 +111,18 @@ class SACConfig:
     """What a resumed run can't change: checkpoints hold what became of it."""
     clone_may_change: ClassVar[tuple[str, ...]] = ("replay_steps", "init_temperature")
     """Those of :attr:`fixed` that a clone can change: it takes over weights and normalisers alone."""
+
+    def check_observations(self, groups: Mapping[str, bool]) -> None:
+        """Raises ValueError where the task lacks a group, or has images where numbers are expected.
+
+        Args:
+            groups: Those of the task, and of each whether it is of images.
+        """
+        if self.critic_group not in groups:
+            known = ", ".join(groups)
+            raise ValueError(f"critic_group: there is no observation group {self.critic_group!r}; there are {known}")
+        if images := [group for group in ("policy", self.critic_group) if groups[group]]:
+            raise ValueError(f"it can't learn from images, and observation group {images[0]!r} is one; use ppo")
 
     @model_validator(mode="after")
     def _fits(self) -> SACConfig:

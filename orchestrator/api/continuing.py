@@ -1,0 +1,115 @@
+"""What resuming a run and cloning one have in common: the checkpoint, the changed spec, and the job that is submitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from orchestrator.admission import fit_in_queue
+from orchestrator.api import batch, definitions, limits, permissions, submission
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.definition import compile_definition, compile_submission, gang_needs
+from orchestrator.excerpts import excerpt
+from orchestrator.spec import Spec
+from orchestrator.tables import Job
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_checkpoint, list_checkpoints
+from shared_store.layout import Run
+
+CONFLICT = 409
+"""The request is well formed, but the state of things refuses it."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What is asked of the new job."""
+
+    checkpoint: int | Literal["best"] | None = None
+    """Iteration, or the one with the greatest score; the newest where None."""
+    assignments: tuple[str, ...] = ()
+    """``key.path=value`` changes of the run's spec."""
+    directory: str = ""
+    """Working directory of the job."""
+    nodes: int | None = None
+    """Another number of nodes."""
+
+    def all(self) -> list[str]:
+        """The assignments, with the one that sets the number of nodes. Raises ClientError where both do."""
+        if self.nodes is None:
+            return [*self.assignments]
+        for assignment in self.assignments:
+            if assignment.partition("=")[0].partition(".")[0] == "nodes":
+                raise ClientError(
+                    f"--set {excerpt(assignment, 100)}: --nodes {self.nodes} sets the number of nodes; give one of them"
+                )
+        return [*self.assignments, f"nodes={self.nodes}"]
+
+
+def answered(context: Context, run: str) -> Job | None:
+    """The job that an earlier call with the same idempotency key has submitted. Raises ClientError where that was for another run."""
+    job = submission.answered(context)
+    if job is not None and job.run != run:
+        raise ClientError(
+            f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", CONFLICT
+        )
+    return job
+
+
+def choose(run: Run, wanted: int | Literal["best"] | None) -> Checkpoint | None:
+    """The checkpoint that is meant; None for the newest one of a run that has none. Raises ClientError where there is no such."""
+    checkpoints = list_checkpoints(run)
+    there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
+    if wanted is None:
+        return checkpoints[-1] if checkpoints else None
+    if wanted == "best":
+        chosen = best_checkpoint(run)
+        problem = ": no checkpoint has a score yet, which is a mean over at least 100 episodes; name an iteration"
+    else:
+        chosen = next((each for each in reversed(checkpoints) if each.iteration == wanted), None)
+        problem = f" has no checkpoint of iteration {wanted}; it has"
+    if chosen is None:
+        raise ClientError(f"run {run.name}{problem}: {there}", 404)
+    return chosen
+
+
+def refusal(run: Run, chosen: Checkpoint, error: DamagedCheckpoint) -> ClientError:
+    """What to say of a checkpoint that can't be used."""
+    if isinstance(error, NewerFormat):
+        return ClientError(f"run {run.name}: {error}", CONFLICT)
+    others = [str(each.iteration) for each in list_checkpoints(run) if each.name != chosen.name]
+    return ClientError(f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT)
+
+
+def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:
+    """The definition of the job, which the caller may submit and which the queue could have. Raises ClientError."""
+    definition = compile_definition(spec, directory)
+    queue = context.queue(spec.queue)
+    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
+    shape = gang_needs(definition["nodeProperties"]).shape
+    if problem := fit_in_queue(context.session, context.controller.engine, queue, shape).problem:
+        raise ClientError(f"{what}: {problem}")
+    limits.check_document("RegisterJobDefinition", definition)
+    return definition
+
+
+def submit(
+    context: Context, spec: Spec, directory: str, what: str, environment: Mapping[str, str]
+) -> tuple[dict[str, Any], Job]:
+    """Register and submit the job; nothing is committed. Raises ClientError.
+
+    Args:
+        context: The call.
+        spec: Of the job.
+        directory: Its working directory.
+        what: Begins the words of a refusal.
+        environment: Added on every node.
+    """
+    definition = check(context, spec, directory, what)
+    registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
+    request = compile_submission(spec, registered["jobDefinitionArn"], environment)
+    answer = submission.submit_job(context, batch.validate("SubmitJob", request))
+    context.session.flush()
+    job = context.session.get(Job, answer["jobId"])
+    assert job is not None
+    return answer, job

@@ -1,0 +1,32 @@
+"""Comparing the settings of two jobs: what a run that goes on, or a clone, may not change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+def setting_at(settings: Any, key: str) -> Any:
+    """The setting ``key``, in which a dot leads into a section; None where there is none, or an empty section."""
+    for part in key.split("."):
+        settings = settings.get(part) if isinstance(settings, Mapping) else None
+    return None if settings == {} else settings
+
+
+def first_difference(old: Any, new: Any, keys: Iterable[str]) -> tuple[str, Any, Any] | None:
+    """The first of ``keys`` whose setting differs, with both values; None where all are equal."""
+    pairs = ((key, setting_at(old, key), setting_at(new, key)) for key in keys)
+    return next((pair for pair in pairs if pair[1] != pair[2]), None)
+
+
+def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> list[str]:
+    """The settings that a run can't change once it has a checkpoint, as the class of an algorithm's settings names them.
+
+    Args:
+        kind: That class; None where it is not known.
+        saved: The settings in a checkpoint: those that an older Muster did not have can't be compared.
+        of_clone: Leave out those that a clone may change.
+    """
+    may_change = getattr(kind, "clone_may_change", ()) if of_clone else ()
+    fixed = [key for key in getattr(kind, "fixed", ()) if key not in may_change]
+    return fixed if saved is None else [key for key in fixed if key.partition(".")[0] in saved]

@@ -1,0 +1,28 @@
+"""Comparing settings: which may not change, and the first that does."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from shared_store.settings import first_difference, fixed_settings, setting_at
+
+KIND = SimpleNamespace(fixed=("sizes", "net.depth", "rate"), clone_may_change=("rate",))
+
+
+def test_a_dot_leads_into_a_section_and_an_empty_section_is_none() -> None:
+    settings = {"net": {"depth": 3, "more": {}}, "sizes": [8]}
+    assert setting_at(settings, "net.depth") == 3 and setting_at(settings, "sizes") == [8]
+    assert setting_at(settings, "net.more") is None and setting_at(settings, "sizes.depth") is None
+    assert setting_at(None, "a") is None
+
+
+def test_the_first_difference_is_told_with_both_values() -> None:
+    old, new = {"sizes": [8], "net": {"depth": 3}}, {"sizes": [8], "net": {"depth": 0}, "rate": {}}
+    assert first_difference(old, new, KIND.fixed) == ("net.depth", 3, 0)
+    assert first_difference(old, new, ("sizes", "rate")) is None
+
+
+def test_what_is_fixed_is_as_the_class_says_and_as_the_checkpoint_knows() -> None:
+    assert fixed_settings(KIND) == ["sizes", "net.depth", "rate"] and fixed_settings(None) == []
+    assert fixed_settings(KIND, of_clone=True) == ["sizes", "net.depth"]
+    assert fixed_settings(KIND, {"net": None}, of_clone=True) == ["net.depth"]
