@@ -56,8 +56,11 @@ class LogCopy:
 
     def _run(self) -> None:
         try:
-            _copy(self._container, self._path, self._limit)
+            last = _copy(self._container, self._path, self._limit, follow=True)
             self._check_ended()
+            if last != self._container.logs(tail=1, timestamps=True):
+                # Docker Engine 20.10 ends a log that is followed slowly before it is whole; that of an ended container is whole
+                _copy(self._container, self._path, self._limit, follow=False)
         except Exception as error:
             if isinstance(error, struct.error):  # half a frame's head
                 error = requests.ConnectionError(f"the log of container {self._container.name} was cut off")
@@ -78,24 +81,34 @@ class LogCopy:
             time.sleep(0.05)
 
 
-def _copy(container: Container, path: Path, limit: int) -> None:
-    """Raises OSError where the log can't be written."""
+def _copy(container: Container, path: Path, limit: int, follow: bool) -> bytes | None:
+    """Append the lines that are not in the log yet; returns what was read last, None where that was not a whole line.
+
+    Raises OSError where the log can't be written.
+    """
     writer = LogWriter(path, limit)
+    last: bytes | None = b""
     try:
         copied = writer.lines
-        for lines in _lines(container):
+        for chunk, lines in _lines(container, follow):
+            last = chunk if chunk.endswith(b"\n") else None
             fresh, copied = lines[copied:], max(0, copied - len(lines))
             data = "".join(format_line(at, 0, "o", line) for at, line in fresh).encode(errors="backslashreplace")
-            if writer.append(data) < len(data):
+            if data and writer.append(data) < len(data):
                 raise writer.error or OSError(f"{path}: not written")
     finally:
         writer.close()
+    return last
 
 
-def _lines(container: Container) -> Iterator[list[tuple[float, str]]]:
-    """Every line and when it was printed [Unix s], which Docker remembers: a line is never dated anew."""
+def _lines(container: Container, follow: bool) -> Iterator[tuple[bytes, list[tuple[float, str]]]]:
+    """What Docker sends, and the lines that it completes with the time at which they were printed [Unix s]: that is never another one.
+
+    A last line without an end is one only where the log is not followed, and therefore whole.
+    """
     rest, at = b"", 0.0
-    for chunk in container.logs(stream=True, follow=True, timestamps=True):
+    for sent in container.logs(stream=True, follow=follow, timestamps=True):
+        chunk = sent
         # one write of the container, or 16 KiB of a longer one, each with its time
         if found := _TIME.match(chunk):
             began, chunk = datetime.fromisoformat(found[1].decode()).timestamp(), chunk[found.end() :]
@@ -104,7 +117,7 @@ def _lines(container: Container) -> Iterator[list[tuple[float, str]]]:
         at = at if rest else began
         *whole, rest = (rest + chunk).split(b"\n")
         times = [at, *[began] * len(whole)]
-        yield [(when, line.decode(errors="backslashreplace")) for when, line in zip(times, whole, strict=False)]
+        yield sent, [(when, line.decode(errors="backslashreplace")) for when, line in zip(times, whole, strict=False)]
         at = began if whole else at
-    if rest:
-        yield [(at, rest.decode(errors="backslashreplace"))]
+    if rest and not follow:
+        yield rest, [(at, rest.decode(errors="backslashreplace"))]

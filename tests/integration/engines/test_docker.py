@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import socket
 import threading
@@ -15,6 +16,7 @@ import pytest
 from orchestrator.engines import docker as docker_engine
 from orchestrator.engines.base import EngineError, NotYet
 from shared_store import __version__
+from shared_store.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.docker_bench import DockerBench
 from tests.support.engines.images import PLAIN, SUPERVISED, host_files
@@ -166,6 +168,26 @@ def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
     log = bench.log()
     assert log[0] == "100000" and log[-2:] == ["160000", "the error"]
     assert len(log) < 40_000 and sum("left out" in line.text for line in bench.lines()) == 1
+
+
+@pytest.mark.parametrize("end", ["echo the error", "printf 'the error'"])
+def test_a_log_that_is_read_slowly_is_copied_to_its_end(
+    bench: DockerBench, monkeypatch: pytest.MonkeyPatch, end: str
+) -> None:
+    """Docker Engine 20.10 cuts such a log off when its container ends: not always, so that three are read."""
+    append, written = LogWriter.append, itertools.count()
+
+    def slowly(writer: LogWriter, data: bytes) -> int:
+        if next(written) % 500 == 0:
+            time.sleep(0.01)
+        return append(writer, data)
+
+    monkeypatch.setattr(LogWriter, "append", slowly)
+    handle = bench.launch(bench.gang(f"seq 100000 160000; {end}; exit 1", 3))
+    bench.ended(handle)
+    lines = bench.lines()
+    for node in range(3):
+        assert [line.text for line in lines if line.node == node] == [*map(str, range(100_000, 160_001)), "the error"]
 
 
 def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: DockerBench) -> None:

@@ -20,6 +20,7 @@ from shared_store.epoch import (
     read_epoch,
     take_epoch,
 )
+from shared_store.files import write_atomic
 from shared_store.layout import Run
 from tests.conftest import PATIENCE, REPOSITORY
 from tests.support.shared_store.crashes import killed_at_every_step
@@ -143,7 +144,7 @@ def test_a_controller_that_claims_second_leaves_the_run_to_the_first(tmp_path: P
     run = Run(tmp_path)
     raise_epoch(run, 4)
     (tmp_path / "EPOCH.5").write_text('{"controller": "b", "job": "job", "attempt": 1}')
-    first = threading.Timer(0.2, lambda: (tmp_path / "EPOCH").write_text("5\n"))
+    first = threading.Timer(0.2, lambda: write_atomic(tmp_path / "EPOCH", b"5\n"))
     first.start()
     with pytest.raises(StaleEpoch, match=r"another controller has just taken run .* with epoch 5"):
         take_epoch(run, 4, Claim("a", "job", 1))
