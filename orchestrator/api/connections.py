@@ -140,7 +140,7 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        # h11 asks for the size of a request's head only while it is incomplete: one that comes at once would pass, however large
+        # h11 checks the size of a request's head only while the head is incomplete: one that arrives at once would pass at any size
         for start in range(0, len(data), _PIECE):
             if not self.transport.is_closing():
                 super().data_received(data[start : start + _PIECE])

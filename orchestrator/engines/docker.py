@@ -143,9 +143,8 @@ class DockerEngine:
             if found:
                 with ThreadPoolExecutor(len(found)) as pool:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
-                for copy in self._copies_of(
-                    facts["gang"]
-                ).values():  # what is not copied yet would go with the container
+                # what is not copied yet would go with the container
+                for copy in self._copies_of(facts["gang"]).values():
                     copy.wait()
             self._ended[facts["gang"]] = dict(enumerate(self._observe(facts)))
             for gang in list(self._ended)[:-_REMEMBERED]:  # other stops do the same
@@ -361,8 +360,10 @@ class DockerEngine:
                 network.remove()
             except APIError:
                 pass  # a container that is still going; the next stop removes it
-        for key in self._copies_of(gang):
-            self._copies.pop(key, None)
+        keys = list(self._copies_of(gang))
+        with self._copying:  # another thread may look through them
+            for key in keys:
+                self._copies.pop(key, None)
 
     def _copies_of(self, gang: str) -> dict[str, LogCopy]:
         """The copies of a gang's logs, by their keys."""

@@ -59,7 +59,7 @@ class LogCopy:
             last = _copy(self._container, self._path, self._limit, follow=True)
             self._check_ended()
             if last != self._container.logs(tail=1, timestamps=True):
-                # Docker Engine 20.10 ends a log that is followed slowly before it is whole; that of an ended container is whole
+                # Docker Engine 20.10 may end a followed log early where it is read slowly; it gives the whole log afterwards
                 _copy(self._container, self._path, self._limit, follow=False)
         except Exception as error:
             if isinstance(error, struct.error):  # half a frame's head
@@ -102,9 +102,10 @@ def _copy(container: Container, path: Path, limit: int, follow: bool) -> bytes |
 
 
 def _lines(container: Container, follow: bool) -> Iterator[tuple[bytes, list[tuple[float, str]]]]:
-    """What Docker sends, and the lines that it completes with the time at which they were printed [Unix s]: that is never another one.
+    """Each chunk that Docker sends, with the lines that it completes and when each was printed [Unix s].
 
-    A last line without an end is one only where the log is not followed, and therefore whole.
+    Docker remembers that time, so a line is never dated anew. A last line without a line end comes only from a log that is not
+    followed: a followed one may have been cut off there.
     """
     rest, at = b"", 0.0
     for sent in container.logs(stream=True, follow=follow, timestamps=True):
