@@ -321,7 +321,7 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
     )["jobId"]
     shared_server.wait(array)
     shown = shared_server.muster("show", "many").stdout
-    assert f"children:    3: 3 SUCCEEDED; muster show {array[:8]}:0" in shown and "run:" not in shown
+    assert f"children:     3: 3 SUCCEEDED; muster show {array[:8]}:0" in shown and "run:" not in shown
     for reference in ("many:2", f"{array[:8]}:2", f"{array}:2"):
         assert f"{array}:2" in shared_server.muster("show", reference).stdout
     for missing in ("many:3", "many:x", "nosuch:0", f"{array[:8]}:1:1"):

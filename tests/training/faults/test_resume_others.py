@@ -231,7 +231,7 @@ def test_a_setting_of_rsl_rl_that_its_state_holds_is_refused(store: Path, run: s
         go_on(store, run, with_value(settings, key, value))
     said = str(error.value)
     if key == "algorithm.class_name" and run == "pupil":
-        assert "teacher_checkpoint: PPO has no teacher; leave it out" in said
+        assert "train.rsl_rl.student: PPO has the networks actor and critic" in said
     else:
         assert f"rsl_rl.{name}" in said and " there and " in said and "start a new run for that" in said, said
 

@@ -20,7 +20,13 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "Cartpole": ("Cartpole", {}),
     "Ant": ("Ant", {}),
     "images": ("CartpolePixels", {}),
-    "a critic of its own": ("Quadruped", {"ppo": {"critic_observations": "critic", "critic_hidden_sizes": [40]}}),
+    "a critic of its own": (
+        "Cartpole",
+        {
+            "config": {"randomize": {"observation_noise": 0.02}},
+            "ppo": {"critic_observations": "critic", "critic_hidden_sizes": [40]},
+        },
+    ),
     "AdamW": ("Cartpole", {"ppo": {"optimizer": "adamw", "weight_decay": 0.01, "schedule": "fixed"}}),
     "sac": ("Cartpole", {"algorithm": "sac"}),
 }
@@ -49,9 +55,9 @@ def test_an_iteration_is_a_few_graphs_and_never_waits_for_the_device(tmp_path: P
     assert training.state.progress.iteration == 9
 
 
-@pytest.mark.parametrize("case", ["Cartpole", "Ant", "a critic of its own", "AdamW", "sac"])
+@pytest.mark.parametrize("case", ["Cartpole", "a critic of its own", "AdamW", "sac"])
 def test_a_graph_computes_what_the_same_code_computes_eagerly(tmp_path: Path, case: str) -> None:
-    """Over few iterations: what differs in the last bits grows in the worlds."""
+    """Over few iterations: what differs in the last bits grows. Without contacts, whose order on a GPU is another in each run."""
     found = []
     for eager in (False, True):
         training = runner(tmp_path / str(eager), case)
