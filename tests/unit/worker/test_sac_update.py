@@ -96,19 +96,20 @@ def test_several_critics_are_each_a_network_of_its_own(layer_norm: bool) -> None
     torch.manual_seed(0)
     critics = Critics(dataclasses.replace(SMALL, critics=3, layer_norm=layer_norm), 4, 2)
     with torch.no_grad():
-        for each in (*critics.gains, *critics.offsets):
-            each.normal_()
+        for parameter in critics.parameters():
+            parameter.normal_()
     observations, actions = torch.randn(7, 4), torch.randn(7, 2)
     outputs = critics(observations, actions)
     assert outputs.shape == (3, 7, 11)
-    for number in range(3):
+    for number, critic in enumerate(critics.each):
+        numbers = iter(critic.parameters())
         x = torch.cat((observations, actions), 1)
         for layer in range(3):
-            x = x @ critics.weights[layer][number] + critics.biases[layer][number]
+            x = x @ next(numbers).T + next(numbers)
             if layer < 2:
                 if layer_norm:
                     x = torch.nn.functional.layer_norm(x, x.shape[1:])
-                    x = x * critics.gains[layer][number] + critics.offsets[layer][number]
+                    x = x * next(numbers) + next(numbers)
                 x = x * x.sigmoid()
         torch.testing.assert_close(outputs[number], x)
 
@@ -229,7 +230,7 @@ def test_gradients_are_clipped_by_their_norm() -> None:
 def test_critics_may_know_what_the_policy_does_not_see() -> None:
     setting = Setting(Spaces({"policy": (2,), "critic": (3,)}, 1), Share(0, 4, 4), alone(), 0)
     sac = SAC(dataclasses.replace(SMALL, critic_group="critic", warm_up=0), setting)
-    assert sac.learner.critics.weights[0].shape == (2, 4, 16) and sac.learner.actor.body[0].in_features == 2
+    assert sac.learner.critics.each[0][0].in_features == 4 and sac.learner.actor.body[0].in_features == 2
     torch.manual_seed(0)
 
     def look() -> TensorDict:

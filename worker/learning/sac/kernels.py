@@ -32,6 +32,30 @@ def _explore(
 
 
 @wp.kernel
+def _look_ahead(
+    rows: wp.array(dtype=wp.int64),
+    outcomes: wp.array2d(dtype=wp.float32),
+    worlds: int,
+    powers: wp.array(dtype=wp.float32),
+    last: wp.array(dtype=wp.int64),
+    returns: wp.array(dtype=wp.float32),
+    discounts: wp.array(dtype=wp.float32),
+):
+    """The steps of one transition, of n or up to the end of its episode."""
+    sample = wp.tid()
+    row = wp.int32(rows[sample])
+    total = powers[0] * outcomes[row, 0]
+    steps = wp.int32(1)
+    while steps < powers.shape[0] - 1 and outcomes[row, 1] != 0.0:
+        row = (row + worlds) % outcomes.shape[0]
+        total += powers[steps] * outcomes[row, 0]
+        steps += 1
+    last[sample] = wp.int64(row)
+    returns[sample] = total
+    discounts[sample] = powers[steps] * outcomes[row, 2]
+
+
+@wp.kernel
 def _project(
     probabilities: wp.array2d(dtype=wp.float32),
     returns: wp.array(dtype=wp.float32),
@@ -97,6 +121,37 @@ def explore(
             dim=len(actions),
             inputs=[_array(keys), step, first_world, _array(uniform), limit, _array(mean), _array(log_std)],
             outputs=[_array(actions)],
+            device=device,
+        )
+
+
+def look_ahead(
+    rows: torch.Tensor,
+    outcomes: torch.Tensor,
+    worlds: int,
+    powers: torch.Tensor,
+    last: torch.Tensor,
+    returns: torch.Tensor,
+    discounts: torch.Tensor,
+) -> None:
+    """What follows the beginnings of transitions, in the replay's ring of steps.
+
+    Args:
+        rows: Where they begin, shape (samples,), int64.
+        outcomes: Reward, whether the episode went on, whether anything comes after; shape (steps · worlds, 3), float32.
+        worlds: Rows of one step.
+        powers: Discounts of 0 to n steps, shape (n + 1,), float32.
+        last: Filled with the rows of their last steps, shape (samples,), int64.
+        returns: Filled with the discounted sums of their rewards, shape (samples,), float32.
+        discounts: Filled with the worth of what comes after, shape (samples,), float32.
+    """
+    device = str(outcomes.device)
+    with on_torch_stream(device):
+        wp.launch(
+            _look_ahead,
+            dim=len(rows),
+            inputs=[_array(rows), _array(outcomes), worlds, _array(powers)],
+            outputs=[_array(last), _array(returns), _array(discounts)],
             device=device,
         )
 

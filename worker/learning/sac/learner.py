@@ -69,6 +69,8 @@ class Learner:
             for parameter in part:
                 parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
                 offset += parameter.numel()
+        self._policy_gradients = [parameter.grad for parameter in self._policy_parameters]
+        self._critic_gradients = [parameter.grad for parameter in self._critic_parameters]
         self._policy_gradient, self._critic_gradient = self._shared[:policy], self._shared[-critics:]
         self._temperature_gradient = self._shared[policy]
         self.losses = self._shared[losses : losses + len(LOSSES)]
@@ -111,7 +113,7 @@ class Learner:
             noise: Standard normal, of the action after the transition and of that at its beginning; shape (2, samples, actions).
             improves: Whether policy and temperature learn too.
         """
-        self._shared.zero_()
+        self.losses.zero_()
         share = 1.0 / self.config.batch_size  # the batch is all ranks' together
         taken = batch.before[:, self.width :]
         seen, known = self._normalize(batch.before)
@@ -122,14 +124,14 @@ class Learner:
             target = self.target(self.targets(known_after, following), batch, -temperature * log_prob)
         outputs = self.critics(known, taken)
         critic_loss = self._critic_loss(outputs, target) * share
-        torch.autograd.backward(critic_loss, inputs=self._critic_parameters)
+        torch._foreach_copy_(self._critic_gradients, torch.autograd.grad(critic_loss, self._critic_parameters))
         self.losses[2].copy_(critic_loss.detach())
         self.losses[3].copy_(self.critics.mean(outputs.detach()).mean(0).sum() * share)
         if improves:
             chosen, log_prob = self.actor.sample(seen, noise[1])
             value = self.critics.combined_mean(self.critics(known, chosen))
             policy_loss = (temperature * log_prob - value).sum() * share
-            torch.autograd.backward(policy_loss, inputs=self._policy_parameters)
+            torch._foreach_copy_(self._policy_gradients, torch.autograd.grad(policy_loss, self._policy_parameters))
             entropy = -log_prob.detach()
             # of J(α) = α · E[−log π − H] (arXiv:1812.05905, eq. 18), by log α
             excess = entropy - self.config.target_entropy * self._actions

@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from tensordict import TensorDict
 from torch import nn
-from torch.nn.functional import layer_norm, silu, softplus
+from torch.nn.functional import softplus
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
 from worker.learning.observations import made_up
@@ -33,6 +33,15 @@ def size_of(spaces: Spaces, group: str) -> int:
     return shape[0]
 
 
+def hidden_layers(sizes: Sequence[int], layer_norm: bool) -> Iterator[nn.Module]:
+    """Layers from an input of ``sizes[0]`` numbers over widths of ``sizes[1:]``, each normalised where ``layer_norm`` says so."""
+    for before, after in itertools.pairwise(sizes):
+        yield nn.Linear(before, after)
+        if layer_norm:
+            yield nn.LayerNorm(after)
+        yield nn.SiLU()
+
+
 class Actor(nn.Module):
     """A Gaussian, squashed into the action's limits by tanh (arXiv:1812.05905, appendix C), with its normaliser inside."""
 
@@ -40,16 +49,8 @@ class Actor(nn.Module):
         super().__init__()
         self.observations, self.limit = observations, config.action_limit
         self.normalizer = make_normalizer(config, observations)
-        layers: list[nn.Module] = []
-        width = observations
-        for size in config.actor_sizes:
-            layers.append(nn.Linear(width, size))
-            if config.layer_norm:
-                layers.append(nn.LayerNorm(size))
-            layers.append(nn.SiLU())
-            width = size
-        self.body = nn.Sequential(*layers)
-        self.head = nn.Linear(width, 2 * actions)
+        self.body = nn.Sequential(*hidden_layers((observations, *config.actor_sizes), config.layer_norm))
+        self.head = nn.Linear(config.actor_sizes[-1], 2 * actions)
         low, high = LOG_STD
         with torch.no_grad():
             self.head.weight.mul_(HEAD_SCALE)
@@ -98,7 +99,7 @@ class Actor(nn.Module):
 
 
 class Critics(nn.Module):
-    """Several critics of one shape, computed as one: their weights lie in one tensor for each layer.
+    """Several critics of one shape.
 
     A critic gives ``atoms`` numbers: the logits of a distribution of the return; of one atom, its mean.
     """
@@ -107,17 +108,18 @@ class Critics(nn.Module):
 
     def __init__(self, config: SACConfig, observations: int, actions: int) -> None:
         super().__init__()
-        sizes = [observations + actions, *config.critic_sizes, config.atoms]
-        self.combine, self.atoms, self.layer_norm = config.combine, config.atoms, config.layer_norm
-        self.weights, self.biases, self.gains, self.offsets = (nn.ParameterList() for _ in range(4))
-        for i, (before, after) in enumerate(itertools.pairwise(sizes)):
-            last = i == len(sizes) - 2
-            bound = (HEAD_SCALE if last else 1.0) / math.sqrt(before)  # as torch's linear layers
-            self.weights.append(torch.empty(config.critics, before, after).uniform_(-bound, bound))
-            self.biases.append(torch.empty(config.critics, 1, after).uniform_(-bound, bound))
-            if self.layer_norm and not last:
-                self.gains.append(torch.ones(config.critics, 1, after))
-                self.offsets.append(torch.zeros(config.critics, 1, after))
+        self.combine, self.atoms = config.combine, config.atoms
+        self.each = nn.ModuleList(
+            nn.Sequential(
+                *hidden_layers((observations + actions, *config.critic_sizes), config.layer_norm),
+                nn.Linear(config.critic_sizes[-1], config.atoms),
+            )
+            for _ in range(config.critics)
+        )
+        with torch.no_grad():
+            for critic in self.each:
+                for parameter in critic[-1].parameters():
+                    parameter.mul_(HEAD_SCALE)
         atoms = torch.linspace(config.v_min, config.v_max, config.atoms)
         self.register_buffer("values", atoms, persistent=False)
 
@@ -131,14 +133,8 @@ class Critics(nn.Module):
         Returns:
             Shape (critics, n, atoms).
         """
-        x = torch.cat((observations, actions), -1).expand(len(self.weights[0]), -1, -1)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias, x, weight)
-            if i < len(self.weights) - 1:
-                if self.layer_norm:
-                    x = torch.addcmul(self.offsets[i], layer_norm(x, x.shape[-1:]), self.gains[i])
-                x = silu(x)
-        return x
+        x = torch.cat((observations, actions), -1)
+        return torch.stack([critic(x) for critic in self.each])
 
     def mean(self, outputs: torch.Tensor) -> torch.Tensor:
         """The return that each critic expects, shape (critics, n), from what :meth:`forward` gave."""

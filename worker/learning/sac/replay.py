@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
+from worker.learning.sac import kernels
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -53,7 +55,6 @@ class Replay:
         self.recorded = 0
         """Steps of each world that were ever written."""
         self._recorded = torch.zeros(worlds, dtype=torch.int64, device=device)  # the same, saved with the worlds
-        self._ahead = torch.arange(n_step, device=device) * worlds
         self._powers = torch.tensor([gamma**k for k in range(n_step + 1)], device=device)
 
     @property
@@ -108,18 +109,10 @@ class Replay:
 
     def sample(self, rows: torch.Tensor) -> Batch:
         """The transitions that begin in ``rows``, shape (samples,), int64."""
-        steps = (rows.unsqueeze(1) + self._ahead) % (self.capacity * self.worlds)
-        rewards, goes_on, comes_after = self.outcomes.flatten(0, 1)[steps].unbind(-1)
-        # a step belongs to the transition where all before it went on
-        belongs = torch.cat((torch.ones_like(goes_on[:, :1]), goes_on[:, :-1].cumprod(1)), 1)
-        length = belongs.sum(1).long()
-        last = (length - 1).unsqueeze(1)
-        return Batch(
-            before=self.before.flatten(0, 1)[rows],
-            after=self.after.flatten(0, 1)[steps.gather(1, last)[:, 0]],
-            returns=(rewards * belongs * self._powers[:-1]).sum(1),
-            discounts=self._powers[length] * comes_after.gather(1, last)[:, 0],
-        )
+        last, returns, discounts = torch.empty_like(rows), *self._powers.new_empty(2, len(rows)).unbind()
+        kernels.look_ahead(rows, self.outcomes.flatten(0, 1), self.worlds, self._powers, last, returns, discounts)
+        before, after = self.before.flatten(0, 1)[rows], self.after.flatten(0, 1)[last]
+        return Batch(before, after, returns, discounts)
 
     def newest(self, slots: torch.Tensor) -> torch.Tensor:
         """What was seen in ``slots``, shape (steps,), int64: shape (steps, worlds, observations + actions)."""
