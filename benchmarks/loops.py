@@ -93,20 +93,26 @@ def main() -> None:
                 found.setdefault((task, way), []).append(measure(task, options.worlds, options.iterations))
                 rows.append(watch.check(f"while {task} was measured"))
                 print(task, way, found[task, way][-1], flush=True)
+                (options.out / "loops.md").write_text(table(found, options.worlds, rows))
+
+
+def table(found: dict[tuple[str, str], list[float]], worlds: int, rows: list[dict[str, Any]]) -> str:
+    """Markdown, of the steps a second by task and way."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "the CPU"
     lines = [
         f"# One configuration, four loops, on {device}",
         "",
-        f"Million steps a second by the clock, with logging and checkpoints, {options.worlds:,} worlds; medians of {options.repeats} runs "
-        f"in turn; `python -m benchmarks.loops`. {told(rows)}",
+        f"Million steps a second by the clock, with logging and checkpoints, {worlds:,} worlds; medians of several runs in turn; "
+        f"`python -m benchmarks.loops`. {told(rows)}",
         "",
-        f"| task | {' | '.join(WAYS)} |",
-        "|---|" + "--:|" * len(WAYS),
+        f"| task | runs | {' | '.join(WAYS)} |",
+        "|---|--:|" + "--:|" * len(WAYS),
     ]
-    for task in options.tasks:
-        rates = (f"{statistics.median(found[task, way]) / 1e6:.3f}" for way in WAYS)
-        lines.append(f"| {task} | {' | '.join(rates)} |")
-    (options.out / "loops.md").write_text("\n".join(lines) + "\n")
+    for task in dict.fromkeys(task for task, _ in found):
+        of_it = [found[task, way] for way in WAYS if (task, way) in found]
+        rates = (f"{statistics.median(each) / 1e6:.3f}" for each in of_it)
+        lines.append(f"| {task} | {len(of_it[-1])} | {' | '.join(rates)} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -66,15 +66,15 @@ def main() -> None:
             rows.append(watch.check(f"while {task} was measured"))
             lines.append(f"| {task} | {way} | {found['learn']:.2f} | {found['iteration']:.2f} |")
             print(lines[-1], flush=True)
-    head = [
-        f"# The loss of the fused PPO on {torch.cuda.get_device_name() if torch.cuda.is_available() else 'the CPU'}",
-        "",
-        f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {told(rows)}",
-        "",
-        "| task | loss | learning | iteration |",
-        "|---|---|--:|--:|",
-    ]
-    (options.out / "objective.md").write_text("\n".join([*head, *lines]) + "\n")
+            head = [
+                f"# The loss of the fused PPO on {torch.cuda.get_device_name() if torch.cuda.is_available() else 'the CPU'}",
+                "",
+                f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {told(rows)}",
+                "",
+                "| task | loss | learning | iteration |",
+                "|---|---|--:|--:|",
+            ]
+            (options.out / "objective.md").write_text("\n".join([*head, *lines]) + "\n")
 
 
 if __name__ == "__main__":
