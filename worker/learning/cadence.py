@@ -19,6 +19,10 @@ class Cadence:
         self.every = _FIRST if self.auto else int(every)
         self._last = 0
 
+    def expects(self, iteration: int) -> bool:
+        """Whether a save after ``iteration`` is likely, as far as can be known before its signals."""
+        return iteration - self._last >= self.every if self.auto else iteration % self.every == 0
+
     def due(self, iteration: int, signals: Mapping[str, float]) -> bool:
         """Whether to save after ``iteration``. All ranks decide alike, since ``signals`` are sums over all of them."""
         if not self.auto:

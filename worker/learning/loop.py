@@ -195,6 +195,8 @@ class Loop:
         self._exchange.gather(self._stopwatch.collect, self._signals())
         metrics = algorithm.learn(self._observations)
         self._stopwatch.mark()
+        if self.cadence.expects(progress.iteration + 1) or progress.iteration + 1 == self.training.iterations:
+            self.state.copy(progress.iteration + 1)
         # the one transfer of the iteration: from here on the host knows
         learnt, totals = self._exchange.read(metrics)
         signals = {name: totals[name][0] for name in SIGNALS}

@@ -9,8 +9,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import torch
 
@@ -27,41 +28,57 @@ RECORDS_SECONDS = 10.0
 
 
 class HostCopies:
-    """Copies of device tensors in pinned host memory that is kept: the device is waited for one time a save."""
+    """Copies of tensors in host memory, those of a device in pinned memory that is kept from one save to the next."""
 
     def __init__(self) -> None:
         self._pinned: dict[str, tuple[tuple[object, ...], torch.Tensor]] = {}
         """Each with the form of what it is a copy of."""
-        self._copied = False
+        self._arrived: torch.cuda.Event | None = None
 
-    def take(self, value: Any, key: str = "") -> Any:
-        """``value`` with every CUDA tensor in it replaced by its copy, which is complete after :meth:`wait`.
+    def take(self, value: Any) -> Any:
+        """``value`` with every tensor in it replaced by its copy; those of a device are complete after :meth:`wait`."""
+        copied = self._take(value, "")
+        if self._pinned:
+            self._arrived = torch.cuda.Event(blocking=True)
+            self._arrived.record()
+        return copied
 
-        Of a CPU tensor that is part of a larger one the part is copied: ``torch.save`` would write the whole.
-        """
+    def _take(self, value: Any, key: str) -> Any:
         if isinstance(value, torch.Tensor) and value.is_cuda:
             # the strides, too: where dimensions lie in another order, the device makes a copy of its own first
             form = value.dtype, value.shape, value.stride()
             if key not in self._pinned or self._pinned[key][0] != form:
                 self._pinned[key] = form, torch.empty_like(value, device="cpu", pin_memory=True)
-            self._copied = True
             return self._pinned[key][1].copy_(value.detach(), non_blocking=True)
         if isinstance(value, torch.Tensor):
-            return value.detach().clone() if value.nbytes < value.untyped_storage().nbytes() else value
+            return value.detach().clone()
         if isinstance(value, dict):
-            return {name: self.take(item, f"{key}/{name}") for name, item in value.items()}
+            return {name: self._take(item, f"{key}/{name}") for name, item in value.items()}
         if isinstance(value, list | tuple):
-            return type(value)(self.take(item, f"{key}/{index}") for index, item in enumerate(value))
+            return type(value)(self._take(item, f"{key}/{index}") for index, item in enumerate(value))
         return value
 
     def wait(self) -> None:
-        """Until the copies are complete."""
-        if self._copied:
-            torch.cuda.current_stream().synchronize()
+        """Until the copies are complete; any thread may call it."""
+        if self._arrived:
+            self._arrived.synchronize()
+
+
+class _Save(NamedTuple):
+    """A save that is under way."""
+
+    iteration: int
+    since: float
+    """When it was ordered (``time.perf_counter``)."""
+    ordered: Future[None]
+    """Done once the writer has its order."""
 
 
 class Saver:
-    """Hands snapshots to the writer process of this rank (:mod:`worker.checkpoint_writer`), in order, and tells how they ended."""
+    """Hands snapshots to the writer process of this rank (:mod:`worker.checkpoint_writer`), in order, and tells how they ended.
+
+    The loop waits while the state is copied. A thread puts the copies into the form of a file, and the process writes the file.
+    """
 
     def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None) -> None:
         self.run, self.epoch, self.rank, self.ranks, self.keep = run, epoch, rank, ranks, keep
@@ -71,12 +88,13 @@ class Saver:
         """Saves of this rank that failed and that the gang has not been told of."""
         self.stall = 0.0
         """How long the last save stopped the loop [s]."""
+        self._copying = 0.0
         self._copies = HostCopies()
         self._memory = [os.memfd_create(f"muster-snapshot-{index}") for index in range(_BUFFERS)]
         self._records = os.memfd_create("muster-records")
         self._given = 0
-        self._pending: list[tuple[int, float]] = []
-        """Iteration of each save that is under way, and when it was ordered (``time.perf_counter``)."""
+        self._pending: list[_Save] = []
+        self._thread = ThreadPoolExecutor(1, "snapshots")
         self._process: subprocess.Popen[bytes] | None = None
         self._answers = b""
         self._lines: list[str] = []
@@ -96,20 +114,32 @@ class Saver:
         """Let the writer know that the metrics records up to ``iteration`` are written. Any thread may call it."""
         os.pwrite(self._records, iteration.to_bytes(8, "little"), 0)
 
+    def copy(self, state: Any) -> Any:
+        """Copies of all tensors in ``state``, to be saved. A device may still be at work on them: it is not waited for.
+
+        They are valid until the next call.
+        """
+        started = time.perf_counter()
+        if self._pending:
+            self._pending[-1].ordered.exception()  # until it has read the copies before these
+        copied = self._copies.take(state)
+        self._copying = time.perf_counter() - started
+        return copied
+
     def save(
         self,
         iteration: int,
-        files: Mapping[str, Callable[[], Any]],
+        files: Mapping[str, Any],
         facts: Mapping[str, Any] | None,
         *,
         after_records: bool = False,
         wait: bool = True,
     ) -> None:
-        """Copy the state and order its saving; returns before anything is on the volume.
+        """Order the saving of copies of the state; returns before anything is on the volume.
 
         Args:
             iteration: Iterations done.
-            files: Name of each file and a function that gives its content: dictionaries of tensors and plain values.
+            files: Name of each file and its content: dictionaries of what :meth:`copy` gave and of plain values, which stay as they are.
             facts: What the manifest says besides; the main rank gives it, and commits.
             after_records: Commit only after :meth:`note_records` of this iteration, or after :data:`RECORDS_SECONDS`.
             wait: For earlier saves, as long as they take; else the save fails where they take longer than :data:`PATIENCE`.
@@ -117,7 +147,8 @@ class Saver:
         Raises:
             StaleEpoch: A newer attempt owns the run.
         """
-        started = time.perf_counter()
+        started = time.perf_counter() - self._copying
+        self._copying = 0.0
         while len(self._pending) >= _BUFFERS:
             if not self._take_answer(None if wait else self._patience()):
                 self._fail(iteration, "earlier saves are still being written")
@@ -125,26 +156,32 @@ class Saver:
                 return
         memory = self._memory[self._given % _BUFFERS]
         self._given += 1
-        layout = []
-        snapshots = {name: self._copies.take(content(), name) for name, content in files.items()}
-        self._copies.wait()
-        with open(memory, "wb", buffering=1 << 20, closefd=False) as file:
-            file.seek(0)  # what an earlier save left behind the end stays, and is not read
-            for name, snapshot in snapshots.items():
-                begin = file.tell()
-                torch.save(snapshot, file)
-                layout.append((name, begin, file.tell() - begin))
         order = {
             "run": str(self.run.path),
             "iteration": iteration,
             "epoch": self.epoch,
             "rank": self.rank,
             "ranks": self.ranks,
+            "memory": memory,
+            "facts": facts,
+            "keep": self.keep,
+            "records": {"memory": self._records, "seconds": RECORDS_SECONDS} if after_records else None,
         }
-        records = {"memory": self._records, "seconds": RECORDS_SECONDS} if after_records else None
-        self._send({**order, "files": layout, "memory": memory, "facts": facts, "keep": self.keep, "records": records})
-        self._pending.append((iteration, started))
+        ordered = self._thread.submit(self._order, self._writer(), order, files)
+        self._pending.append(_Save(iteration, started, ordered))
         self.stall = time.perf_counter() - started
+
+    def _order(self, writer: subprocess.Popen[bytes], order: dict[str, Any], files: Mapping[str, Any]) -> None:
+        """On the thread: write the files' content into the memory that the writer reads, and send it the order."""
+        self._copies.wait()
+        layout = []
+        with open(order["memory"], "wb", buffering=1 << 20, closefd=False) as file:
+            file.seek(0)  # what an earlier save left behind the end stays, and is not read
+            for name, snapshot in files.items():
+                begin = file.tell()
+                torch.save(snapshot, file)
+                layout.append((name, begin, file.tell() - begin))
+        _send(writer, {**order, "files": layout})
 
     def poll(self) -> list[str]:
         """What has become of earlier saves, a line for each that ended; does not wait. Raises StaleEpoch."""
@@ -160,12 +197,14 @@ class Saver:
 
     def abandon(self) -> None:
         """Another rank's part of a save failed: the main rank's writer must not wait for it."""
-        for iteration, _ in self._pending:
-            self._send({"abandon": iteration})
+        for each in self._pending:
+            if self._process:
+                _send(self._process, {"abandon": each.iteration})
 
     def close(self) -> None:
         """End the writer; what is under way is waited for. Raises StaleEpoch."""
         self.wait()
+        self._thread.shutdown()
         if self._process and self._process.stdin:
             self._process.stdin.close()
             self._process.wait()
@@ -173,24 +212,21 @@ class Saver:
 
     def _patience(self) -> float:
         """How long a save still waits for the oldest one [s]."""
-        return max(0.0, self._pending[0][1] + PATIENCE - time.perf_counter())
+        return max(0.0, self._pending[0].since + PATIENCE - time.perf_counter())
 
     def _told(self) -> list[str]:
         lines, self._lines = self._lines, []
         return lines
 
-    def _send(self, order: Mapping[str, Any]) -> None:
+    def _writer(self) -> subprocess.Popen[bytes]:
+        """The writer's process, a new one where it died: what it had answered counts, the rest is lost."""
         if self._process is not None and self._process.poll() is not None:
-            while self._process is not None:  # it died: what it had answered counts, the rest is lost
+            while self._process is not None:
                 self._take_answer(None)
         if self._process is None:
             self._start()
-        assert self._process is not None and self._process.stdin is not None
-        try:
-            self._process.stdin.write(json.dumps(order).encode() + b"\n")
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            pass  # it has just died: the answer that does not come says so
+        assert self._process is not None
+        return self._process
 
     def _start(self) -> None:
         """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it.
@@ -212,6 +248,11 @@ class Saver:
 
     def _take_answer(self, seconds: float | None) -> bool:
         """Note the next answer, waiting for it up to ``seconds`` (None: for ever); False where none came. Raises StaleEpoch."""
+        if self._pending:
+            try:
+                self._pending[0].ordered.result(seconds)
+            except TimeoutError:
+                return False
         assert self._process is not None and self._process.stdout is not None
         while b"\n" not in self._answers:
             if not select.select([self._process.stdout], [], [], seconds)[0]:
@@ -222,7 +263,7 @@ class Saver:
                 return True
             self._answers += chunk
         line, _, self._answers = self._answers.partition(b"\n")
-        iteration, _ = self._pending.pop(0)
+        iteration = self._pending.pop(0).iteration
         answer = json.loads(line)
         if "stale" in answer:
             raise StaleEpoch(answer["stale"])
@@ -248,5 +289,14 @@ class Saver:
         code = self._process.wait()
         self._process = None
         lost, self._pending = self._pending, []
-        for iteration, _ in lost:
-            self._fail(iteration, f"its writer died with code {code}")
+        for each in lost:
+            self._fail(each.iteration, f"its writer died with code {code}")
+
+
+def _send(writer: subprocess.Popen[bytes], order: Mapping[str, Any]) -> None:
+    assert writer.stdin
+    try:
+        writer.stdin.write(json.dumps(order).encode() + b"\n")
+        writer.stdin.flush()
+    except BrokenPipeError:
+        pass  # it has just died: the answer that does not come says so

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -132,6 +132,8 @@ class TrainingState:
         self.seconds = 0.0
         """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
         self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep)
+        self._copied: tuple[int, dict[str, Any]] = -1, {}
+        """Iterations done, and the copies of the state after them."""
         self.ordered_at: int | None = None
         """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
         self.load_seconds = 0.0
@@ -140,6 +142,23 @@ class TrainingState:
         """The learning rate after the newest iteration, or the one with which a resumed run goes on; kept in the manifest."""
         self.set_anew: Sequence[str] = ()
         """One log line for each value that this job's settings replace in the checkpoint."""
+
+    def copy(self, iteration: int) -> None:
+        """Copy what a save after ``iteration`` needs.
+
+        Called before the host waits for the iteration's numbers, it takes no time on a device, which copies once it has come so far.
+        """
+        worlds = {"first": self.share.first, "count": self.share.count}
+        self._copied = (
+            iteration,
+            self.saver.copy(
+                {
+                    "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
+                    "generators": generator_state(),
+                    "algorithm": self.algorithm.state_dict() if self.gang.is_main else {},
+                }
+            ),
+        )
 
     def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
@@ -152,16 +171,14 @@ class TrainingState:
         Raises:
             StaleEpoch: A newer attempt owns the run.
         """
-        worlds = {"first": self.share.first, "count": self.share.count}
-        files: dict[str, Callable[[], Any]] = {
-            f"rank-{self.gang.rank}.pt": lambda: {
-                "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
-                "generators": generator_state(),
-            }
-        }
-        if self.gang.is_main:
-            files["learner.pt"] = lambda: {"algorithm": self.algorithm.state_dict(), "progress": asdict(self.progress)}
         iteration = self.progress.iteration
+        if self._copied[0] != iteration:
+            self.copy(iteration)
+        copied = self._copied[1]
+        self._copied = -1, {}
+        files = {f"rank-{self.gang.rank}.pt": {name: copied[name] for name in ("worlds", "generators")}}
+        if self.gang.is_main:
+            files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": asdict(self.progress)}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
         facts = self._manifest() if self.gang.is_main else None

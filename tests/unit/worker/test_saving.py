@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -30,8 +30,8 @@ def run(tmp_path: Path) -> Run:
     return run
 
 
-def content(iteration: int, size: int = 1000) -> dict[str, Callable[[], dict[str, torch.Tensor]]]:
-    return {"learner.pt": lambda: {"value": torch.full((size,), float(iteration))}}
+def content(iteration: int, size: int = 1000) -> dict[str, dict[str, torch.Tensor]]:
+    return {"learner.pt": {"value": torch.full((size,), float(iteration))}}
 
 
 def test_saves_are_committed_in_order_and_verify(run: Run) -> None:
@@ -54,7 +54,7 @@ def test_saves_are_committed_in_order_and_verify(run: Run) -> None:
 def test_what_is_saved_is_the_state_at_the_order_not_at_the_writing(run: Run) -> None:
     saver = Saver(run, 1, 0, 1, keep=None)
     live = torch.zeros(200_000)
-    saver.save(1, {"learner.pt": lambda: {"value": live}}, {})
+    saver.save(1, {"learner.pt": saver.copy({"value": live})}, {})
     live.fill_(9.0)
     saver.wait()
     loaded = torch.load(list_checkpoints(run)[0].path / "learner.pt", weights_only=True)
@@ -62,12 +62,31 @@ def test_what_is_saved_is_the_state_at_the_order_not_at_the_writing(run: Run) ->
     saver.close()
 
 
+def test_a_copy_that_is_still_being_written_is_not_written_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second copy waits for the thread, which writes the first one into memory."""
+    saver, save = Saver(run, 1, 0, 1, keep=None), torch.save
+    monkeypatch.setattr(torch, "save", lambda *given: (time.sleep(0.5), save(*given)))
+    saver.save(1, {"learner.pt": saver.copy({"value": torch.ones(3)})}, {})
+    assert saver.stall < 0.4
+    saver.save(2, {"learner.pt": saver.copy({"value": torch.zeros(3)})}, {})
+    assert saver.stall > 0.4
+    assert saver.wait()[-1] == "checkpoint 00000002-e1" and len(list_checkpoints(run)) == 2
+    saver.close()
+
+
+def test_a_state_that_can_not_be_written_down_ends_the_training_and_not_in_silence(run: Run) -> None:
+    saver = Saver(run, 1, 0, 1, keep=None)
+    saver.save(1, {"learner.pt": {"value": lambda: None}}, {})
+    with pytest.raises((AttributeError, pickle.PicklingError), match="local object"):
+        saver.wait()
+
+
 def test_the_main_writer_commits_only_when_every_rank_is_durable(run: Run) -> None:
     main, other = Saver(run, 1, 0, 2, keep=None), Saver(run, 1, 1, 2, keep=None)
     main.save(4, content(4), {})
     time.sleep(0.5)
     assert main.poll() == [] and list_checkpoints(run) == []
-    other.save(4, {"rank-1.pt": lambda: {"value": torch.ones(3)}}, None)
+    other.save(4, {"rank-1.pt": {"value": torch.ones(3)}}, None)
     assert main.wait() == ["checkpoint 00000004-e1"]
     assert set(list_checkpoints(run)[0].manifest["files"]) == {"learner.pt", "rank-1.pt"}
     main.save(5, content(5), {})
