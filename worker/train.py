@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import sys
 
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, run_command, user_errors
+
+SWITCH_SECONDS = 0.0005
+"""For how long a thread that reports or saves may keep the interpreter from the training thread, whose device may be idle meanwhile [s]."""
 
 
 def main() -> int:
     """Train; returns the exit code."""
     stop = StopRequest().listen()  # before the imports, which take seconds
+    sys.setswitchinterval(SWITCH_SECONDS)
     job = Job.from_env(os.environ, "train")
     from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 

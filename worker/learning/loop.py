@@ -197,8 +197,11 @@ class Loop:
         self._stopwatch.mark()
         if self.cadence.expects(progress.iteration + 1) or progress.iteration + 1 == self.training.iterations:
             self.state.copy(progress.iteration + 1)
+        self.reporter.release()
         # the one transfer of the iteration: from here on the host knows
         learnt, totals = self._exchange.read(metrics)
+        if self._collecting.can_be_captured:
+            self.reporter.hold()
         signals = {name: totals[name][0] for name in SIGNALS}
         progress.iteration += 1
         self.state.learning_rate = learnt.get("learning_rate")

@@ -19,6 +19,8 @@ _EVERY = 1.0
 """Seconds between two reads of the epoch."""
 _MOST = 10_000
 """Calls that are kept while the volume does not take them; later ones are dropped."""
+_HELD = 0.02
+"""Seconds that a call waits at most for :meth:`Reporter.release`."""
 _FAREWELL = 30.0
 """Seconds that the end of a training waits for the volume to take the last records."""
 
@@ -60,6 +62,8 @@ class Reporter:
         self._calls: queue.Queue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.Queue(_MOST)
         self._dropped = 0
         self._failed = 0
+        self._free = threading.Event()
+        self._free.set()
         threading.Thread(target=self._run, name="reporter", daemon=True).start()
 
     def do(self, function: Callable[..., object], *arguments: Any) -> None:
@@ -68,6 +72,14 @@ class Reporter:
             self._calls.put_nowait((function, arguments))
         except queue.Full:  # there is nobody to tell: what would print it is what hangs
             self._dropped += 1
+
+    def hold(self) -> None:
+        """Begin no call for a moment: the training thread is about to give a device its work, and needs the interpreter."""
+        self._free.clear()
+
+    def release(self) -> None:
+        """The device is at work: go on."""
+        self._free.set()
 
     def close(self) -> None:
         """Wait for the calls that are left, at most :data:`_FAREWELL` seconds, and print how many were lost."""
@@ -81,6 +93,7 @@ class Reporter:
     def _run(self) -> None:
         while True:
             function, arguments = self._calls.get()
+            self._free.wait(_HELD)
             try:
                 function(*arguments)
             except Exception as error:  # the thread must live: without it every later record would be lost

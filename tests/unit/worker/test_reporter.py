@@ -36,6 +36,22 @@ def test_reports_are_made_in_order_and_nobody_waits_for_them() -> None:
     assert done == list(range(1000))
 
 
+def test_what_is_held_is_made_once_it_is_released_or_after_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reporting, "_HELD", 60.0)
+    reporter, done = Reporter(), []
+    reporter.hold()
+    reporter.do(done.append, 1)
+    time.sleep(0.1)
+    assert done == []
+    reporter.release()
+    wait_for(lambda: done == [1])
+    monkeypatch.setattr(reporting, "_HELD", 0.01)
+    reporter.hold()
+    reporter.do(done.append, 2)
+    reporter.close()
+    assert done == [1, 2]
+
+
 def test_a_report_that_fails_is_told_once_and_later_ones_are_made(capsys: pytest.CaptureFixture[str]) -> None:
     reporter, done = Reporter(), []
     for _ in range(3):
