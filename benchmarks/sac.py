@@ -48,6 +48,11 @@ def train(task: str, algorithm: str, seed: int, judged: bool) -> dict[str, Any]:
     return told | found | {"curve": curve}
 
 
+def thinned(row: dict[str, Any]) -> dict[str, Any]:
+    """The row with about 300 points of its curve."""
+    return row | {"curve": row["curve"][:: max(1, len(row["curve"]) // 300)]}
+
+
 def reached(curve: list[tuple[float, int, float]], goal: float) -> tuple[float, int] | None:
     """Seconds and steps when ten iterations in a row had reached ``goal`` on average; None where they never did."""
     for end in range(10, len(curve) + 1):
@@ -137,7 +142,7 @@ def main() -> None:
                 judged = seed == options.seeds[0]
                 rows.append(train(task, algorithm, seed, judged) | watch.check(f"while {task} was trained"))
                 print(task, algorithm, seed, rows[-1]["curve"][-1:], flush=True)
-                (options.out / "sac.json").write_text(json.dumps(rows))
+                (options.out / "sac.json").write_text(json.dumps([thinned(row) for row in rows]))
                 (options.out / "sac.md").write_text(table(rows))
     draw(rows, options.out / "sac.png")
 
