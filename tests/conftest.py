@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import os
 import signal
@@ -172,6 +173,14 @@ def submit_gang(
     registered = client.batch("RegisterJobDefinition", **definition)
     submitted = client.batch("SubmitJob", jobName=name, jobQueue=queue, jobDefinition=registered["jobDefinitionArn"])
     return str(submitted["jobId"])
+
+
+@pytest.fixture(autouse=True, scope="session")
+def nothing_is_frozen() -> Iterator[None]:
+    """What a training freezes when it begins would outlast its test, with its open files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gc, "freeze", lambda: None)
+        yield
 
 
 @pytest.fixture(scope="session")

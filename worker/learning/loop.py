@@ -126,7 +126,8 @@ class Loop:
             self.fence.close()
 
     def close(self) -> None:
-        """Leave the gang; nothing can be trained afterwards."""
+        """Leave the gang, and end what saves; nothing can be trained afterwards."""
+        self.state.saver.close()
         for part in (self._collecting, *self.algorithm.graphs):
             part.release()
         self.gang.close()

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
@@ -90,8 +90,8 @@ class Saver:
         """How long the last save stopped the loop [s]."""
         self._copying = 0.0
         self._copies = HostCopies()
-        self._memory = [os.memfd_create(f"muster-snapshot-{index}") for index in range(_BUFFERS)]
-        self._records = os.memfd_create("muster-records")
+        self._memory = [os.fdopen(os.memfd_create("muster-snapshot"), "wb", 1 << 20) for _ in range(_BUFFERS)]
+        self._records = os.fdopen(os.memfd_create("muster-records"), "wb")
         self._given = 0
         self._pending: list[_Save] = []
         self._thread = ThreadPoolExecutor(1, "snapshots")
@@ -112,7 +112,7 @@ class Saver:
 
     def note_records(self, iteration: int) -> None:
         """Let the writer know that the metrics records up to ``iteration`` are written. Any thread may call it."""
-        os.pwrite(self._records, iteration.to_bytes(8, "little"), 0)
+        os.pwrite(self._records.fileno(), iteration.to_bytes(8, "little"), 0)
 
     def copy(self, state: Any) -> Any:
         """Copies of all tensors in ``state``, to be saved. A device may still be at work on them: it is not waited for.
@@ -162,25 +162,27 @@ class Saver:
             "epoch": self.epoch,
             "rank": self.rank,
             "ranks": self.ranks,
-            "memory": memory,
+            "memory": memory.fileno(),
             "facts": facts,
             "keep": self.keep,
-            "records": {"memory": self._records, "seconds": RECORDS_SECONDS} if after_records else None,
+            "records": {"memory": self._records.fileno(), "seconds": RECORDS_SECONDS} if after_records else None,
         }
-        ordered = self._thread.submit(self._order, self._writer(), order, files)
+        ordered = self._thread.submit(self._order, self._writer(), memory, order, files)
         self._pending.append(_Save(iteration, started, ordered))
         self.stall = time.perf_counter() - started
 
-    def _order(self, writer: subprocess.Popen[bytes], order: dict[str, Any], files: Mapping[str, Any]) -> None:
+    def _order(
+        self, writer: subprocess.Popen[bytes], memory: BinaryIO, order: Mapping[str, Any], files: Mapping[str, Any]
+    ) -> None:
         """On the thread: write the files' content into the memory that the writer reads, and send it the order."""
         self._copies.wait()
         layout = []
-        with open(order["memory"], "wb", buffering=1 << 20, closefd=False) as file:
-            file.seek(0)  # what an earlier save left behind the end stays, and is not read
-            for name, snapshot in files.items():
-                begin = file.tell()
-                torch.save(snapshot, file)
-                layout.append((name, begin, file.tell() - begin))
+        memory.seek(0)  # what an earlier save left behind the end stays, and is not read
+        for name, snapshot in files.items():
+            begin = memory.tell()
+            torch.save(snapshot, memory)
+            layout.append((name, begin, memory.tell() - begin))
+        memory.flush()
         _send(writer, {**order, "files": layout})
 
     def poll(self) -> list[str]:
@@ -209,6 +211,8 @@ class Saver:
             self._process.stdin.close()
             self._process.wait()
             self._process = None
+        for file in (*self._memory, self._records):
+            file.close()
 
     def _patience(self) -> float:
         """How long a save still waits for the oldest one [s]."""
@@ -240,7 +244,7 @@ class Saver:
                 tied([sys.executable, "-P", "-m", "worker.checkpoint_writer"], ignoring=[signal.SIGTERM]),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                pass_fds=[*self._memory, self._records],
+                pass_fds=[file.fileno() for file in (*self._memory, self._records)],
                 start_new_session=True,
             )
         finally:
