@@ -19,6 +19,14 @@ def first_difference(old: Any, new: Any, keys: Iterable[str]) -> tuple[str, Any,
     return next((pair for pair in pairs if pair[1] != pair[2]), None)
 
 
+def innermost(key: str, old: Any, new: Any) -> tuple[str, Any, Any]:
+    """The first part of a setting that differs, with both values: of sections the first of their keys."""
+    while isinstance(old, Mapping) and isinstance(new, Mapping):
+        part = next(name for name in {**old, **new} if old.get(name) != new.get(name))
+        key, old, new = f"{key}.{part}", old.get(part), new.get(part)
+    return key, old, new
+
+
 def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> list[str]:
     """The settings that a run can't change once it has a checkpoint, as the class of an algorithm's settings names them.
 

@@ -28,7 +28,7 @@ from orchestrator.tables import Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
 from shared_store.parent import NewRun, RunExists, TeacherCopy
-from shared_store.settings import first_difference, fixed_settings, setting_at
+from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 
 
 def clone(
@@ -165,7 +165,7 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
     fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
     asked = [key for key in fixed if setting_at(given, key) is not None]
     if difference := first_difference(settings, given, asked):
-        key, there, here = difference
+        key, there, here = innermost(*difference)
         raise ClientError(
             f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
         )

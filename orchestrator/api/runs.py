@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import ColumnElement, select
@@ -23,14 +23,14 @@ from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
-from orchestrator.spec import ALGORITHMS, Spec, override, validate
+from orchestrator.spec import ALGORITHMS, Spec, Train, override, validate
 from orchestrator.tables import Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
 from shared_store.files import DamagedFile, read_json
 from shared_store.layout import LARGEST_DESCRIPTION, Run
 from shared_store.metrics import history_of
 from shared_store.parent import TeacherCopy
-from shared_store.settings import first_difference, fixed_settings, setting_at
+from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 
 
 def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
@@ -161,7 +161,9 @@ def _resume(
             )
         try:
             before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
-            spec = validate(override(document, changes.all()), f"run {run.name}")
+            changed = override(document, changes.all())
+            _check_algorithm(run, before, changed)
+            spec = validate(changed, f"run {run.name}")
         except SpecError as error:
             raise ClientError(str(error)) from None
         _check_changes(run, before, spec)
@@ -201,6 +203,16 @@ def last_metrics(run: Run) -> dict[str, Any] | None:
         return None
 
 
+def _check_algorithm(run: Run, before: Spec, changed: Mapping[str, Any]) -> None:
+    """Refuse another algorithm first: what is wrong with its settings, which are the old one's, would not help anybody."""
+    new = setting_at(changed, "train.algorithm") or Train.model_fields["algorithm"].default
+    if before.train and new != before.train.algorithm:
+        raise ClientError(
+            f"run {run.name}: train.algorithm is {before.train.algorithm} and can't become {shown(new)}, which can't go on from its "
+            "state; start a new run for that"
+        )
+
+
 def _check_changes(run: Run, before: Spec, after: Spec) -> None:
     """A run is one history: what its state depends on can't change under it."""
     if before.train is None or after.train is None:
@@ -209,7 +221,7 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         return
     was, wanted = (dict(each.train) for each in (before, after))  # type: ignore[arg-type]
     if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
-        key, old, new = difference
+        key, old, new = innermost(*difference)
         raise ClientError(
             f"run {run.name}: train.{key} is {_shown(old)} and can't become {_shown(new)}; start a new run for that: "
             f"muster clone {run.name} --name NEW begins one with its weights"
@@ -217,9 +229,9 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
     name = after.train.algorithm
     kind = ALGORITHMS.get(name)
     if difference := first_difference(before.train.given(), after.train.given(), fixed_settings(kind)):
-        key, *values = difference
-        old, new = ("the task's own" if value is None else shown(value) for value in values)
-        may = key not in fixed_settings(kind, of_clone=True)
+        may = difference[0] not in fixed_settings(kind, of_clone=True)
+        key, *values = innermost(*difference)
+        old, new = ("not set" if value is None else shown(value) for value in values)
         raise ClientError(
             f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
             "start a new run for that"

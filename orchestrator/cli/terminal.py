@@ -81,13 +81,14 @@ class Console(rich.console.Console):
 
 def print_cut(table: Table) -> None:
     """One line a row: on a terminal the last column is cut to what the others leave of its width, for another program all is whole."""
+    console, wide = Console(), Console(width=10 * WHOLE)
+    widths = [max(wide.measure(cell).maximum for cell in (each.header, *each.cells)) for each in table.columns]
+    for column, width in zip(table.columns[:-1], widths, strict=False):  # rich would shrink all of them alike
+        column.min_width = width
+    taken = sum(2 + width for width in widths[:-1])
     if not sys.stdout.isatty():
-        Console(width=WHOLE).print(table)
+        Console(width=taken + 2 + widths[-1]).print(table, soft_wrap=True)
         return
-    console, wide = Console(), Console(width=WHOLE)
-    for column in table.columns[:-1]:  # rich would shrink all of them alike
-        column.min_width = max(wide.measure(cell).maximum for cell in (column.header, *column.cells))
-    taken = sum(2 + (column.min_width or 0) for column in table.columns[:-1])
     table.columns[-1].max_width = max(len("REASON"), console.width - taken)
     Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
 

@@ -11,7 +11,7 @@ import torch
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.files import DamagedFile
 from shared_store.parent import parent_checkpoint
-from shared_store.settings import first_difference, fixed_settings
+from shared_store.settings import first_difference, fixed_settings, innermost
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
@@ -80,7 +80,7 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
         return  # whether a class of the user's own reads the other's, or is read, only the loading shows
     fixed = fixed_settings(algorithm.config_type, there.get("settings") or {}, of_clone=True)
     if difference := first_difference(there.get("settings"), here["settings"], fixed):
-        key, old, new = difference
+        key, old, new = innermost(*difference)
         raise UserError(
             f"the weights of checkpoint {checkpoint.name} do not fit this job: {section_of(here['algorithm'])}.{key} is {old!r} "
             f"there and {new!r} here; leave the setting as it is there"

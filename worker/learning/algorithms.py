@@ -8,11 +8,12 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import ValidationError
 from pydantic_core import ArgsKwargs
 
@@ -73,6 +74,43 @@ def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
         )
 
 
+def check_state(algorithm: Algorithm, name: str) -> None:
+    """Raises UserError where the state of an algorithm has no policy, which evaluation and export read."""
+    if not isinstance(algorithm.state_dict().get("policy"), Mapping):
+        raise UserError(f'train.algorithm: {name}: state_dict() must hold "policy", the state_dict() of its policy')
+
+
+def check_actions(actions: Any, expected: torch.Size, name: str) -> None:
+    """Raises UserError for actions that are no tensor of the ``expected`` shape."""
+    if not isinstance(actions, torch.Tensor) or actions.shape != expected:
+        found = tuple(actions.shape) if isinstance(actions, torch.Tensor) else type(actions).__name__
+        raise UserError(
+            f"train.algorithm: {name}: act() must give a tensor of shape {tuple(expected)} (worlds, actions); it gave {found}"
+        )
+
+
+def check_metrics(metrics: Any, name: str) -> None:
+    """Raises UserError for metrics that are not scalar tensors by name."""
+    if not isinstance(metrics, Mapping):
+        raise UserError(
+            f"train.algorithm: {name}: learn() must give a mapping of metrics, not a {type(metrics).__name__}"
+        )
+    for key, value in metrics.items():
+        if not isinstance(value, torch.Tensor) or value.shape != ():
+            found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+            raise UserError(
+                f"train.algorithm: {name}: learn() must give tensors of shape (); its metric {key} is {found}"
+            )
+
+
+def check_names(metrics: Collection[str], record: Collection[str], name: str) -> None:
+    """Raises UserError for a metric that is called like a number of every record."""
+    if taken := sorted(set(metrics) & set(record)):
+        raise UserError(
+            f"train.algorithm: {name}: a metric of learn() can't be called {taken[0]}: every record has one"
+        )
+
+
 def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:
     """The algorithm's settings: the task's own for it, with what the job sets. Raises UserError naming the key.
 
@@ -84,6 +122,8 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
     kind = algorithm.config_type
+    if not dataclasses.is_dataclass(kind):
+        raise UserError(f"train.algorithm: {name}: its config_type must be a dataclass, not {kind.__name__}")
     known = [item.name for item in dataclasses.fields(kind)]
     for key in given:
         if key not in known:

@@ -14,6 +14,7 @@ from worker.distributed import Gang
 from worker.errors import TrainingError
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.cuda_graph import CudaGraphFunction
@@ -86,7 +87,9 @@ class Loop:
         training, gang = self.training, self.gang
         seed_generators(training.seed)
         task = build_task(training.task_type, training.config, self.share, gang, training.seed)
-        return task, build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
+        made = build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
+        check_state(made, training.algorithm)
+        return task, made
 
     def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
         """The first start of a run, which may be a clone: returns the checkpoint with whose weights it begins."""
@@ -195,6 +198,8 @@ class Loop:
         self._stopwatch.mark()
         self._exchange.gather(self._stopwatch.collect, self._signals())
         metrics = algorithm.learn(self._observations)
+        if self.iterated == 0:
+            check_metrics(metrics, self.training.algorithm)
         self._stopwatch.mark()
         if self.cadence.expects(progress.iteration + 1) or progress.iteration + 1 == self.training.iterations:
             self.state.copy(progress.iteration + 1)
@@ -211,6 +216,8 @@ class Loop:
             worst = ", ".join(f"{name} {value:g}" for name, value in learnt.items())
             raise self._failure(f"the loss is not finite ({worst})", "Try a smaller learning_rate")
         record = self._count(totals["statistics"])
+        if self.iterated == 1:
+            check_names(learnt, record, self.training.algorithm)
         if record.get("nan_worlds"):
             self._judge_resets(int(record["nan_worlds"]), totals["mishap"])
         return record | learnt | straggler(totals["collected"]), signals
@@ -271,6 +278,8 @@ class Loop:
         self.incident.keep()
         for step in range(self.algorithm.steps):
             actions = self.algorithm.act(self._observations)
+            if self.iterated == 0:
+                check_actions(actions, self.task.actions.shape, self.training.algorithm)
             self.incident.note(step, actions)
             self.task.step(actions)
             self.algorithm.record(self._step)

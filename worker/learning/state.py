@@ -25,7 +25,7 @@ from shared_store.checkpoints import (
     sweep,
 )
 from shared_store.epoch import check_epoch
-from shared_store.settings import first_difference, fixed_settings, setting_at
+from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
@@ -296,8 +296,9 @@ class TrainingState:
         settings = [f"settings.{key}" for key in fixed_settings(self.algorithm.config_type, there["settings"])]
         difference = first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings])
         if difference:
-            key, old, new = difference
-            if key in settings:  # as a job's YAML calls it
+            ours = difference[0] in settings
+            key, old, new = innermost(*difference)
+            if ours:  # as a job's YAML calls it
                 key = f"{section_of(there['algorithm'])}.{key.removeprefix('settings.')}"
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "

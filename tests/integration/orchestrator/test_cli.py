@@ -281,6 +281,17 @@ def test_a_narrow_terminal_cuts_the_reasons_and_nothing_else(
     assert second == ["4567abcd", "another", "RUNNABLE", "waits"]
 
 
+def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for column in ("JOB", "NAME", "REASON"):
+        table.add_column(column, no_wrap=True, overflow="ellipsis" if column == "REASON" else "fold")
+    table.add_row("0123abcd", "a-job", "a long story " * 120)
+    print_cut(table)
+    header, row = capsys.readouterr().out.splitlines()
+    assert header.split() == ["JOB", "NAME", "REASON"] and row.split()[:2] == ["0123abcd", "a-job"]
+    assert row.count("story") == 120
+
+
 def test_what_set_gave_is_not_blamed_on_a_line_of_the_file(tmp_path: Path) -> None:
     wrong = ["submit", "job_specs/cartpole.yaml", "--dry-run", "--set", "train.task=Cartpol"]
     refused(wrong, tmp_path, 2, "muster: --set: train.task: no task is called 'Cartpol'")

@@ -169,7 +169,11 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> loops.Loop:
         ("ppo", {"ppo": {"normalize_observations": False}}, "ppo.normalize_observations is True there and False here"),
         ("ppo", {"ppo": {"init_std": 0.5}}, "ppo.init_std is 1.0 there and 0.5 here"),
         ("sac", {**KINDS["sac"], "sac": {**SMALL_SAC, "v_max": 5.0}}, "sac.v_max is 20.0 there and 5.0 here"),
-        ("rsl_rl", {**KINDS["rsl_rl"], "rsl_rl": {**SMALL_RSL, "actor": {"hidden_dims": [9]}}}, "rsl_rl.actor is "),
+        (
+            "rsl_rl",
+            {**KINDS["rsl_rl"], "rsl_rl": {**SMALL_RSL, "actor": {"hidden_dims": [9]}}},
+            "rsl_rl.actor.hidden_dims is ",
+        ),
         (
             "ppo",
             KINDS["own"],

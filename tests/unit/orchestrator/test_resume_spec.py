@@ -158,7 +158,8 @@ def test_a_job_does_not_become_one_of_another_kind() -> None:
 
 
 PROBES = ["1", "2", "0.5", "0.25", "true", "false", "[8]", "[8, 4, 2]", "[0.1, 0.2]", "adamw", "fixed", "tanh"]
-PROBES += ["critic", "min", "min_or_mean", "{a: [b]}", "{a: 1}", "run@3", "default"]
+PROBES += ["critic", "min", "min_or_mean", "{a: [b]}", "{actor: [policy]}", "{a: 1}", "{learning_rate: 0.5}"]
+PROBES += ["run@3", "default"]
 
 
 def accepted_value(name: str, key: str) -> str:
@@ -186,7 +187,7 @@ def test_each_setting_of_an_algorithm_is_carried_to_the_rank_or_refused_by_name(
         before, after = changed("train", f"train.{name}.{item.name}={probe}", algorithm=name)
         if item.name in fixed:
             may = "muster clone ant" if item.name in kind.clone_may_change else "start a new run for that$"
-            with pytest.raises(ClientError, match=rf"run ant: train\.{name}\.{item.name} is the task's own .*{may}"):
+            with pytest.raises(ClientError, match=rf"run ant: train\.{name}\.{item.name} is not set .*{may}"):
                 _check_changes(RUN, before, after)
         else:
             _check_changes(RUN, before, after)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from shared_store.settings import first_difference, fixed_settings, setting_at
+from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 
 KIND = SimpleNamespace(fixed=("sizes", "net.depth", "rate"), clone_may_change=("rate",))
 
@@ -20,6 +20,14 @@ def test_the_first_difference_is_told_with_both_values() -> None:
     old, new = {"sizes": [8], "net": {"depth": 3}}, {"sizes": [8], "net": {"depth": 0}, "rate": {}}
     assert first_difference(old, new, KIND.fixed) == ("net.depth", 3, 0)
     assert first_difference(old, new, ("sizes", "rate")) is None
+
+
+def test_of_sections_the_first_key_that_differs_is_told() -> None:
+    old = {"class_name": "RNNModel", "rnn": {"type": "gru", "size": 64}}
+    new = {"class_name": "RNNModel", "rnn": {"type": "gru", "size": 32}}
+    assert innermost("actor", old, new) == ("actor.rnn.size", 64, 32)
+    assert innermost("actor", {"a": 1}, {"a": 1, "b": 2}) == ("actor.b", None, 2)
+    assert innermost("actor", None, {"a": 1}) == ("actor", None, {"a": 1})
 
 
 def test_what_is_fixed_is_as_the_class_says_and_as_the_checkpoint_knows() -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+import torch
 import warp
 
 from tests.conftest import REPOSITORY
@@ -17,7 +18,15 @@ from tests.support.worker.point_task import Point, PointConfig
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Share
-from worker.learning.algorithms import find_algorithm, installed
+from worker.learning.algorithms import (
+    check_actions,
+    check_metrics,
+    check_names,
+    check_state,
+    find_algorithm,
+    installed,
+    settings,
+)
 from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo import draws, objective
 from worker.learning.sac import kernels
@@ -52,6 +61,34 @@ def test_a_class_that_is_no_algorithm_is_refused_with_all_that_it_lacks() -> Non
     lacks = "begin, act, record, load_state_dict, world_state, load_world_state, build_policy"
     with pytest.raises(UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is no algorithm: it lacks {lacks} \("):
         find_algorithm(f"{HERE}:OnlyLearns")
+
+
+class WithoutPolicy(OnlyLearns):
+    config_type = dict
+
+    def state_dict(self) -> Any:
+        return {"weights": torch.ones(1)}
+
+
+def test_what_an_algorithm_of_ones_own_does_wrong_is_said_in_one_line() -> None:
+    with pytest.raises(UserError, match=r'^train\.algorithm: own:A: state_dict\(\) must hold "policy"'):
+        check_state(WithoutPolicy(), "own:A")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"own:A: its config_type must be a dataclass, not dict$"):
+        settings(WithoutPolicy, "own:A", PointConfig(), {})  # type: ignore[arg-type]
+    with pytest.raises(
+        UserError, match=r"act\(\) must give a tensor of shape \(4, 2\) \(worlds, actions\); it gave \(4,\)$"
+    ):
+        check_actions(torch.zeros(4), torch.Size((4, 2)), "own:A")
+    check_actions(torch.zeros(4, 2), torch.Size((4, 2)), "own:A")
+    for metrics, said in (
+        (None, "a mapping of metrics, not a NoneType"),
+        ({"loss": 0.5}, r"tensors of shape \(\); its metric loss is float"),
+        ({"loss": torch.zeros(3)}, r"tensors of shape \(\); its metric loss is \(3,\)"),
+    ):
+        with pytest.raises(UserError, match=rf"own:A: learn\(\) must give {said}$"):
+            check_metrics(metrics, "own:A")
+    with pytest.raises(UserError, match=r"own:A: a metric of learn\(\) can't be called reward: every record has one$"):
+        check_names(["loss", "reward"], ["reward", "score"], "own:A")
 
 
 def test_what_only_an_instance_has_is_looked_for_before_the_first_iteration() -> None:

@@ -148,7 +148,6 @@ TAUGHT = {"teacher_checkpoint": "taught"}
     [
         ({"algorithm": {"class_name": "PPOO"}}, r"algorithm\.class_name: Could not resolve 'PPOO'"),
         ({"algorithm": {"class_name": "torch:nn"}}, r"algorithm\.class_name: torch:nn is not an algorithm"),
-        ({"algorithm": {"clip": 0.1}}, r"algorithm: .* unexpected keyword argument 'clip'"),
         (own(gamma="99e-2"), r"algorithm\.gamma: expected a number, found a text \('99e-2'\)$"),
         (own(num_mini_batches=2.5), r"algorithm\.num_mini_batches: expected a whole number, found a number \(2\.5\)$"),
         (own(max_grad_norm=None), r"algorithm\.max_grad_norm: expected a number, found nothing$"),
@@ -190,7 +189,6 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         ({**own(), "student": GRU}, r"student: .*:OwnPPO has the networks actor and critic$"),
         ({**own(), **TAUGHT}, r"teacher_checkpoint: .*:OwnPPO has no teacher"),
         (own("Distillation"), r"teacher_checkpoint: name the run that trained the teacher"),
-        ({"algorithm": {**DISTILLATION, "rnd_cfg": RND}, **TAUGHT}, r"algorithm: The RND extension is not compatible"),
         (
             {**own("Distillation", gradient_length=9), **TAUGHT},
             r"algorithm\.gradient_length: .* 8 steps .*, 9 are needed",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import math
 import subprocess
@@ -10,9 +11,11 @@ import sys
 from typing import Any
 
 import pytest
+import rsl_rl.algorithms
 
 from tests.support.worker.rsl_loop import settings
 from worker.errors import UserError
+from worker.learning.rsl import checks
 from worker.learning.rsl.settings import REFUSED, RslRlConfig
 
 
@@ -91,6 +94,13 @@ def scheduled(**keys: Any) -> dict[str, Any]:
             ppo(rnd_cfg=scheduled(mode="step", final_step=3)),
             r"algorithm\.rnd_cfg\.weight_schedule\.final_value: is required$",
         ),
+        (ppo(num_minibatches=2), r"algorithm\.num_minibatches: there is no such key; did you mean num_mini_batches\?$"),
+        (ppo(symmetry_cfg={"mirror": "a:b"}), r"algorithm\.symmetry_cfg\.data_augmentation_func: is required$"),
+        (
+            ppo(rnd_cfg=scheduled(mode="constant", steps=3)),
+            r"algorithm\.rnd_cfg\.weight_schedule\.steps: there is no such key; there are mode$",
+        ),
+        ({"obs_groups": {"critc": ["policy"]}}, r"obs_groups\.critc: PPO has no such set; did you mean critic\?$"),
         (ppo(symmetry_cfg={}), r"algorithm\.symmetry_cfg\.data_augmentation_func: is required$"),
         (ppo(class_name="Distillation"), r"teacher_checkpoint: name the run that trained the teacher$"),
         ({"teacher_checkpoint": "taught"}, r"teacher_checkpoint: PPO has no teacher; leave it out$"),
@@ -123,3 +133,12 @@ def test_no_key_is_known_and_refused() -> None:
 )
 def test_settings_that_rsl_rl_takes_are_taken(section: dict[str, Any]) -> None:
     assert settings(section).section("algorithm").items() >= section["algorithm"].items()
+
+
+@pytest.mark.parametrize("kind", ["PPO", "Distillation"])
+def test_every_key_that_rsl_rl_s_classes_take_is_known(kind: str) -> None:
+    """But for what their runner gives them."""
+    taken = set(inspect.signature(getattr(rsl_rl.algorithms, kind)).parameters)
+    given = {"actor", "critic", "student", "teacher", "storage", "device", "multi_gpu_cfg", "kwargs"}
+    known = set(checks._SECTIONS[kind].json_schema()["properties"])
+    assert taken - given <= known and known - taken <= {"class_name", "share_cnn_encoders"}

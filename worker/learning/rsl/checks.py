@@ -1,6 +1,6 @@
 """What rsl_rl takes in the section ``algorithm`` of its classes: checked beforehand, since rsl_rl stumbles over it while it learns.
 
-Keys that are not here are left to rsl_rl, which refuses those that it does not know when it is built. Imported without torch.
+Of a class of one's own only what it has in common with them. Imported without torch.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal, Required
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
-from shared_store.wording import Refused, explain, kind_of, shown
+from shared_store.wording import Refused, explain, kind_of, nearest, shown
 
-_CHECKED = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+_CHECKED = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Widths = Annotated[list[int], Field(min_length=1)]
@@ -62,6 +62,7 @@ class _Symmetry(TypedDict, total=False):
 
 
 class _Any(TypedDict, total=False):
+    class_name: str
     num_learning_epochs: Count
     learning_rate: float
     optimizer: str
@@ -174,4 +175,18 @@ def _check(kind: TypeAdapter[Any], section: Mapping[str, Any], where: tuple[str 
         kind.validate_python(section)
     except ValidationError as error:
         first: Any = error.errors(include_url=False)[0]
-        raise Refused((*where, *first["loc"]), explain(first)) from None
+        words = explain(first)
+        if first["type"] == "extra_forbidden":
+            words = f"there is no such key; {nearest(str(first['loc'][-1]), _keys(kind, first['loc']))}"
+        raise Refused((*where, *first["loc"]), words) from None
+
+
+def _keys(kind: TypeAdapter[Any], path: tuple[str | int, ...]) -> list[str]:
+    """The keys that are known where ``path`` ends."""
+    schema = kind.json_schema()
+    found = schema
+    for part in path[:-1]:
+        options = found["properties"][part]
+        for option in options.get("anyOf", [options]):
+            found = schema["$defs"][option["$ref"].rpartition("/")[2]] if "$ref" in option else found
+    return sorted(found["properties"])

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from shared_store.wording import Refused, nearest
 from worker.learning.rsl.checks import check_algorithm, check_finite, check_gradient_length, check_networks, class_of
 
 _NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "elu", "obs_normalization": True}
@@ -25,6 +26,8 @@ DEFAULTS: Mapping[str, dict[str, Any]] = {
 
 NETWORKS = ("actor", "critic", "student", "teacher")
 """Names of networks, of configuration sections and of observation sets alike."""
+SETS = (*NETWORKS, "rnd_state")
+"""Names of observation sets of rsl_rl's own algorithms."""
 Network = Annotated[dict[str, Any], AfterValidator(check_finite)]
 
 _LOGS = "every run writes metrics.jsonl and TensorBoard's files by itself"
@@ -108,6 +111,9 @@ class RslRlConfig:
     def _agree(self) -> RslRlConfig:
         section = self.section("algorithm")
         if kind := class_of(section):
+            for name in self.obs_groups:
+                if name not in SETS:
+                    raise Refused(("obs_groups", name), f"{kind} has no such set; {nearest(name, SETS)}")
             given = {name: getattr(self, name) for name in NETWORKS}
             check_networks(kind, kind == "Distillation", given, self.teacher_checkpoint)
         if kind == "Distillation":
