@@ -114,7 +114,7 @@ class Loop:
                     die()
                 self.fence.check()
                 if report:
-                    self.reporter.do(report.iteration, record)
+                    self.reporter.do(self.fence.guard, report.iteration, record)
                 self._tell_captured()
                 self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
                 if self._handle(signals):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +18,8 @@ from shared_store.layout import Run
 
 _EVERY = 1.0
 """Seconds between two reads of the epoch."""
+_LATE = 2.0
+"""Seconds since the last look from which on a record waits for the next one, at most as long: a volume that hangs answers no look."""
 _MOST = 10_000
 """Calls that are kept while the volume does not take them; later ones are dropped."""
 _HELD = 0.02
@@ -31,6 +34,7 @@ class Fence:
     def __init__(self, run: Run, epoch: int) -> None:
         self._run, self._epoch = run, epoch
         self._problem: Exception | None = None
+        self._looked = time.monotonic()
         self._over = threading.Event()
         threading.Thread(target=self._watch, name="fence", daemon=True).start()
 
@@ -38,6 +42,21 @@ class Fence:
         """Does not wait. Raises StaleEpoch where a newer attempt owned the run at the last read, and whatever else ended the reading."""
         if self._problem is not None:
             raise self._problem
+
+    def guard(self, write: Callable[..., object], *arguments: Any) -> None:
+        """Call ``write``, unless a newer attempt owns the run. Waits for a look where the last one is long ago, on the caller's thread.
+
+        A process that was stopped, and goes on, would otherwise write before its next look.
+        """
+        patience = time.monotonic() + _LATE
+        while self._problem is None and not self._over.is_set() and self._is_late(patience):
+            time.sleep(0.01)
+        if self._problem is None:
+            write(*arguments)
+
+    def _is_late(self, patience: float) -> bool:
+        now = time.monotonic()
+        return now - self._looked > _LATE and now < patience
 
     def close(self) -> None:
         """Read no more."""
@@ -52,6 +71,7 @@ class Fence:
             except Exception as error:  # StaleEpoch; a defect must not end the fence unseen
                 self._problem = error
                 return
+            self._looked = time.monotonic()
             self._over.wait(_EVERY)
 
 

@@ -28,7 +28,17 @@ def muster(home: Path, directory: Path, *arguments: str) -> str:
 
 
 def test_the_page_has_a_job_of_every_kind() -> None:
-    assert {"critic-of-its-own", "gru", "symmetry", "curious", "teacher", "student", "sac", "my-algorithm"} == set(JOBS)
+    assert {
+        "critic-of-its-own",
+        "gru",
+        "symmetry",
+        "curious",
+        "images",
+        "teacher",
+        "student",
+        "sac",
+        "my-algorithm",
+    } == set(JOBS)
 
 
 @pytest.mark.parametrize("name", sorted(JOBS))

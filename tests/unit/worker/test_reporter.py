@@ -36,6 +36,27 @@ def test_reports_are_made_in_order_and_nobody_waits_for_them() -> None:
     assert done == list(range(1000))
 
 
+def test_a_record_waits_for_the_look_that_a_stopped_process_has_missed(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reporting, "_EVERY", 0.3)
+    monkeypatch.setattr(reporting, "_LATE", 0.2)
+    done: list[int] = []
+    fence = Fence(run, 1)
+    wait_for(lambda: time.monotonic() - fence._looked > 0.2)
+    raise_epoch(run, 2)
+    fence.guard(done.append, 1)
+    assert done == []
+    with pytest.raises(StaleEpoch):
+        fence.check()
+    fence = Fence(run, 2)
+    wait_for(lambda: time.monotonic() - fence._looked > 0.2)
+    fence.guard(done.append, 2)
+    fence.guard(done.append, 3)
+    assert done == [2, 3]
+    fence.close()
+
+
 def test_what_is_held_is_made_once_it_is_released_or_after_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reporting, "_HELD", 60.0)
     reporter, done = Reporter(), []
