@@ -8,6 +8,7 @@ from collections.abc import Mapping
 OVERHEAD = 0.01
 """Share of the time that ``every: auto`` spends on saving."""
 _FIRST = 5
+"""Iterations to the first save, and the least between two."""
 _LONGEST = 1000
 
 
@@ -29,7 +30,8 @@ class Cadence:
             return iteration % self.every == 0
         if signals["stall"] > 0 and signals["iteration_seconds"] > 0:
             wanted = math.ceil(signals["stall"] / (OVERHEAD * signals["iteration_seconds"]))
-            self.every = min(max(wanted, 1), _LONGEST)
+            # not at once: where the loop waits for the volume now and then, the next save says nothing of it
+            self.every = min(max(wanted, self.every // 2, _FIRST), _LONGEST)
         if iteration - self._last < self.every:
             return False
         self._last = iteration

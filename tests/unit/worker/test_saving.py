@@ -153,6 +153,9 @@ def test_auto_saves_as_often_as_one_percent_allows() -> None:
     slow = {"stall": 0.02, "iteration_seconds": 0.1}  # a stall of a fifth of an iteration: every 20 iterations
     due = [i for i in range(11, 61) if cadence.due(i, slow)]
     assert due == [30, 50] and cadence.every == 20
+    brief = {"stall": 0.0001, "iteration_seconds": 0.1}
+    due = [i for i in range(61, 101) if cadence.due(i, brief)]
+    assert due == [61, 66, 71, 76, 81, 86, 91, 96] and cadence.every == 5, "after one of 10: half as many each time"
     fixed = Cadence(25)
     assert [i for i in range(1, 101) if fixed.due(i, slow)] == [25, 50, 75, 100]
 
