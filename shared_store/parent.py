@@ -16,7 +16,7 @@ import uuid
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
 from shared_store.files import DamagedFile, open_regular, sync_directory, write_json
@@ -35,6 +35,8 @@ class RunExists(Exception):
 class WeightsCopy:
     """A copy of the weights of ``source``, a checkpoint, in the making: under a hidden name among the runs.
 
+    As a context it is closed at the end, and discarded where an error ends it.
+
     Args:
         store: Where the runs are.
         owner: Of the hidden directory; the next copy that the same owner makes clears away what a crash left of earlier ones.
@@ -47,6 +49,15 @@ class WeightsCopy:
         self._store, self._owner, self.source = store, owner, source
         self.hidden = store.path / "runs" / f".{owner}.{uuid.uuid4().hex[:12]}.clone"
         self._published: Path | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
 
     def copy(self, place: str = "parent") -> None:
         """Copy the weights into directory ``place``, durably, and prove that they are what the source's manifest says.
@@ -174,7 +185,7 @@ def parent_checkpoint(run: Run) -> Checkpoint | None:
 
 
 def named_parent(run: Run) -> Checkpoint | None:
-    """:func:`parent_checkpoint`, which nobody has verified."""
+    """As :func:`parent_checkpoint`, without verifying it."""
     lineage = (run.description() or {}).get("parent")
     if lineage is None:
         return None

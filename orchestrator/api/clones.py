@@ -76,30 +76,24 @@ def _clone(
     making = NewRun(controller.store, controller.peers.id, source.name, chosen)
     environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
     try:
-        try:
-            making.copy()
-        except DamagedCheckpoint as error:
-            raise refusal(source, chosen, error) from None
-        with controller.writing, controller.database.session() as session:
-            context = Context(session, controller, idempotency_key, making, teacher)
-            if earlier := _answered(context, name):
-                making.discard()
-                return earlier
-            _check_free(session, new)
-            forget_gone_run(session, new)
-            answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
-            # before the commit: a job without its weights must not start
-            making.publish(new.name, first_description(new, job, job.owner, job.queue))
+        with making:
+            try:
+                making.copy()
+            except DamagedCheckpoint as error:
+                raise refusal(source, chosen, error) from None
+            with controller.writing, controller.database.session() as session:
+                context = Context(session, controller, idempotency_key, making, teacher)
+                if earlier := _answered(context, name):
+                    return earlier
+                _check_free(session, new)
+                forget_gone_run(session, new)
+                answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
+                # before the commit: a job without its weights must not start
+                making.publish(new.name, first_description(new, job, job.owner, job.queue))
     except RunExists:
-        making.discard()
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
-        making.discard()
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
-    except BaseException:
-        making.discard()
-        raise
-    making.close()
     controller.wake()
     return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
 

@@ -81,7 +81,7 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> Teach
 
 
 def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], dict[str, Any]]) -> dict[str, Any]:
-    """Submit a job; the weights that its policy will imitate are copied first, while nobody waits for the database.
+    """Submit a job; the weights that its policy will imitate are copied first, without holding the database.
 
     Raises ClientError.
 
@@ -97,19 +97,13 @@ def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], 
         raise ClientError(f"{shortage}; the run has a copy of its teacher's weights", 503)
     copy = TeacherCopy(controller.store, controller.peers.id, needed.run, needed.checkpoint)
     try:
-        copy.copy("teacher")
-        answer = submit(copy)
+        with copy:
+            copy.copy("teacher")
+            return submit(copy)
     except DamagedCheckpoint as error:
-        copy.discard()
         raise ClientError(f"{_TEACHER}: run {needed.run}: {error}") from None
     except OSError as error:
-        copy.discard()
         raise ClientError(f"{_TEACHER}: the weights can't be copied ({error.strerror or error})", 503) from None
-    except BaseException:
-        copy.discard()
-        raise
-    copy.close()
-    return answer
 
 
 def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:
