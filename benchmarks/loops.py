@@ -17,11 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_config, stock_runner
-from benchmarks.training import build, wait
+from benchmarks.training import build, device_name, wait
 from shared_store.metrics import read_metrics
 from worker.learning.setup import build_task
 
@@ -98,9 +96,8 @@ def main() -> None:
 
 def table(found: dict[tuple[str, str], list[float]], worlds: int, rows: list[dict[str, Any]]) -> str:
     """Markdown, of the steps a second by task and way."""
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "the CPU"
     lines = [
-        f"# One configuration, four loops, on {device}",
+        f"# One configuration, four loops, on {device_name()}",
         "",
         f"Million steps a second by the clock, with logging and checkpoints, {worlds:,} worlds; medians of several runs in turn; "
         f"`python -m benchmarks.loops`. {told(rows)}",

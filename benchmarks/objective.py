@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.load import Watch, add_option, told
-from benchmarks.training import build, wait
+from benchmarks.training import build, device_name, wait
 from worker.learning.ppo import fused, heads
 
 WAYS = ("kernel", "torch", "torch.compile")
@@ -66,7 +66,7 @@ def main() -> None:
             lines.append(f"| {task} | {way} | {found['learn']:.2f} | {found['iteration']:.2f} |")
             print(lines[-1], flush=True)
             head = [
-                f"# The loss of the fused PPO on {torch.cuda.get_device_name() if torch.cuda.is_available() else 'the CPU'}",
+                f"# The loss of the fused PPO on {device_name()}",
                 "",
                 f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {told(rows)}",
                 "",

@@ -16,11 +16,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from benchmarks.curves import worth
 from benchmarks.load import Watch, add_option, told
-from benchmarks.training import build
+from benchmarks.training import build, device_name
 
 PLAN: dict[str, tuple[dict[str, int], float, tuple[float, ...]]] = {
     "Cartpole": ({"sac": 1024, "ppo": 4096}, 6.0, (20.0, 26.0)),
@@ -28,7 +26,6 @@ PLAN: dict[str, tuple[dict[str, int], float, tuple[float, ...]]] = {
     "Humanoid": ({"sac": 4096, "ppo": 4096}, 45.0, (2000.0, 5000.0, 7000.0)),
 }
 """By task: worlds of each algorithm, seconds of training, and the returns to be reached."""
-DEVICE = torch.cuda.get_device_name() if torch.cuda.is_available() else "the CPU"
 
 
 def train(task: str, algorithm: str, seed: int, judged: bool) -> dict[str, Any]:
@@ -44,7 +41,7 @@ def train(task: str, algorithm: str, seed: int, judged: bool) -> dict[str, Any]:
                 curve.append((round(seconds, 3), record["env_steps"], round(record["reward"], 2)))
         found = worth(loop) if judged else {}
         loop.close()
-    told = {"task": task, "algorithm": algorithm, "worlds": worlds[algorithm], "seed": seed, "device": DEVICE}
+    told = {"task": task, "algorithm": algorithm, "worlds": worlds[algorithm], "seed": seed, "device": device_name()}
     return told | found | {"curve": curve}
 
 

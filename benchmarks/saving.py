@@ -16,10 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from benchmarks.load import Watch, add_option, told
-from benchmarks.training import CUDA, build
+from benchmarks.training import CUDA, build, device_name
 from shared_store.checkpoints import list_checkpoints
 from shared_store.metrics import read_metrics
 
@@ -57,7 +55,7 @@ def measure(task: str, worlds: int, iterations: int) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        f"# What a save costs, on {torch.cuda.get_device_name() if CUDA else 'the CPU'}",
+        f"# What a save costs, on {device_name()}",
         "",
         f"Medians, by the clock; `python -m benchmarks.saving`. {told(rows)}",
         "",

@@ -59,6 +59,11 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9
     return Loop(Training.of(job, find_task(task)), connect(placement), StopRequest())
 
 
+def device_name() -> str:
+    """What the tables call the device."""
+    return torch.cuda.get_device_name() if CUDA else "the CPU"
+
+
 def wait() -> None:
     """Until the device is done."""
     if CUDA:
