@@ -127,7 +127,7 @@ def resume(controller: Controller, run: Run, changes: Changes, idempotency_key: 
     Args:
         controller: The controller.
         run: The run.
-        changes: What is different from now on. The run's worlds stay the same and are dealt out anew to other nodes.
+        changes: What is different from now on. The run keeps its worlds; another number of nodes shares them anew.
         idempotency_key: A second call with it answers what the first one did.
 
     Raises:

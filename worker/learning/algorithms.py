@@ -29,7 +29,7 @@ def installed() -> dict[str, str]:
     """Where the class of each installed algorithm is (``module:Class``), by its name: the entry points ``muster.algorithms``."""
     found = {point.name: point.value for point in entry_points(group="muster.algorithms")}
     source = Path(__file__).parents[2] / "pyproject.toml"
-    if not found and source.exists():  # a source tree on the path, which nobody installed
+    if not found and source.exists():  # a source tree on the path, not installed
         found = tomllib.loads(source.read_text())["project"]["entry-points"]["muster.algorithms"]
     return found
 

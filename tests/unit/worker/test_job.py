@@ -1,4 +1,4 @@
-"""What a rank says of a job that nobody checked when it was submitted, as one that came through the Batch API."""
+"""What a rank says of a job whose submission was not checked, such as one of the Batch API."""
 
 from __future__ import annotations
 
