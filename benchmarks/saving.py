@@ -1,8 +1,9 @@
-"""What a save costs the training, for each task on this device: how much longer the iterations with a save take than those without.
+"""What a save costs the training, for each task on this device: how much longer iterations around a save take than those far from one.
 
     python -m benchmarks.saving [--tasks Ant Humanoid Cartpole] [--iterations 180] [--out DIRECTORY]
 
-It saves every third iteration, far more often than a run does, so that there are many to compare. Writes ``saving.md``.
+It saves every third iteration, far more often than a run does, so that there are many to compare: in the one before a save the device
+makes the copies, in the one after it threads write them, the third has nothing of it. Writes ``saving.md``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ WARM = 10
 
 
 def measure(task: str, worlds: int, iterations: int) -> dict[str, Any]:
-    """Milliseconds by the clock of an iteration without and with a save, what the loop itself waits [ms], and bytes of a checkpoint."""
+    """Milliseconds by the clock of the iterations before, after and far from a save, of the host's part, and bytes of a checkpoint."""
     with tempfile.TemporaryDirectory() as store:
         loop = build(task, worlds, Path(store), every=3, iterations=iterations)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -37,18 +38,19 @@ def measure(task: str, worlds: int, iterations: int) -> dict[str, Any]:
         last = list_checkpoints(loop.job.run)[-1].path
         size = sum(file.stat().st_size for file in last.rglob("*") if file.is_file())
         loop.close()
-    took: dict[bool, list[float]] = {True: [], False: []}
-    for before, after in pairwise(records):
-        took[after["stall_seconds"] > 0].append(1000 * (after["total_seconds"] - before["total_seconds"]))
-    stalls = [1000 * record["stall_seconds"] for record in records if record["stall_seconds"] > 0]
+    took = [1000 * (after["total_seconds"] - before["total_seconds"]) for before, after in pairwise(records)]
+    saves = [
+        index for index, record in enumerate(records[1:]) if record["stall_seconds"] > 0 and 0 < index < len(took) - 1
+    ]
     return {
         "task": task,
         "worlds": worlds,
         "size": size,
-        "saves": len(stalls),
-        "without": statistics.median(took[False]),
-        "with": statistics.median(took[True]),
-        "stall": statistics.median(stalls),
+        "saves": len(saves),
+        "before": statistics.median(took[index - 1] for index in saves),
+        "after": statistics.median(took[index] for index in saves),
+        "far": statistics.median(took[index + 1] for index in saves),
+        "host": statistics.median(1000 * records[index + 1]["stall_seconds"] for index in saves),
     }
 
 
@@ -59,12 +61,13 @@ def table(rows: list[dict[str, Any]]) -> str:
         "",
         f"Medians, by the clock; `python -m benchmarks.saving`. {told(rows)}",
         "",
-        "| task | worlds | a checkpoint | saves | iteration without | with a save | the loop waits | of an iteration |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|",
+        "| task | worlds | a checkpoint | saves | an iteration [ms] | before a save | after it | both together | host, meanwhile [ms] |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     lines += [
-        f"| {row['task']} | {row['worlds']:,} | {row['size'] / 1e6:.1f} MB | {row['saves']} | {row['without']:.2f} ms | "
-        f"{row['with']:.2f} ms | {row['stall']:.2f} ms | {row['with'] / row['without'] - 1.0:+.1%} |"
+        f"| {row['task']} | {row['worlds']:,} | {row['size'] / 1e6:.1f} MB | {row['saves']} | {row['far']:.2f} | "
+        f"{row['before'] - row['far']:+.2f} | {row['after'] - row['far']:+.2f} | "
+        f"{(row['before'] + row['after']) / row['far'] - 2.0:+.1%} | {row['host']:.2f} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"

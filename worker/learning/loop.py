@@ -25,7 +25,7 @@ from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.report import Report, Stopwatch
-from worker.learning.reporter import Fence, Reporter
+from worker.learning.reporter import Fence, Gate, Reporter
 from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
@@ -64,7 +64,8 @@ class Loop:
         self.incident = Incident(self.task, self.share, self.algorithm.steps, job.section, training.seed)
         seed_generators(training.seed, gang.rank)
         facts = describe(training, self.task)
-        self.state = TrainingState(job, gang, self.share, self.task, self.algorithm, facts, training.keep)
+        self.gate = Gate()
+        self.state = TrainingState(job, gang, self.share, self.task, self.algorithm, facts, training.keep, self.gate)
         self.resumed = self.state.restore()
         self.adopted = None if self.resumed else self._begin_run(facts)
         """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
@@ -78,7 +79,7 @@ class Loop:
         captured = gang.device if self.algorithm.captures_rollout else "cpu"
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
-        self.reporter, self.fence, self.beacon = Reporter(), Fence(job.run, job.epoch), Beacon()
+        self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
         self.state.saver.start()
         end_startup()
 
@@ -201,13 +202,13 @@ class Loop:
         if self.iterated == 0:
             check_metrics(metrics, self.training.algorithm)
         self._stopwatch.mark()
+        self.gate.open()
         if self.cadence.expects(progress.iteration + 1) or progress.iteration + 1 == self.training.iterations:
             self.state.copy(progress.iteration + 1)
-        self.reporter.release()
         # the one transfer of the iteration: from here on the host knows
         learnt, totals = self._exchange.read(metrics)
         if self._collecting.can_be_captured:
-            self.reporter.hold()
+            self.gate.shut()
         signals = {name: totals[name][0] for name in SIGNALS}
         progress.iteration += 1
         self.state.learning_rate = learnt.get("learning_rate")

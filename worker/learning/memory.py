@@ -18,6 +18,7 @@ import torch
 from worker.distributed import Gang
 from worker.errors import UserError, is_out_of_memory
 from worker.learning.algorithm import Algorithm, Share
+from worker.learning.host_copies import HostCopies
 from worker.learning.setup import build_algorithm, build_task, load_kernels, observed, transition
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: G
 
 
 def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
-    """Peak memory [bytes] of building ``worlds`` and learning once from an iteration in which the worlds are not stepped."""
+    """Peak memory [bytes] of building ``worlds``, learning once from an iteration in which they are not stepped, and saving."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()
@@ -127,8 +128,10 @@ def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: 
         algorithm.act(observations)
         algorithm.record(step)
     algorithm.learn(observations)
+    copies = HostCopies()  # which a save makes
+    copied = copies.take((task.state_tensors(), dict(algorithm.world_state()), algorithm.state_dict()))
     taken = _most(gang.device) - before
-    del task, algorithm, observations, step
+    del task, algorithm, observations, step, copies, copied
     gc.collect()
     return max(taken, 0)
 

@@ -23,7 +23,7 @@ _LATE = 2.0
 _MOST = 10_000
 """Calls that are kept while the volume does not take them; later ones are dropped."""
 _HELD = 0.02
-"""Seconds that a call waits at most for :meth:`Reporter.release`."""
+"""Seconds that a thread waits at most at the :class:`Gate`."""
 _FAREWELL = 30.0
 """Seconds that the end of a training waits for the volume to take the last records."""
 
@@ -75,15 +75,34 @@ class Fence:
             self._over.wait(_EVERY)
 
 
+class Gate:
+    """Keeps other threads from the interpreter for a moment: the training thread needs it to give a device its work."""
+
+    def __init__(self) -> None:
+        self._open = threading.Event()
+        self._open.set()
+
+    def shut(self) -> None:
+        """The device has nothing to do."""
+        self._open.clear()
+
+    def open(self) -> None:
+        """The device is at work."""
+        self._open.set()
+
+    def wait(self) -> None:
+        """Until it is open, at most :data:`_HELD` seconds."""
+        self._open.wait(_HELD)
+
+
 class Reporter:
     """Runs print and write calls in order on its own thread, so that training never waits for them."""
 
-    def __init__(self) -> None:
+    def __init__(self, gate: Gate | None = None) -> None:
+        self._gate = gate or Gate()
         self._calls: queue.Queue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.Queue(_MOST)
         self._dropped = 0
         self._failed = 0
-        self._free = threading.Event()
-        self._free.set()
         threading.Thread(target=self._run, name="reporter", daemon=True).start()
 
     def do(self, function: Callable[..., object], *arguments: Any) -> None:
@@ -92,14 +111,6 @@ class Reporter:
             self._calls.put_nowait((function, arguments))
         except queue.Full:  # there is nobody to tell: what would print it is what hangs
             self._dropped += 1
-
-    def hold(self) -> None:
-        """Begin no call for a moment: the training thread is about to give a device its work, and needs the interpreter."""
-        self._free.clear()
-
-    def release(self) -> None:
-        """The device is at work: go on."""
-        self._free.set()
 
     def close(self) -> None:
         """Wait for the calls that are left, at most :data:`_FAREWELL` seconds, and print how many were lost."""
@@ -113,7 +124,7 @@ class Reporter:
     def _run(self) -> None:
         while True:
             function, arguments = self._calls.get()
-            self._free.wait(_HELD)
+            self._gate.wait()
             try:
                 function(*arguments)
             except Exception as error:  # the thread must live: without it every later record would be lost

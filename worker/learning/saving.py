@@ -18,6 +18,8 @@ import torch
 from shared_store.epoch import StaleEpoch
 from shared_store.layout import Run
 from shared_store.tied import tied
+from worker.learning.host_copies import HostCopies
+from worker.learning.reporter import Gate
 
 _BUFFERS = 2
 """One save is written while the next one is copied; a third waits."""
@@ -25,43 +27,6 @@ PATIENCE = 2.0
 """For how long after the order of the oldest save a third one waits for it [s]: the volume hangs, and training goes on without."""
 RECORDS_SECONDS = 10.0
 """How long a commit waits for the metrics records before it [s]: a checkpoint is worth more than records that are never written."""
-
-
-class HostCopies:
-    """Copies of tensors in host memory, those of a device in pinned memory that is kept from one save to the next."""
-
-    def __init__(self) -> None:
-        self._pinned: dict[str, tuple[tuple[object, ...], torch.Tensor]] = {}
-        """Each with the form of what it is a copy of."""
-        self._arrived: torch.cuda.Event | None = None
-
-    def take(self, value: Any) -> Any:
-        """``value`` with every tensor in it replaced by its copy; those of a device are complete after :meth:`wait`."""
-        copied = self._take(value, "")
-        if self._pinned:
-            self._arrived = torch.cuda.Event(blocking=True)
-            self._arrived.record()
-        return copied
-
-    def _take(self, value: Any, key: str) -> Any:
-        if isinstance(value, torch.Tensor) and value.is_cuda:
-            # the strides, too: where dimensions lie in another order, the device makes a copy of its own first
-            form = value.dtype, value.shape, value.stride()
-            if key not in self._pinned or self._pinned[key][0] != form:
-                self._pinned[key] = form, torch.empty_like(value, device="cpu", pin_memory=True)
-            return self._pinned[key][1].copy_(value.detach(), non_blocking=True)
-        if isinstance(value, torch.Tensor):
-            return value.detach().clone()
-        if isinstance(value, dict):
-            return {name: self._take(item, f"{key}/{name}") for name, item in value.items()}
-        if isinstance(value, list | tuple):
-            return type(value)(self._take(item, f"{key}/{index}") for index, item in enumerate(value))
-        return value
-
-    def wait(self) -> None:
-        """Until the copies are complete; any thread may call it."""
-        if self._arrived:
-            self._arrived.synchronize()
 
 
 class _Save(NamedTuple):
@@ -80,7 +45,7 @@ class Saver:
     The loop waits while the state is copied. A thread puts the copies into the form of a file, and the process writes the file.
     """
 
-    def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None) -> None:
+    def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None, gate: Gate | None = None) -> None:
         self.run, self.epoch, self.rank, self.ranks, self.keep = run, epoch, rank, ranks, keep
         self.committed: str | None = None
         """Name of the newest checkpoint that is durable (main rank)."""
@@ -89,6 +54,7 @@ class Saver:
         self.stall = 0.0
         """How long the last save stopped the loop [s]."""
         self._copying = 0.0
+        self._gate = gate or Gate()
         self._copies = HostCopies()
         self._memory = [os.fdopen(os.memfd_create("muster-snapshot"), "wb", 1 << 20) for _ in range(_BUFFERS)]
         self._records = os.fdopen(os.memfd_create("muster-records"), "wb")
@@ -175,6 +141,7 @@ class Saver:
         self, writer: subprocess.Popen[bytes], memory: BinaryIO, order: Mapping[str, Any], files: Mapping[str, Any]
     ) -> None:
         """On the thread: write the files' content into the memory that the writer reads, and send it the order."""
+        self._gate.wait()
         self._copies.wait()
         layout = []
         memory.seek(0)  # what an earlier save left behind the end stays, and is not read

@@ -11,7 +11,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -36,7 +36,7 @@ from worker.learning.saving import Saver
 from worker.learning.shards import Shards, read_file
 
 if TYPE_CHECKING:
-    from worker.learning.reporter import Reporter
+    from worker.learning.reporter import Gate, Reporter
     from worker.tasks.task import Task
 
 
@@ -73,6 +73,10 @@ class Progress:
     """How many episodes the score is a mean of."""
     recent: list[list[float]] = field(default_factory=list)
     """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists, which checkpoints can hold."""
+
+    def saved(self) -> dict[str, Any]:
+        """All fields, for a thread that writes them while training goes on: the entries of ``recent`` never change, the list does."""
+        return {**vars(self), "recent": list(self.recent)}
 
     def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
         """Note what ended in an iteration, and work out the score and its error.
@@ -118,8 +122,9 @@ class TrainingState:
         algorithm: Algorithm,
         facts: dict[str, Any],
         keep: int,
+        gate: Gate | None = None,
     ) -> None:
-        """``facts``: extra manifest fields (task, configuration), so that a checkpoint can be read on its own."""
+        """``facts``: extra manifest fields (task, configuration), so that a checkpoint can be read on its own. Saving waits at ``gate``."""
         self.job, self.gang, self.share, self.task, self.algorithm, self.facts = (
             job,
             gang,
@@ -131,7 +136,7 @@ class TrainingState:
         self.progress = Progress()
         self.seconds = 0.0
         """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
-        self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep)
+        self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep, gate)
         self._copied: tuple[int, dict[str, Any]] = -1, {}
         """Iterations done, and the copies of the state after them."""
         self.ordered_at: int | None = None
@@ -178,7 +183,7 @@ class TrainingState:
         self._copied = -1, {}
         files = {f"rank-{self.gang.rank}.pt": {name: copied[name] for name in ("worlds", "generators")}}
         if self.gang.is_main:
-            files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": asdict(self.progress)}
+            files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": self.progress.saved()}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
         facts = self._manifest() if self.gang.is_main else None

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.host_copies import HostCopies
 from worker.learning.ppo import linear
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -100,3 +101,39 @@ def test_padded_products_and_their_gradients_are_those_of_the_network(inputs: in
     torch.testing.assert_close(linear.forward(mlp, wide), expected)
     for parameter, gradient in zip(mlp.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
+
+
+def test_copies_are_of_the_moment_they_were_taken_whatever_the_device_does_afterwards(tmp_path: Path) -> None:
+    state = {
+        "weights": torch.arange(7.0, device="cuda"),
+        "transposed": torch.arange(6.0, device="cuda").view(2, 3).t(),
+        "flags": torch.tensor([True, False, True], device="cuda"),
+        "count": torch.tensor(5, device="cuda", dtype=torch.int64),
+        "half": torch.full((3, 2), 0.5, device="cuda", dtype=torch.bfloat16),
+        "none": torch.empty(0, 4, device="cuda"),
+        "here": [torch.ones(2), 3, "name"],
+    }
+    expected = {name: value.cpu().clone() for name, value in state.items() if name != "here"}
+    copies, work = HostCopies(), torch.zeros(4096, 4096, device="cuda")
+    for _ in range(20):  # the device is behind the host
+        work @ work
+    copied = copies.take(state)
+    for name in expected:
+        state[name].zero_()
+    copies.wait()
+    torch.save(copied, tmp_path / "all.pt")
+    torch.save({"count": copied["count"]}, tmp_path / "one.pt")
+    loaded = torch.load(tmp_path / "all.pt", weights_only=True)
+    assert loaded["here"][1:] == [3, "name"] and torch.equal(loaded["here"][0], torch.ones(2))
+    for name, value in expected.items():
+        assert loaded[name].dtype == value.dtype and torch.equal(loaded[name], value), name
+    assert (tmp_path / "one.pt").stat().st_size < 2000, "a file holds its own tensors alone"
+
+
+def test_copies_of_a_state_that_grows_and_shrinks_are_right() -> None:
+    copies = HostCopies()
+    for length in (3, 1000, 10):
+        state = {"replay": torch.rand(length, 5, device="cuda"), "place": torch.tensor(length, device="cuda")}
+        copied = copies.take(state)
+        copies.wait()
+        assert torch.equal(copied["replay"], state["replay"].cpu()) and int(copied["place"]) == length

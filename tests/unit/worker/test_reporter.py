@@ -12,7 +12,7 @@ from shared_store.epoch import StaleEpoch, raise_epoch
 from shared_store.layout import Run, Store
 from tests.support.waiting import wait_for
 from worker.learning import reporter as reporting
-from worker.learning.reporter import Fence, Reporter
+from worker.learning.reporter import Fence, Gate, Reporter
 
 
 @pytest.fixture
@@ -57,17 +57,18 @@ def test_a_record_waits_for_the_look_that_a_stopped_process_has_missed(
     fence.close()
 
 
-def test_what_is_held_is_made_once_it_is_released_or_after_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_wait_at_a_gate_that_is_shut_but_only_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reporting, "_HELD", 60.0)
-    reporter, done = Reporter(), []
-    reporter.hold()
+    gate, done = Gate(), []
+    reporter = Reporter(gate)
+    gate.shut()
     reporter.do(done.append, 1)
     time.sleep(0.1)
     assert done == []
-    reporter.release()
+    gate.open()
     wait_for(lambda: done == [1])
     monkeypatch.setattr(reporting, "_HELD", 0.01)
-    reporter.hold()
+    gate.shut()
     reporter.do(done.append, 2)
     reporter.close()
     assert done == [1, 2]

@@ -21,9 +21,9 @@ from tests.support.worker.sac import SMALL, make, point, same
 from worker.distributed import Gang, Placement
 from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.host_copies import HostCopies
 from worker.learning.sac.sac import SAC, SAVED
 from worker.learning.sac.settings import SACConfig
-from worker.learning.saving import HostCopies
 
 torch.set_num_threads(1)
 

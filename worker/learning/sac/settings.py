@@ -51,7 +51,8 @@ class SACConfig:
     uniformly from within the limit."""
     save_replay: Literal[True, False, "auto"] = "auto"
     """Whether checkpoints hold the replay. Without it they are small, and a resumed run fills a new one first: it goes on, but not
-    as if it had never stopped. ``"auto"``: where the replay of a rank is small, see :data:`worker.learning.sac.sac.SAVED`."""
+    as if it had never stopped. ``"auto"``: where the replay of a rank is small, see :data:`worker.learning.sac.sac.SAVED`. With it, a
+    GPU holds the replay twice from the first save on."""
 
     actor_sizes: Sizes = (512, 256, 128)
     """Widths of the hidden layers of the policy."""
