@@ -135,7 +135,10 @@ class Task:
             )
         except ValueError as error:
             raise ValueError(f"task {type(self).__name__}: {error}") from error
-        self._allocate()
+        with on_torch_stream(
+            self.device
+        ):  # torch fills some: on Warp's own stream, clearing them might come after that
+            self._allocate()
         self._parameters = self.parameters_type()
         for item in fields(config):
             if hasattr(self._parameters, item.name):

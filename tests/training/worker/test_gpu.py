@@ -8,11 +8,15 @@ from typing import Any
 
 import pytest
 import torch
+import warp as wp
 from torch import nn
 
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.host_copies import HostCopies
 from worker.learning.ppo import linear
+from worker.tasks.cartpole import Cartpole
+from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.task import Task
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -101,6 +105,22 @@ def test_padded_products_and_their_gradients_are_those_of_the_network(inputs: in
     torch.testing.assert_close(linear.forward(mlp, wide), expected)
     for parameter, gradient in zip(mlp.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
+
+
+def test_a_task_has_its_weights_however_late_warps_own_stream_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clearing a buffer there after torch had filled it left one training in ten without rewards."""
+    allocate, rows = Task._allocate, wp.zeros(1 << 28, dtype=wp.float32, device="cuda:0")
+
+    def behind(self: Task) -> None:
+        for _ in range(200):
+            rows.fill_(1.0)
+        allocate(self)
+
+    monkeypatch.setattr(Task, "_allocate", behind)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        task = Cartpole(CartpoleConfig(), 8, seed=0, device="cuda:0")
+        assert torch.equal(task._weights.cpu(), torch.tensor(list(task.config.rewards.values())))
+        assert float(task.level) == 1.0
 
 
 def test_copies_are_of_the_moment_they_were_taken_whatever_the_device_does_afterwards(tmp_path: Path) -> None:
