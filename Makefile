@@ -74,6 +74,9 @@ bench-gpu: $(READY)
 	$(BIN)/python -m benchmarks.training --sweep Ant Humanoid
 	$(BIN)/python -m benchmarks.curves
 	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m benchmarks.loops
+	$(BIN)/python -m benchmarks.saving
+	$(BIN)/python -m benchmarks.objective
 
 bench-api: $(READY)
 	$(BIN)/python -m benchmarks.api
