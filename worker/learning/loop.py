@@ -57,7 +57,7 @@ class Loop:
         self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
         self._kill_at = kill_at(os.environ, job) if gang.is_main else None
         self.cadence = Cadence(training.save_every)
-        self._save_is_due = False
+        self._save_is_due = self._order_is_due = False
         self.task, self.algorithm = self._build()
         self._observations = observed(self.task)
         self._step = transition(self.task, self._observations)
@@ -161,13 +161,21 @@ class Loop:
         is_last = stopping or iteration == self.training.iterations
         # While the volume hangs, a save is put off and training goes on. All ranks decide alike.
         if is_last or (self._save_is_due and not signals["busy"]):
-            state.save(self.reporter if self.gang.is_main else None, wait=is_last)
-            self._stall_seconds = state.saver.stall
             self._save_is_due = False
+            # what needs no more of the device is ordered once that has its next work
+            self._order_is_due = self._collecting.can_be_captured and state.is_copied and not is_last
+            if not self._order_is_due:
+                self._order(wait=is_last)
         self._tell_saved(state.saver.poll())
         if stopping:
             self._tell_saved(state.finish())
         return stopping
+
+    def _order(self, *, wait: bool = False) -> None:
+        """Order a checkpoint of the state after the last whole iteration."""
+        self._order_is_due = False
+        self.state.save(self.reporter if self.gang.is_main else None, wait=wait)
+        self._stall_seconds = self.state.saver.stall
 
     def _beginning(self) -> str:
         ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
@@ -203,6 +211,8 @@ class Loop:
             check_metrics(metrics, self.training.algorithm)
         self._stopwatch.mark()
         self.gate.open()
+        if self._order_is_due:
+            self._order()
         if self.cadence.expects(progress.iteration + 1) or progress.iteration + 1 == self.training.iterations:
             self.state.copy(progress.iteration + 1)
         # the one transfer of the iteration: from here on the host knows

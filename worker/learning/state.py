@@ -165,6 +165,11 @@ class TrainingState:
             ),
         )
 
+    @property
+    def is_copied(self) -> bool:
+        """Whether the present state has been copied already."""
+        return self._copied[0] == self.progress.iteration
+
     def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
@@ -177,7 +182,7 @@ class TrainingState:
             StaleEpoch: A newer attempt owns the run.
         """
         iteration = self.progress.iteration
-        if self._copied[0] != iteration:
+        if not self.is_copied:
             self.copy(iteration)
         copied = self._copied[1]
         self._copied = -1, {}

@@ -24,7 +24,9 @@ from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.distributed import Placement
 from worker.errors import TrainingError, UserError
 from worker.learning import algorithms
+from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.job import configure
+from worker.learning.loop import Loop
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -110,6 +112,36 @@ def test_a_damaged_checkpoint_is_named_set_aside_and_the_one_before_is_used(
     assert "warning: checkpoint 00000004-e1: the content of learner.pt was altered" in output
     assert "set aside as 00000004-e1.damaged" in output
     assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
+
+
+def test_what_is_ordered_while_a_device_works_is_the_state_before_that_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a GPU: the copies are made at the end of an iteration, and ordered to be saved in the next one."""
+    train(training(tmp_path, run="at-once", iterations=7, every=2))
+    ordered: list[tuple[int, int]] = []
+    order = Loop._order
+
+    def noting(loop: Loop, *, wait: bool = False) -> None:
+        ordered.append((loop.state.progress.iteration, loop.iterated))
+        order(loop, wait=wait)
+
+    monkeypatch.setattr(Loop, "_order", noting)
+    monkeypatch.setattr(CudaGraphFunction, "can_be_captured", True)
+    loop = runner(training(tmp_path, run="later", iterations=7, every=2))
+    seen: list[bool] = []
+    learn = loop.algorithm.learn
+    loop.algorithm.learn = lambda given: (seen.append(loop._order_is_due), learn(given))[1]  # type: ignore[method-assign, func-returns-value]
+    assert loop.train() == 0
+    assert seen == [False, False, True, False, True, False, True], "each is ordered in the iteration after it"
+    assert [iteration for iteration, _ in ordered] == [2, 4, 6, 7]
+    first, second = (list_checkpoints(Store(tmp_path).run(name)) for name in ("at-once", "later"))
+    assert [each.iteration for each in first] == [each.iteration for each in second] == [2, 4, 6, 7]
+    for one, other in zip(first, second, strict=True):
+        assert_same_bits(one.path, other.path)
+        assert one.manifest["reward"] == other.manifest["reward"]
+    stalls = [record["stall_seconds"] > 0 for record in read_metrics(Store(tmp_path).run("later"))]
+    assert stalls == seen
 
 
 def test_a_chosen_checkpoint_is_gone_on_from(tmp_path: Path) -> None:
