@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from itertools import groupby
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,6 +21,8 @@ class HostCopies:
     def __init__(self) -> None:
         self._forms: list[tuple[torch.dtype, torch.Size]] = []
         """Of the tensors that the views below are for."""
+        self._alike: list[list[int]] = []
+        """Which of them have the same dtype: one kernel copies these."""
         self._gathered: list[torch.Tensor] = []
         self._received: list[torch.Tensor] = []
         self._piece, self._memory = torch.empty(0, dtype=torch.uint8), torch.empty(0, dtype=torch.uint8)
@@ -58,17 +59,19 @@ class HostCopies:
         if forms != self._forms:
             self._lay_out(tensors)
             self._forms = forms
-        pairs = sorted(zip(self._gathered, tensors, strict=True), key=_dtype)
-        for _, alike in groupby(pairs, _dtype):
-            gathered, given = zip(*alike, strict=True)
-            torch._foreach_copy_(gathered, given)
+        for alike in self._alike:
+            torch._foreach_copy_([self._gathered[index] for index in alike], [tensors[index] for index in alike])
         self._beside.wait_stream(here)
         with torch.cuda.stream(self._beside):
             self._memory.copy_(self._piece, non_blocking=True)
         return self._received
 
     def _lay_out(self, tensors: list[torch.Tensor]) -> None:
-        """Views for ``tensors`` in the piece and in the memory of the host, both of which grow where they are too small."""
+        """Make a view of the device's piece and one of the host's memory for each tensor. Both grow when they are too small."""
+        by_dtype: dict[torch.dtype, list[int]] = {}
+        for index, tensor in enumerate(tensors):
+            by_dtype.setdefault(tensor.dtype, []).append(index)
+        self._alike = list(by_dtype.values())
         starts, size = [], 0
         for tensor in tensors:
             starts.append(size)
@@ -78,7 +81,9 @@ class HostCopies:
             self._piece = torch.empty(size, dtype=torch.uint8, device=tensors[0].device)
             self._memory = torch.empty(size, dtype=torch.uint8, pin_memory=True)
         places = list(zip(starts, tensors, strict=True))
-        self._gathered = [_view(self._piece[start : start + each.nbytes], each) for start, each in places]
+        self._gathered = [
+            self._piece[start : start + each.nbytes].view(each.dtype).view(each.shape) for start, each in places
+        ]
         # each with a storage of its own: a file would otherwise hold the whole memory for any of them
         host = self._memory.numpy()
         self._received = [
@@ -87,14 +92,6 @@ class HostCopies:
             else torch.empty(each.shape, dtype=each.dtype)
             for start, each in places
         ]
-
-
-def _view(piece: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    return piece.view(like.dtype).view(like.shape)
-
-
-def _dtype(pair: Iterable[torch.Tensor]) -> str:
-    return str(next(iter(pair)).dtype)
 
 
 def _replaced(value: Any, change: Callable[[torch.Tensor], torch.Tensor]) -> Any:

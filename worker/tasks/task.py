@@ -135,9 +135,8 @@ class Task:
             )
         except ValueError as error:
             raise ValueError(f"task {type(self).__name__}: {error}") from error
-        with on_torch_stream(
-            self.device
-        ):  # torch fills some: on Warp's own stream, clearing them might come after that
+        # torch fills some of the buffers: Warp's own stream might clear them after that
+        with on_torch_stream(self.device):
             self._allocate()
         self._parameters = self.parameters_type()
         for item in fields(config):

@@ -131,7 +131,12 @@ def test_what_is_ordered_while_a_device_works_is_the_state_before_that_work(
     loop = runner(training(tmp_path, run="later", iterations=7, every=2))
     seen: list[bool] = []
     learn = loop.algorithm.learn
-    loop.algorithm.learn = lambda given: (seen.append(loop._order_is_due), learn(given))[1]  # type: ignore[method-assign, func-returns-value]
+
+    def watched(observations: Any) -> Any:
+        seen.append(loop._order_is_due)
+        return learn(observations)
+
+    monkeypatch.setattr(loop.algorithm, "learn", watched)
     assert loop.train() == 0
     assert seen == [False, False, True, False, True, False, True], "each is ordered in the iteration after it"
     assert [iteration for iteration, _ in ordered] == [2, 4, 6, 7]
