@@ -1,5 +1,6 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
+# make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
@@ -13,7 +14,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test unit integration training engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test unit integration training robots engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -22,7 +23,7 @@ run: $(READY)
 PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
 test: lint kernels
-	$(PYTEST) -m "not cluster"
+	$(PYTEST) -m "not cluster and not robots"
 
 unit: $(READY)
 	$(PYTEST) tests/unit
@@ -32,6 +33,10 @@ integration: $(READY)
 
 training: $(READY) kernels
 	$(PYTEST) tests/training
+
+robots: $(READY)
+	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube
+	$(PYTEST) tests/robots
 
 # one after the other: a cluster has this machine for itself
 engines: $(READY) kernels
@@ -76,6 +81,7 @@ bench-gpu: $(READY)
 	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.loops
 	$(BIN)/python -m benchmarks.saving
+	$(BIN)/python -m benchmarks.tasks
 	$(BIN)/python -m benchmarks.objective
 
 bench-api: $(READY)
@@ -93,11 +99,14 @@ fuzz: $(READY)
 env: $(READY)
 
 # torch first and alone: an environment that has it installs nothing more for the packages that want it
+# mjlab (Apache-2.0) for the files of real robots that it brings along, which the tests and the jobs of those robots read: none of its code
+# is imported, and so nothing that it depends on is needed
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Muster needs Python 3.11 or newer; set PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[worker,aws,dev]'
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --no-deps mjlab
 	touch $(READY)
 
 # the image, and a cluster of containers of it: containers/compose.yaml

@@ -61,7 +61,7 @@ ENTRIES = (
         "tasks",
         "tasks",
         _HERE,
-        "List the tasks that are installed here; of one, the names of its observations and actions.",
+        "List the tasks that are installed here; of one, all its terms and numbers.",
     ),
     Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors."),
     Entry(

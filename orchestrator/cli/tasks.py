@@ -21,12 +21,10 @@ def register(app: typer.Typer) -> None:
 
 
 def tasks(
-    name: Annotated[
-        str | None, typer.Argument(help="A task, or module:Class: show its observations, actions and rewards by name.")
-    ] = None,
+    name: Annotated[str | None, typer.Argument(help="A task, or module:Class: show its terms and numbers.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the tasks that are installed here; of one, the names of its observations and actions.
+    """List the tasks that are installed here; of one, all its terms and numbers.
 
     The weights of reward terms are changed in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
@@ -38,9 +36,16 @@ def tasks(
         return
     console = Console()
     console.print(_table(found))
-    if name:
-        for kind in ("observations", "actions"):
-            console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", highlight=False, markup=False)
+    if not name:
+        return
+    for kind in ("observations", "actions"):
+        console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", highlight=False, markup=False)
+    for section, rows in found[0].get("tables", {}).items():
+        console.print()
+        console.print(_terms(section, rows))
+    if numbers := found[0].get("numbers"):
+        console.print("\nNUMBERS of train.config.numbers and train.config.curriculum", highlight=False, markup=False)
+        console.print(_numbers(numbers))
 
 
 def _ask_worker(names: list[str]) -> list[dict[str, Any]]:
@@ -63,6 +68,26 @@ def _ask_worker(names: list[str]) -> list[dict[str, Any]]:
     # what a module of the user's prints while it is imported comes before
     found: list[dict[str, Any]] = json.loads(asked.stdout.splitlines()[-1])
     return found
+
+
+def _terms(section: str, rows: list[dict[str, str]]) -> Table:
+    """A section of a declaration; columns in which nothing stands are left out."""
+    table = Table(box=None, pad_edge=False, title=section.upper(), title_justify="left", title_style="")
+    columns = [column for column in rows[0] if any(row[column] for row in rows)]
+    for column in columns:
+        table.add_column(column, overflow="fold", no_wrap=column == "name")
+    for row in rows:
+        table.add_row(*(row[column] for column in columns))
+    return table
+
+
+def _numbers(numbers: dict[str, list[float]]) -> Table:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column("place", no_wrap=True)
+    table.add_column("value", overflow="fold")
+    for place, values in numbers.items():
+        table.add_row(place, ", ".join(f"{value:g}" for value in values))
+    return table
 
 
 def _table(found: list[dict[str, Any]]) -> Table:

@@ -334,7 +334,7 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{name: _figure(name, value, finished) for name, value in known.items()},
+            **{name: _figure(name, value, finished, lengths) for name, value in known.items()},
         }
 
     def _finish(self) -> None:
@@ -401,8 +401,10 @@ def straggler(seconds: list[float]) -> dict[str, float]:
     return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
 
 
-def _figure(name: str, total: float, episodes: float) -> float | None:
-    """A reward term as its mean over the finished episodes; a count of mishaps as it is."""
-    if not name.startswith("reward_"):
-        return total
-    return total / episodes if episodes else None
+def _figure(name: str, total: float, episodes: float, steps: float) -> float | None:
+    """A reward term as its mean over the finished episodes, a metric over their steps; a count as it is."""
+    if name.startswith("reward_"):
+        return total / episodes if episodes else None
+    if name.startswith("metric_"):
+        return total / steps if steps else None
+    return total

@@ -15,6 +15,7 @@ from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
+from worker.tasks.images import described
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -106,8 +107,10 @@ def describe(training: Training, task: Task) -> dict[str, Any]:
     names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
     if interface := task.interface():
         names |= dataclasses.asdict(interface)
+    if images := described(task):
+        names["images"] = images
     if len(task.observation_shape) > 1:
-        names["camera"] = dataclasses.asdict(config.camera)  # type: ignore[attr-defined]
+        names["camera"] = images["policy"]
         for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
             names.pop(key, None)
     return {

@@ -44,13 +44,17 @@ class EpisodeArrays:
         weights: Weight of each reward term, shape ``(terms,)``.
         level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
         memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
+        lasting: What a task keeps of a world from episode to episode, shape ``(worlds, lasting_size)``.
+        last_actions: The actions of the step before while a declared task rewards, those that led here when it observes, 0 when an
+            episode begins; shape ``(worlds, actions)``.
+        earlier_actions: Those of one step earlier; shape ``(worlds, actions)``.
         warm_start: Accelerations from which the constraint solver starts, those of the worlds, shape ``(worlds, dofs)``.
         broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
-            a reward term, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns;
-            shape ``(6 + terms,)``.
+            a reward term and metric, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns, of a
+            declared task the ends by each termination and by the clock; shape ``(6 + terms,)`` or more.
     """
 
     actions: wp.array2d(dtype=wp.float32)
@@ -65,6 +69,9 @@ class EpisodeArrays:
     weights: wp.array(dtype=wp.float32)
     level: wp.array(dtype=wp.float32)
     memory: wp.array2d(dtype=wp.float32)
+    lasting: wp.array2d(dtype=wp.float32)
+    last_actions: wp.array2d(dtype=wp.float32)
+    earlier_actions: wp.array2d(dtype=wp.float32)
     warm_start: wp.array2d(dtype=wp.float32)
     broken: wp.array(dtype=wp.int32)
     mishap: wp.array(dtype=wp.int32)
@@ -202,6 +209,19 @@ def check_observations(episodes: EpisodeArrays):
         for column in range(episodes.terminal_observations.shape[1]):
             if not wp.isfinite(episodes.terminal_observations[world, column]):
                 episodes.terminal_observations[world, column] = 0.0
+
+
+@wp.kernel
+def check_group(
+    dones: wp.array(dtype=wp.bool), rows: wp.array2d(dtype=wp.float32), ended: wp.array2d(dtype=wp.float32)
+):
+    """Replace non-finite numbers of a further observation group by 0."""
+    world = wp.tid()
+    for column in range(rows.shape[1]):
+        if not wp.isfinite(rows[world, column]):
+            rows[world, column] = 0.0
+        if dones[world] and not wp.isfinite(ended[world, column]):
+            ended[world, column] = 0.0
 
 
 @wp.kernel

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco_warp
@@ -13,6 +14,10 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.wording import nearest
+from worker.simulation.collisions import share, share_ground
+from worker.simulation.drives import Drives, has_drives
+from worker.simulation.terrain import Terrain
+from worker.simulation.terrain_arrays import Ground
 
 wp.set_module_options({"enable_backward": False})
 
@@ -105,10 +110,31 @@ class _Solver(SolverMuJoCo):
     """Takes all substeps between one push of Newton's state to MuJoCo and one pull of it: none of them needs the other's coordinates."""
 
     substeps = 1
+    before_substep: Sequence[Callable[[], None]] = ()
+    after_substep: Sequence[Callable[[], None]] = ()
 
     def _mujoco_warp_step(self) -> None:
         for _ in range(self.substeps):
+            for launch in self.before_substep:
+                launch()
             super()._mujoco_warp_step()
+            for launch in self.after_substep:
+                launch()
+
+    @staticmethod
+    def _preserved_masks_cover_collision_filters(
+        model: newton.Model, selected_shapes: Any, collision_type: Any, collision_affinity: Any, body_filters: Any
+    ) -> bool:
+        """Newton asks whether masks alone keep those apart that must not touch, and makes up masks of its own where they don't.
+
+        What is fixed to the world never touches the world in MuJoCo, whatever the masks: the base of an arm and the ground are no reason.
+        """
+        of_shapes = {int(body) for body in model.shape_body.numpy()[selected_shapes]}
+        fixed = sorted(of_shapes & _fixed_bodies(model))
+        filters = [*body_filters, *((first, second) for first in fixed for second in fixed)]
+        return SolverMuJoCo._preserved_masks_cover_collision_filters(
+            model, selected_shapes, collision_type, collision_affinity, filters
+        )
 
 
 class Worlds:
@@ -121,11 +147,19 @@ class Worlds:
         timestep: Length of one physics step [s].
         substeps: Physics steps of one :meth:`simulate`.
         fastest: See :class:`WorldArrays`.
-        ground: Whether to add one ground plane (z = 0) that all worlds share.
+        ground: Whether to add one ground plane (z = 0) that all worlds share, or the terrain that is their ground.
         solver_options: Keyword arguments of ``SolverMuJoCo`` (``njmax`` and ``nconmax`` are per world).
 
+    Attributes:
+        ground: The terrain on the device and the place of every world on it; None without a terrain.
+        drives: The delays and explicit motors of the actuators; None where there is neither. A task calls ``drives.settle`` after it
+            placed worlds afresh and keeps ``drives.state_tensors``.
+        after_substep: Called after each physics step of :meth:`simulate`, in this order: launches only. The contacts and forces of that
+            step are in ``solver.mjw_data``; Newton's own state (``arrays.joint_q``, ``state``) is still that before :meth:`simulate`.
+
     Raises:
-        ValueError: An option of the solver is unknown or set here, or the robot has actuators that would ignore the controls.
+        ValueError: An option of the solver is unknown or set here, the robot has actuators that would ignore the controls, or the
+            terrain would not fit into memory.
     """
 
     def __init__(
@@ -137,18 +171,33 @@ class Worlds:
         timestep: float,
         substeps: int,
         fastest: float,
-        ground: bool = False,
+        ground: bool | Terrain = False,
         solver_options: Mapping[str, Any],
     ) -> None:
         _check_options(solver_options)
         scene = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(scene)
+        has_masks = share(template)
         scene.replicate(template, world_count)
-        if ground:
+        if isinstance(ground, Terrain):
+            ground.check_memory(device)
+            ground.add_to(scene)
+        elif ground:
             scene.add_ground_plane()
-        self.model = scene.finalize(device=device)
+        if has_masks:
+            share_ground(scene)
+        # Newton gives a shape whose file says nothing a gap of 0.1 m, in which contacts are found, stored and not used; MuJoCo gives
+        # none. Without it there are 3 to 4 times fewer of them on a robot that stands.
+        scene.shape_gap = [0.0 if gap == scene.rigid_gap else gap for gap in scene.shape_gap]
+        self.ground = Ground(ground, world_count, device) if isinstance(ground, Terrain) else None
+        with warnings.catch_warnings():
+            # of height fields that can't collide with each other; none of a terrain's does
+            warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")
+            self.model = scene.finalize(device=device)
         self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
         self.solver.substeps = substeps
+        self.after_substep: list[Callable[[], None]] = []
+        self.solver.after_substep = self.after_substep
         # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
         options = self.solver.mjw_model.opt
         options.warn_overflow = 0
@@ -169,7 +218,12 @@ class Worlds:
         self.arrays.fastest = fastest
         self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
         self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
-        self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
+        self.drives = Drives(self.model, self.solver, world_count) if has_drives(self.model) else None
+        if self.drives is None:
+            self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
+        else:
+            self.arrays.controls = self.drives.controls
+            self.solver.before_substep = [self.drives.launch]
         self.arrays.drives = self.solver.mjw_data.qfrc_actuator
         self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
         self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
@@ -204,12 +258,28 @@ class Worlds:
         self.state.joint_q.assign(self.model.joint_q)
         self.state.joint_qd.assign(self.model.joint_qd)
         self.arrays.controls.zero_()
+        if self.drives is not None:
+            self.drives.forget()
         self.arrays.warm_start.zero_()
         self.arrays.overflow.zero_()
 
     def update_bodies(self) -> None:
         """Compute body poses and velocities (``state.body_q``, ``state.body_qd``) from joint coordinates, which alone are kept up to date."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+
+    def update_shapes(self) -> None:
+        """Bring what cameras see to where :meth:`update_bodies` found the bodies."""
+        self.model.bvh_refit_shapes(self.state)
+
+
+def _fixed_bodies(model: newton.Model) -> set[int]:
+    """Bodies that fixed joints alone connect to the world."""
+    fixed = {-1}
+    joints = zip(model.joint_type.numpy(), model.joint_parent.numpy(), model.joint_child.numpy(), strict=True)
+    for kind, parent, child in joints:  # parents come first
+        if kind == newton.JointType.FIXED and int(parent) in fixed:
+            fixed.add(int(child))
+    return fixed
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
@@ -229,13 +299,14 @@ def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.C
     if controls is None or not controls.size:
         if sources is None:
             raise ValueError(
-                "the robot has no actuators, so that no action could move it; give its MJCF file an <actuator> section"
+                "the robot has no actuators, so that no action could move it; give worker.simulation.robot.Robot its actuators, or its MJCF "
+                "file an <actuator> section"
             )
         joints = model.joint_target_mode.numpy()[: solver.mj_model.nv].nonzero()[0]
         raise ValueError(
             f"nothing would drive the robot: {_joints(model, joints)} follow joint targets, as joints of URDF and USD files do, and a "
-            "task writes the inputs of MuJoCo's actuators alone; describe the robot in MJCF, with an <actuator> section, and add it with "
-            "builder.add_mjcf(file, ctrl_direct=True)"
+            "task writes the inputs of actuators alone; give worker.simulation.robot.Robot its actuators, or describe the robot in MJCF, "
+            "with an <actuator> section, and add it with builder.add_mjcf(file, ctrl_direct=True)"
         )
     attributes: Any = model.mujoco
     count = controls.size // max(1, model.world_count)

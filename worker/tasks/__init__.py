@@ -1,4 +1,8 @@
-"""The built-in tasks and how a task is found by name."""
+"""Tasks: how they are found by name, and all that a task of one's own is made of.
+
+What is named here is public: ``from worker.tasks import DeclaredTask, Declaration, Robot, terms``. Names are imported when they are
+first used, since most of them bring the simulation with them.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,71 @@ import importlib
 import os
 import sys
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from shared_store.wording import nearest
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
+
+_PUBLIC = {
+    "worker.tasks.config": ("Randomization", "STRICT", "TaskConfig", "reward_weights"),
+    "worker.tasks.declaration": (
+        *(
+            "Action",
+            "Adaptive",
+            "Choice",
+            "Command",
+            "Curriculum",
+            "Declaration",
+            "Event",
+            "Image",
+            "Metric",
+            "Observation",
+            "Reward",
+            "Term",
+        ),
+        "Termination",
+    ),
+    "worker.tasks.declared": ("DeclaredTask",),
+    "worker.tasks.randomize": ("Randomize",),
+    "worker.tasks.task": ("Task",),
+    "worker.simulation.actuators": (
+        *("DCMotorActuator", "EffortActuator", "ExplicitPDActuator", "PositionActuator", "VelocityActuator"),
+    ),
+    "worker.simulation.collisions": ("Collision",),
+    "worker.simulation.episodes": ("EpisodeArrays", "numbered_stream", "random_stream"),
+    "worker.simulation.objects": ("Box", "Capsule", "Sphere"),
+    "worker.simulation.robot": ("Robot",),
+    "worker.simulation.robot_arrays": ("BodyArrays", "RobotArrays"),
+    "worker.simulation.sensors.camera": ("CameraArrays", "CameraSensor"),
+    "worker.simulation.sensors.contact": ("ContactArrays", "ContactSensor"),
+    "worker.simulation.sensors.frames": ("FrameArrays", "Frames"),
+    "worker.simulation.sensors.height_scan": ("GridPattern", "HeightScan", "HeightScanArrays", "RingPattern"),
+    "worker.simulation.sensors.imu": ("Imu", "ImuArrays"),
+    "worker.simulation.sensors.momentum": ("AngularMomentum", "MomentumArrays"),
+    "worker.simulation.terrain": ("Terrain",),
+    "worker.simulation.terrain_patches": (
+        *("Flat", "Gaps", "Grid", "Patch", "Rough", "Slope", "Stairs", "Steps", "Stones", "Waves"),
+    ),
+    "worker.simulation.terrain_arrays": ("TerrainArrays",),
+    "worker.simulation.worlds": ("WorldArrays",),
+}
+"""Public names by the module that has them."""
+_MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "terms":
+        return importlib.import_module("worker.tasks.terms")
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULE_OF, "terms"})
+
 
 BUILT_IN = {
     "Cartpole": "worker.tasks.cartpole:Cartpole",
@@ -19,6 +82,11 @@ BUILT_IN = {
     "Ant": "worker.tasks.ant:Ant",
     "Humanoid": "worker.tasks.humanoid:Humanoid",
     "Quadruped": "worker.tasks.quadruped:Quadruped",
+    "Go1Flat": "worker.tasks.go1:Go1Flat",
+    "Go1Rough": "worker.tasks.go1:Go1Rough",
+    "G1Flat": "worker.tasks.g1:G1Flat",
+    "G1Rough": "worker.tasks.g1:G1Rough",
+    "LiftCube": "worker.tasks.lift:LiftCube",
 }
 """Tasks that are there even where the distribution's metadata is not (a source tree on the path)."""
 

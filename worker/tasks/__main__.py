@@ -5,41 +5,53 @@ from __future__ import annotations
 import gc
 import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from worker.tasks import find_task, task_names
+from worker.tasks.images import shown
+from worker.tasks.tables import numbers, tables
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
 
 
-def describe(name: str) -> dict[str, Any]:
+def describe(name: str, whole: bool = False) -> dict[str, Any]:
     """What a task sees, does and is rewarded for.
 
     Args:
         name: As :func:`worker.tasks.find_task` takes it.
+        whole: Of a declared task its terms, too: their tables, and the numbers that a job can change.
 
     Raises:
         ValueError: There is no such task.
     """
-    task = find_task(name)
-    config = task.config_type()
+    kind = find_task(name)
+    config = kind.config_type()
+    task = kind.sketch(config)
+    plan = getattr(task, "plan", None)
     return {
         "name": name,
-        "class": f"{task.__module__}:{task.__qualname__}",
-        "about": (task.__doc__ or "").strip().partition("\n")[0],
+        "class": f"{kind.__module__}:{kind.__qualname__}",
+        "about": (kind.__doc__ or "").strip().partition("\n")[0],
         "observations": _observations(task, config),
         "actions": list(task.action_names),
         "rewards": dict(config.rewards),
         "control_hz": config.control_hz,
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
+        **({"tables": tables(plan), "numbers": numbers(plan)} if whole and plan else {}),
     }
 
 
-def _observations(task: Any, config: Any) -> list[str]:
-    """Name of each observation; of a camera one line says what its image is."""
+def _observations(task: Task, config: Any) -> list[str]:
+    """Name of each observation; of each camera one line says what its image is."""
     camera = getattr(config, "camera", None)
-    if camera is None:
-        return list(task.observation_names)
-    return [f"image: {camera.frames} x RGB of {camera.width} x {camera.height} bytes, the present one first"]
+    if camera is not None:
+        return [f"image: {camera.frames} x RGB of {camera.width} x {camera.height} bytes, the present one first"]
+    plan = getattr(task, "plan", None)
+    images = {group: shown(plan, group) for group in plan.images} if plan else {}
+    names = [] if "policy" in images else list(task.observation_names)
+    return names + [f"{'image' if group == 'policy' else group}: {words}" for group, words in images.items()]
 
 
 def main(names: list[str]) -> int:
@@ -50,7 +62,7 @@ def main(names: list[str]) -> int:
     found = []
     for name in names or task_names():
         try:
-            found.append(describe(name))
+            found.append(describe(name, whole=bool(names)))
         except ValueError as error:
             if names:
                 print(error, file=sys.stderr)

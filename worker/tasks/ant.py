@@ -6,18 +6,13 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from worker.tasks.configs.running import AntConfig
-from worker.tasks.running import Running, observation_names
-
-JOINT_NAMES = tuple(f"{part}_{leg}" for leg in range(1, 5) for part in ("hip", "ankle"))
-"""The model file's hinges in the order of the joint coordinates."""
+from worker.tasks.running import Running
 
 
 class Ant(Running):
     """Newton's bundled ``nv_ant.xml``: 35 observations, 8 actions, 60 control steps a second, episodes of 16 s."""
 
     config_type = AntConfig
-    observation_names = observation_names(JOINT_NAMES)
-    action_names = JOINT_NAMES
     asset = "nv_ant.xml"
     # ankles bent outwards: the pose that the model file gives as init_qpos
     start_pose: ClassVar[Mapping[str, float]] = {"ankle_1": 1.0, "ankle_2": -1.0, "ankle_3": -1.0, "ankle_4": 1.0}

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, WrapValidator
 from pydantic.dataclasses import dataclass
@@ -171,8 +171,11 @@ class _Common:
     """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
     """What changes in the course of training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated
-    and held constant outside their range. By the name of a reward term: its weight; ``level``: how hard the
+    and held constant outside their range. By the name of a reward term: its weight; by the place of a number of a declared task, such as
+    ``events.push.speed`` (of several numbers, all of them): that number; ``level``: how hard the
     task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
+    numbers: Mapping[str, Finite | Sequence[Finite]] = field(default_factory=lambda: MappingProxyType({}))
+    """Numbers of a declared task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
     fastest: Positive = 1000.0
     """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""
     nan_limit: Amount = 0.1
@@ -193,6 +196,10 @@ class TaskConfig(_Common):
             not have.
     """
 
+    further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
+    """Observation groups besides ``policy`` and ``critic``, and of each whether it is of images, such as ``{"camera": True}``; ``policy``,
+    too, where a declaration makes it an image. Jobs are checked against these names when they are submitted."""
+
     @classmethod
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
         """What is wrong with a job's ``train.config``: keys to the value, and one line; None where nothing is."""
@@ -210,7 +217,7 @@ class TaskConfig(_Common):
     @property
     def observation_groups(self) -> Mapping[str, bool]:
         """The task's observation groups, and of each whether it is of images."""
-        return {"policy": getattr(self, "camera", None) is not None, "critic": False}
+        return {"policy": getattr(self, "camera", None) is not None, "critic": False, **self.further_groups}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
@@ -239,15 +246,17 @@ class TaskConfig(_Common):
                     ("rewards", name), f"{type(self).__name__} has no term {shown(name)}; {nearest(name, known)}"
                 )
         for name, points in self.curriculum.items():
-            if name != "level" and name not in known:
+            # only the task itself knows its places
+            if name != "level" and name not in known and "." not in name:
                 raise Refused(("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}")
             if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):
                 raise Refused(("curriculum", "level"), f"expected levels from 0 to 1, found {shown(points)}")
-        camera, scene = getattr(self, "camera", None), self.randomize.scene
-        if scene and camera is None:
+        groups, scene = self.observation_groups, self.randomize.scene
+        if scene and not any(groups.values()):
             raise Refused(("randomize", scene[0]), f"{type(self).__name__} has no camera that would see it")
-        if self.randomize.observation_noise and camera is not None:
+        if self.randomize.observation_noise and groups["policy"]:
             raise Refused(("randomize", "observation_noise"), "it is for numbers, not for images; use light and colors")
         weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
         object.__setattr__(self, "curriculum", MappingProxyType(dict(self.curriculum)))
+        object.__setattr__(self, "numbers", MappingProxyType(dict(self.numbers)))

@@ -17,13 +17,17 @@ from gymnasium.vector.utils import batch_space
 
 from worker.tasks import BUILT_IN, find_task
 
+Observations = np.ndarray | dict[str, np.ndarray]
 
-class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+
+class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
     """One task as a vector environment, with numpy at its edge.
 
     A world whose episode ends is reset in the same step: the step returns the first observation of the next episode, and
     ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask); of images
     the one before the last step.
+
+    An observation is an array; of a task with images beside numbers a dictionary of arrays: ``policy``, and each group of images.
 
     Args:
         task: Name or ``module:Class``, as :func:`worker.tasks.find_task` takes it.
@@ -49,13 +53,14 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.task = task_type(config, num_envs, seed=seed, device=device)
         self.num_envs = num_envs
         self.metadata = {**self.metadata, "render_fps": config.control_hz}
-        shape, images = self.task.observation_shape, self.task.observations.dtype == torch.uint8
-        self.single_observation_space = (
-            gymnasium.spaces.Box(0, 255, shape, np.uint8)
-            if images
-            else gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+        groups = self.task.groups
+        self._image_groups = [name for name, group in groups.items() if group.dtype == torch.uint8]
+        self._several = any(name != "policy" for name in self._image_groups)
+        spaces = {name: _space(groups[name]) for name in dict.fromkeys(("policy", *self._image_groups))}
+        self.single_observation_space: gymnasium.Space[Any] = (
+            gymnasium.spaces.Dict(spaces) if self._several else spaces["policy"]
         )
-        self._images = self._numpy(self.task.observations) if images else None
+        self._images = {name: self._numpy(groups[name]) for name in self._image_groups}
         size = self.task.action_size
         self.single_action_space: gymnasium.Space[Any] = (
             gymnasium.spaces.Discrete(size)
@@ -67,7 +72,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Observations, dict[str, Any]]:
         """Begin a new episode in every world.
 
         Args:
@@ -76,7 +81,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Returns:
             Observations, shape ``(num_envs, observations)``, float32 (images ``(num_envs, channels, height, width)``, uint8),
-            and an empty info.
+            in a dictionary where there are images beside numbers, and an empty info.
 
         Raises:
             ValueError: ``seed`` is negative, or ``options`` asks for a partial reset, which worlds do by themselves.
@@ -89,7 +94,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.task.reset()
         return self._observe(), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance every world by one control step.
 
         Args:
@@ -112,10 +117,13 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         info: dict[str, Any] = {}
         if dones.any():
             # no picture is taken of a world between its end and its reset: the one before stands for it
-            terminal = self._numpy(self.task.terminal_observations) if self._images is None else self._images
+            terminal = self._images
+            if "policy" not in terminal:
+                terminal = {"policy": self._numpy(self.task.terminal_observations), **terminal}
             final_obs = np.full(self.num_envs, None, dtype=object)
             for world in np.flatnonzero(dones):
-                final_obs[world] = terminal[world]
+                last = {name: group[world] for name, group in terminal.items()}
+                final_obs[world] = last if self._several else last["policy"]
             info = {"final_obs": final_obs, "_final_obs": dones.copy(), "final_info": {}, "_final_info": dones.copy()}
         return (
             self._observe(),
@@ -125,16 +133,23 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info,
         )
 
-    def _observe(self) -> np.ndarray:
-        observations = self._numpy(self.task.observations)
-        if self._images is not None:
-            self._images = observations
-        return observations
+    def _observe(self) -> Observations:
+        self._images = {name: self._numpy(self.task.groups[name]) for name in self._image_groups}
+        policy = self._images["policy"] if "policy" in self._images else self._numpy(self.task.observations)
+        return {"policy": policy, **self._images} if self._several else policy
 
     @staticmethod
     def _numpy(tensor: torch.Tensor) -> np.ndarray:
         """A copy, since the task's buffers change with the next step."""
         return tensor.cpu().numpy().copy()
+
+
+def _space(group: torch.Tensor) -> gymnasium.Space[Any]:
+    """Of one world's part of an observation group."""
+    shape = tuple(group.shape[1:])
+    if group.dtype == torch.uint8:
+        return gymnasium.spaces.Box(0, 255, shape, np.uint8)
+    return gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
 
 def register() -> None:

@@ -26,6 +26,10 @@ class Observation:
     """Where it comes from: a sensor, the operator, or the policy itself (its last action, clipped)."""
     range: tuple[float, float] | None = None
     """Least and greatest value in training, of a command [unit]."""
+    clip: tuple[float, float] | None = None
+    """Limits of ``quantity - offset`` before the scale [unit]; None: not limited."""
+    back: int = 0
+    """How many control steps ago it was: history that the policy sees. Before an episode's first step, its first value."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +37,20 @@ class Action:
     """One number that a policy asks for: the actuator's input is ``offset + scale * action``, the action clipped to ``clip`` before."""
 
     name: str
-    """Name of the joint."""
-    kind: Literal["effort", "position"]
-    """Whether the input is a force or torque, or the target of a position controller in the actuator."""
+    """Name of the joint; of a choice, its own."""
+    kind: Literal["effort", "position", "velocity", "choice"]
+    """Whether the input is a force or torque, or the target of a position or velocity controller in the actuator; a choice is one of
+    several actions, of which the policy names one."""
     unit: str
-    """Unit of the input: N, N m, m or rad."""
+    """Unit of the input: N, N m, m, rad, m/s or rad/s."""
     scale: float
     """Input that an action of 1 adds [unit]."""
     default_position: float
     """Position of the joint at the start of an episode, before it is varied [m, rad]."""
     offset: float = 0.0
     """Input at an action of 0 [unit]."""
-    clip: tuple[float, float] = (-float(ACTION_LIMIT), float(ACTION_LIMIT))
-    """Limits of the action."""
+    clip: tuple[float, float] | None = (-float(ACTION_LIMIT), float(ACTION_LIMIT))
+    """Limits of the action; None: not limited."""
     stiffness: float = 0.0
     """Gain on the error of the position [N/m, N m/rad]."""
     damping: float = 0.0

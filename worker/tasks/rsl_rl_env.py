@@ -6,7 +6,7 @@
     runner = OnPolicyRunner(make("Cartpole", 64, seed=1), config, "logs", "cpu")
     runner.learn(100, init_at_random_ep_len=True)
 
-Observation groups are ``policy`` and ``critic``. Images become float32 from -0.5 to 0.5, shape (worlds, channels, height, width):
+Observation groups are ``policy``, ``critic`` and those of the task's own, such as a camera's. Images become float32 from -0.5 to 0.5, shape (worlds, channels, height, width):
 rsl_rl's convolutions take numbers, and a task gives bytes.
 """
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import newton
 import torch
@@ -23,9 +23,12 @@ from worker.simulation.episodes import (
     read_mishap,
 )
 from worker.simulation.randomization import Randomizer
+from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
+from worker.tasks.checks import check_arguments, checked_interface
 from worker.tasks.config import TaskConfig, default_rewards, value_at
-from worker.tasks.interface import Interface, Observation, deviations
+from worker.tasks.interface import Interface, deviations
+from worker.tasks.saved import NEWER, check_state
 
 
 class Task:
@@ -76,11 +79,11 @@ class Task:
     A pair of numbers becomes a ``wp.vec2``."""
     reward_terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
-    observation_names: ClassVar[tuple[str, ...]]
+    observation_names: tuple[str, ...]
     """Name of each observation, in order."""
-    action_names: ClassVar[tuple[str, ...]]
+    action_names: tuple[str, ...]
     """Name of each action, in order (the joint that it drives); of a task with choices, of each choice."""
-    discrete: ClassVar[bool] = False
+    discrete: bool = False
     """Whether an action is one of several choices: its number, from 0, is then ``episodes.actions[world, 0]``."""
     act: ClassVar[wp.Kernel]
     """Kernel ``(parameters, worlds, episodes)`` over worlds: from ``episodes.actions`` to ``worlds.controls``."""
@@ -88,10 +91,17 @@ class Task:
     """Kernel ``(mode, max_age, parameters, worlds, episodes)`` over worlds; see :mod:`worker.simulation.episodes`."""
     ground: ClassVar[bool] = False
     """Whether the worlds stand on a ground plane."""
-    memory_size: ClassVar[int] = 0
+    metric_names: tuple[str, ...] = ()
+    """Names of what is logged besides the rewards, as a mean over the steps; of declared tasks."""
+    termination_names: tuple[str, ...] = ()
+    """Names of what ends episodes, which are counted; of declared tasks."""
+    memory_size: int = 0
     """Numbers that the kernels keep of each world in ``episodes.memory``, such as commands; they are part of the state."""
+    lasting_size: int = 0
+    """Numbers that survive episodes, in ``episodes.lasting``."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
+    _exact: tuple[wp.array, wp.array] | None = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -101,27 +111,28 @@ class Task:
     def __init__(
         self, config: TaskConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
     ) -> None:
-        self._check(config, world_count, seed, first_world)
+        check_arguments(type(self), config, world_count, seed, first_world)
         self.config = config
         self.world_count = world_count
         self.device = "cuda:0" if device == "cuda" else device
-        self.action_size = len(self.action_names)
-        camera = getattr(config, "camera", None)
-        self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
+        self.first_world = first_world
+        template = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(template)
+        self.build(template)
+        self.action_size = len(self.action_names)
+        self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.statistic_names: tuple[str, ...] = (
             "episodes",
             "episode_return",
             "episode_length",
             *(f"reward_{name}" for name in self.reward_terms),
+            *self.metric_names,
             "nan_worlds",
             "solver_overflows",
             "squared_return",
+            *self.termination_names,
         )
-        self.first_world = first_world
-        template = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(template)
-        self.build(template)
         try:
             self.worlds = Worlds(
                 template,
@@ -130,24 +141,21 @@ class Task:
                 timestep=1.0 / (config.control_hz * config.substeps),
                 substeps=config.substeps,
                 fastest=config.fastest,
-                ground=self.ground,
+                ground=self.stands_on(),
                 solver_options=self.solver_options,
             )
         except ValueError as error:
             raise ValueError(f"task {type(self).__name__}: {error}") from error
+        wp.synchronize_device(self.device)  # the worlds are built on Warp's own stream
         # torch fills some of the buffers: Warp's own stream might clear them after that
         with on_torch_stream(self.device):
             self._allocate()
-        self._parameters = self.parameters_type()
-        for item in fields(config):
-            if hasattr(self._parameters, item.name):
-                value = getattr(config, item.name)
-                setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
-        self.read_model(self._parameters)
+            self._prepare()
         noise = self._noise()
-        wp.synchronize_device(self.device)  # Built on Warp's own stream, from here on torch's.
+        wp.synchronize_device(self.device)
 
         self.seed(seed)
+        camera = getattr(config, "camera", None)
         with on_torch_stream(self.device):
             self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz, noise)
             self._camera = Camera(camera, config.randomize, self.worlds, self._episodes) if camera else None
@@ -155,18 +163,43 @@ class Task:
                 self.observations = self._camera.images
                 self.observation_shape = tuple(self.observations.shape[1:])
             self.groups, self.terminal_groups = self._group()
-            self._launch_step()  # Loads every kernel, which a capture cannot do on every platform.
-        self._graph = CapturedStep(self._launch_step, self.device)
+            self._begin()
+            for _, part in self._parts():  # Loads every kernel, which a capture cannot do on every platform.
+                part()
+        self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
         self._assert_captured()
         with on_torch_stream(self.device):
             self.worlds.restore_defaults()
+            self._lasting.zero_()
+            self.seed(seed)
+            self._begin()
         self.clear_statistics()
-        self.seed(seed)
         self.reset()
+
+    @classmethod
+    def sketch(cls, config: TaskConfig) -> Self:
+        """The task without any worlds: its names, and what a declared task's :attr:`plan` holds.
+
+        Args:
+            config: The task's configuration, of type ``config_type``.
+
+        Raises:
+            ValueError: The robot can't be read, or the declaration does not fit it.
+        """
+        task = cls.__new__(cls)
+        task.config = config
+        template = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(template)
+        task.build(template)
+        return task
 
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
         raise NotImplementedError
+
+    def stands_on(self) -> bool | Terrain:
+        """Whether the worlds stand on a plane, or the terrain that they stand on."""
+        return self.ground
 
     def read_model(self, parameters: Any) -> None:
         """Fill the kernel parameters that depend on the built model (``self.worlds``); by default none."""
@@ -190,8 +223,15 @@ class Task:
             episode_length: Their mean length [steps].
         """
         for name, points in self.config.curriculum.items():
-            number = self.level if name == "level" else self._weights[self.reward_terms.index(name)]
-            number.fill_(value_at(points, iteration))
+            self._number(name).fill_(value_at(points, iteration))
+
+    def _number(self, name: str) -> torch.Tensor:
+        """What a curriculum changes under this name."""
+        if "." in name:
+            raise ValueError(
+                f"task {type(self).__name__}: curriculum: it has no number {name}; declared tasks have such"
+            )
+        return self.level if name == "level" else self._weights[self.reward_terms.index(name)]
 
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
@@ -200,7 +240,8 @@ class Task:
             actions: As :attr:`actions`, into which they are copied.
         """
         self.actions.copy_(actions)
-        self._graph.launch()
+        for launch in self._steps:
+            launch()
 
     def reset(self) -> None:
         """Begin a new episode, from fresh random numbers, in every world."""
@@ -263,59 +304,16 @@ class Task:
                 otherwise; nothing was changed.
         """
         tensors = self.state_tensors()
-        task = type(self).__name__
-        state = {"broken": torch.zeros_like(self._broken, device="cpu"), **state}  # older states do not have it
-        if missing := sorted(tensors.keys() - state.keys()):
-            raise ValueError(f"the saved state of task {task} lacks {', '.join(missing)}")
-        if unknown := sorted(state.keys() - tensors.keys()):
-            raise ValueError(f"the saved state of task {task} holds {', '.join(unknown)}, which the task does not have")
-        for name, tensor in tensors.items():
-            saved = state[name]
-            if saved.shape != tensor.shape or saved.dtype != tensor.dtype:
-                raise ValueError(
-                    f"the saved state of task {task} does not fit: {name} is {tuple(saved.shape)} {saved.dtype}, "
-                    f"expected {tuple(tensor.shape)} {tensor.dtype}"
-                )
-            if name == "world_factors" and not torch.equal(saved, tensor.cpu()):
-                raise ValueError(
-                    f"the saved state of task {task} does not fit: its worlds have other physics; use the same seed, "
-                    "first world and randomize"
-                )
+        # older states lack what is 0 when an episode begins, or nothing to go by
+        new = {name: torch.zeros_like(tensors[name], device="cpu") for name in NEWER if name in tensors}
+        state = {**new, **state}
+        check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
 
-    def _check(self, config: TaskConfig, world_count: int, seed: int, first_world: int) -> None:
-        """Raise an error of one sentence for an argument that is not valid."""
-        task = type(self).__name__
-        if not isinstance(config, self.config_type):
-            raise ValueError(
-                f"task {task} takes a {self.config_type.__name__}, not a {type(config).__name__}; "
-                f"make one with {self.config_type.__name__}(...)"
-            )
-        if not self.reward_terms:
-            raise ValueError(
-                f"task {task} has no reward terms; give {self.config_type.__name__} a field "
-                "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
-            )
-        if world_count < 1:
-            raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
-        if first_world < 0:
-            raise ValueError(f"task {task}: first_world is {first_world}; use an index >= 0")
-        if seed < 0:
-            raise ValueError(f"task {task}: seed is {seed}; use an integer >= 0")
-
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
-        interface = self.interface() or Interface(tuple(map(Observation, self.observation_names)), ())
-        for what, declared, names in (
-            ("observations", interface.observations, self.observation_names),
-            ("actions", interface.actions, self.action_names),
-        ):
-            if declared and tuple(item.name for item in declared) != tuple(names):
-                raise ValueError(
-                    f"task {type(self).__name__}: interface() has other {what} than the task, or in another order; "
-                    f"they are {', '.join(names)}"
-                )
+        interface = checked_interface(self)
         try:
             return deviations(self.config.randomize.observation_noise, interface.observations)
         except ValueError as error:
@@ -340,9 +338,12 @@ class Task:
         self.dones = buffer("dones", (count,), wp.bool)
         self.time_outs = buffer("time_outs", (count,), wp.bool)
         self.episode_length = buffer("ages", (count,), wp.int32)
-        self._sums = buffer("sums", (count, 2 + len(self.reward_terms)), wp.float32)
+        self._sums = buffer("sums", (count, 2 + len(self.reward_terms) + len(self.metric_names)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
         self._memory = buffer("memory", (count, self.memory_size), wp.float32)
+        self._lasting = buffer("lasting", (count, self.lasting_size), wp.float32)
+        self._last_actions = buffer("last_actions", tuple(self.actions.shape), wp.float32)
+        self._earlier_actions = buffer("earlier_actions", tuple(self.actions.shape), wp.float32)
         self._broken = buffer("broken", (count,), wp.int32)
         self.mishap = buffer("mishap", (1,), wp.int32)
         self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
@@ -394,13 +395,30 @@ class Task:
         """
         self.captured = False
         self.rewards.fill_(float("nan"))
-        self._graph.launch()
+        for launch in self._steps:
+            launch()
         if self.rewards.isnan().any():
             raise RuntimeError(f"the captured step of task {type(self).__name__} does not replay on {self.device}")
         self.captured = True
 
+    def _prepare(self) -> None:
+        """Everything that the kernels take besides the worlds and episodes."""
+        self._parameters = self.parameters_type()
+        for item in fields(self.config):
+            if hasattr(self._parameters, item.name):
+                value = getattr(self.config, item.name)
+                setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
+        self.read_model(self._parameters)
+
+    def _begin(self) -> None:
+        """What happens to the worlds once in their life: called after random streams are seeded, and again after the trial step."""
+
+    def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
+        """The control step in order: its parts, and of each whether a graph holds it."""
+        return [(True, self._launch_step)]
+
     def _launch_step(self) -> None:
-        """The whole control step, as launches: what the graph holds."""
+        """The whole control step, as launches."""
         self.randomizer.push()
         wp.launch(
             self.act,

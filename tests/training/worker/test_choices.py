@@ -17,28 +17,24 @@ from tests.conftest import run_muster
 from worker.tasks.gym import TaskVectorEnv
 
 TASK = '''
+import dataclasses
+
 import warp as wp
 
-from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.worlds import WorldArrays
-from worker.tasks.cartpole import Cartpole, CartpoleParameters
+from worker.tasks import Choice, RobotArrays, WorldArrays
+from worker.tasks.cartpole import Cartpole
 
 
-@wp.kernel
-def push(parameters: CartpoleParameters, worlds: WorldArrays, episodes: EpisodeArrays):
-    world = wp.tid()
-    worlds.controls[world, 0] = 0.6 * (episodes.actions[world, 0] - 1.0)
+@wp.func
+def push(world: int, worlds: WorldArrays, robot: RobotArrays, choice: int):
+    worlds.controls[world, robot.actuators[0]] = 0.6 * float(choice - 1)
 
 
 class Pushed(Cartpole):
     """The cart is pushed to the left, not at all, or to the right."""
 
-    discrete = True
-    action_names = ("left", "nothing", "right")
-    act = push
-
-    def interface(self):
-        return None
+    def declare(self, config):
+        return dataclasses.replace(super().declare(config), actions=Choice(push, names=("left", "nothing", "right")))
 '''
 JOB = "name: pushed\nresources: {cpus: 1, memory: 1GiB}\ntrain: {task: pushed:Pushed, worlds: 64, iterations: 80}\n"
 

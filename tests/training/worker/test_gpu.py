@@ -25,6 +25,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "Cartpole": ("Cartpole", {}),
     "Ant": ("Ant", {}),
     "images": ("CartpolePixels", {}),
+    "a camera on a body": ("tests.support.worker.seeing:SeeingDepth", {}),
     "a critic of its own": (
         "Cartpole",
         {

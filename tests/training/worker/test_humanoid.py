@@ -12,7 +12,7 @@ import torch
 
 from tests.support.worker.tasks import observe, play, put, statistics
 from worker.tasks import find_task
-from worker.tasks.humanoid import JOINT_NAMES, Humanoid, HumanoidConfig
+from worker.tasks.humanoid import Humanoid, HumanoidConfig
 
 FILE = ElementTree.parse(newton.examples.get_asset("nv_humanoid.xml")).getroot()
 HINGES = {
@@ -20,6 +20,7 @@ HINGES = {
     for joint in FILE.iter("joint")
     if joint.get("range")
 }
+JOINT_NAMES = tuple(HINGES)
 GEARS = {motor.get("joint"): float(motor.get("gear", "nan")) for motor in FILE.iterfind("actuator/motor")}
 
 
@@ -31,19 +32,19 @@ def humanoid() -> Humanoid:
 def test_it_is_found_and_its_sizes_are_those_of_its_names(humanoid: Humanoid) -> None:
     assert find_task("Humanoid") is Humanoid
     assert (humanoid.observation_shape, humanoid.action_size) == ((74,), 21)
-    assert len(set(Humanoid.observation_names)) == 74 and Humanoid.action_names == JOINT_NAMES
+    assert len(set(humanoid.observation_names)) == 74 and humanoid.action_names == JOINT_NAMES
     assert humanoid.config.ppo.hidden_sizes == (400, 200, 100)
     assert HumanoidConfig().control_hz == 60 and HumanoidConfig().substeps == 2
 
 
 def test_joints_ranges_and_strengths_are_those_of_the_file(humanoid: Humanoid) -> None:
-    assert tuple(HINGES) == JOINT_NAMES, "bodies hold their hinges in this order"
-    parameters = humanoid._parameters
-    assert np.allclose(parameters.ranges.numpy(), [HINGES[name] for name in JOINT_NAMES], atol=1e-6)
-    assert np.allclose(parameters.strengths.numpy(), [GEARS[name] / 135.0 for name in JOINT_NAMES])
+    robot = humanoid.robots["robot"]
+    assert np.allclose(robot.ranges.numpy(), [HINGES[name] for name in JOINT_NAMES], atol=1e-6)
+    assert np.allclose(robot.efforts.numpy(), [GEARS[name] for name in JOINT_NAMES])
+    assert humanoid.numbers("rewards.energy.strongest").tolist() == [135.0]
     motors = list(GEARS)
     assert motors[:3] == ["abdomen_y", "abdomen_z", "abdomen_x"], "another order than the joints'"
-    assert parameters.actuators.numpy().tolist() == [motors.index(name) for name in JOINT_NAMES]
+    assert robot.actuators.numpy().tolist() == [motors.index(name) for name in JOINT_NAMES]
 
 
 def test_every_action_drives_the_joint_that_it_is_named_after(humanoid: Humanoid) -> None:
@@ -77,7 +78,7 @@ def test_observation_and_reward_by_hand(humanoid: Humanoid) -> None:
     humanoid.actions.zero_()
     humanoid.actions[0, knee] = -3.0
     observe(humanoid)
-    seen = dict(zip(Humanoid.observation_names, humanoid.observations[0].tolist(), strict=True))
+    seen = dict(zip(humanoid.observation_names, humanoid.observations[0].tolist(), strict=True))
     assert seen["torso_height"] == pytest.approx(1.3)
     assert [seen[f"torso_velocity_{axis}"] for axis in "xyz"] == pytest.approx([2.0, -0.3, 0.1], abs=1e-5)
     assert [seen[f"torso_angular_velocity_{axis}"] for axis in "xyz"] == pytest.approx([0, 0, 0.1], abs=1e-6)

@@ -121,7 +121,7 @@ def test_symmetry_makes_a_policy_that_acts_alike_on_both_sides() -> None:
         unlike[name] = float((here + mirrored).abs().mean() / here.abs().mean())
         mean_return, mean_length = evaluate(algorithm.policy(), task)
         assert mean_length > 295.0 and mean_return > HELD
-    assert unlike["with"] < 0.1 and unlike["with"] < 0.3 * unlike["without"]
+    assert unlike["with"] < 0.15 and unlike["with"] < 0.3 * unlike["without"]
 
 
 def test_what_rnd_knows_is_no_longer_new() -> None:

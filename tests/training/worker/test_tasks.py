@@ -117,16 +117,11 @@ def test_replay_does_what_the_launches_do(cartpole: Cartpole) -> None:
     addresses = cartpole.observations.data_ptr(), cartpole.rewards.data_ptr(), cartpole.statistics.data_ptr()
     replayed = play(cartpole, 60, seed=3)
     cartpole.load_state_dict(start)
-    graph, cartpole._graph = cartpole._graph, None
-
-    class Eager:
-        launch = staticmethod(cartpole._launch_step)
-
-    cartpole._graph = Eager()
+    replaying, cartpole._steps = cartpole._steps, [part for _, part in cartpole._parts()]
     try:
         eager = play(cartpole, 60, seed=3)
     finally:
-        cartpole._graph = graph
+        cartpole._steps = replaying
     assert same(replayed, eager) and any(dones.any() for _, _, dones, _ in eager)
     assert addresses == (
         cartpole.observations.data_ptr(),
@@ -224,9 +219,9 @@ def test_a_task_without_reward_terms_is_refused() -> None:
 
 def test_a_step_that_replays_nothing_is_refused() -> None:
     class Deaf(Cartpole):
-        def _launch_observe(self, mode: int) -> None:
+        def _judge_alone(self, mode: int) -> None:
             if mode != STEP:
-                super()._launch_observe(mode)
+                super()._judge_alone(mode)
 
     with pytest.raises(RuntimeError, match="the captured step of task Deaf does not replay on cpu"):
         Deaf(CartpoleConfig(), 2)

@@ -44,7 +44,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
 
 LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
-TASKS = "Ant, Cartpole, CartpolePixels, Humanoid, Quadruped"
+TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, Quadruped"
 TOP = (
     "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, logs, retry, "
     "on_child_failure, timeout, stall_timeout"
@@ -327,7 +327,7 @@ def test_a_task_of_one_s_own_is_taken_by_module_and_class() -> None:
 
 
 def test_the_known_tasks_are_the_installed_ones() -> None:
-    assert known_tasks() == ["Ant", "Cartpole", "CartpolePixels", "Humanoid", "Quadruped"]
+    assert known_tasks() == TASKS.split(", ")
 
 
 def test_there_is_a_spec_to_copy() -> None:

@@ -221,4 +221,5 @@ def test_what_can_not_be_checked_here_is_left_to_the_rank() -> None:
 @pytest.mark.usefixtures("reach")
 def test_the_json_schema_has_the_installed_tasks_that_json_can_describe() -> None:
     described = {each["if"]["properties"]["task"]["const"] for each in schema()["$defs"]["Train"]["allOf"]}
-    assert described == {"Ant", "Cartpole", "CartpolePixels", "Humanoid", "Quadruped", "Reach"}
+    walkers = {"G1Flat", "G1Rough", "Go1Flat", "Go1Rough"}
+    assert described == {"Ant", "Cartpole", "CartpolePixels", "Humanoid", "LiftCube", "Quadruped", "Reach"} | walkers

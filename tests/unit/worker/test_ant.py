@@ -28,7 +28,7 @@ def test_ant_observation_and_reward_by_hand(ant: Ant) -> None:
     ant.actions.zero_()
     ant.actions[0, 0] = 2.0
     observe(ant)
-    seen = dict(zip(Ant.observation_names, ant.observations[0].tolist(), strict=True))
+    seen = dict(zip(ant.observation_names, ant.observations[0].tolist(), strict=True))
     assert seen["torso_height"] == pytest.approx(0.5)
     assert [seen[f"torso_velocity_{axis}"] for axis in "xyz"] == pytest.approx([2.0, -0.3, 0.1], abs=1e-5)
     assert [seen[f"torso_angular_velocity_{axis}"] for axis in "xyz"] == pytest.approx([0, 0, 0.1], abs=1e-6)
@@ -63,13 +63,13 @@ def test_every_ant_action_drives_the_joint_that_it_is_named_after(ant: Ant) -> N
     pose = [0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0, *[0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0]]
     put(ant, joint_q=[pose] * 8, joint_qd=[[0.0] * 14] * 8)
     ant.step(torch.eye(8))
-    names = Ant.observation_names[19:27]
-    assert [name.removesuffix("_velocity") for name in names] == list(Ant.action_names)
+    names = ant.observation_names[19:27]
+    assert [name.removesuffix("_velocity") for name in names] == list(ant.action_names)
     velocities = ant.observations[:, 19:27]
     assert velocities.abs().argmax(dim=1).tolist() == list(range(8))
     assert (velocities.diagonal() > 0.5).all()
     labels = [label.rsplit("/", 1)[-1] for label in ant.worlds.model.joint_label[1:9]]
-    assert labels == list(Ant.action_names)
+    assert labels == list(ant.action_names)
 
 
 def test_ants_stand_and_random_ones_stay_finite(ant: Ant) -> None:

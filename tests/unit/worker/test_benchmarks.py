@@ -8,9 +8,11 @@ import subprocess
 import time
 
 import pytest
+import warp as wp
 
 from benchmarks import load
 from benchmarks.processor import contradictions
+from benchmarks.tasks import LOADED
 
 BUSY = "while :; do :; done"
 
@@ -50,3 +52,16 @@ def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> 
     theirs = {**ours, "stock": True, "seconds": 5.3}
     (line,) = contradictions(rates, [ours, theirs, {**ours, "worlds": 128}])
     assert line == "Cartpole with 64 worlds by Muster: 153,600 steps took 9.2 s, its rate says 2.4 s"
+
+
+def test_compile_times_are_read_from_what_warp_says(capfd: pytest.CaptureFixture[str]) -> None:
+    @wp.kernel(module="unique")
+    def fill(values: wp.array(dtype=wp.float32)):
+        values[wp.tid()] = 2.0
+
+    values = wp.zeros(3, dtype=wp.float32, device="cpu")
+    started = time.perf_counter()
+    wp.launch(fill, dim=3, inputs=[values], device="cpu")
+    took = time.perf_counter() - started
+    [(module, milliseconds)] = LOADED.findall(capfd.readouterr().out)
+    assert "fill" in module and 0.0 < float(milliseconds) <= 1000.0 * took and values.numpy().tolist() == [2.0] * 3

@@ -13,7 +13,7 @@ from tests.support.worker.tasks import observe, play, put, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks import find_task
-from worker.tasks.quadruped import JOINT_NAMES, Quadruped, QuadrupedConfig
+from worker.tasks.quadruped import Quadruped, QuadrupedConfig
 
 STAND = [0.0, 0.8, -1.6] * 4
 LEVEL = [0.0, 0.0, 0.0, 1.0]
@@ -24,16 +24,12 @@ def quadruped() -> Quadruped:
     return Quadruped(QuadrupedConfig(episode_seconds=2.0, command_seconds=0.1), 12, seed=1)
 
 
-def memory(command: list[float], countdown: float, action: list[float]) -> list[float]:
-    return [*command, countdown, *action]
-
-
 def test_it_is_found_and_its_sizes_are_those_of_its_names(quadruped: Quadruped) -> None:
     assert find_task("Quadruped") is Quadruped
     assert (quadruped.observation_shape, quadruped.action_size) == ((48,), 12)
-    assert len(set(Quadruped.observation_names)) == 48
+    assert len(set(quadruped.observation_names)) == 48
     labels = [label.rsplit("/", 1)[-1] for label in quadruped.worlds.model.joint_label[1:13]]
-    assert labels == list(Quadruped.action_names) == list(JOINT_NAMES)
+    assert labels == list(quadruped.action_names)
     assert QuadrupedConfig().control_hz == 50 and quadruped.worlds.timestep == pytest.approx(1 / 200)
 
 
@@ -75,7 +71,8 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
         quadruped,
         joint_q=[[1.0, 2.0, 0.3, 0.0, 0.0, half, half, *joints]],
         joint_qd=[[0.1, 0.8, 0.2, 0.3, 0.0, 0.5, 4.0, *[0.0] * 11]],
-        memory=[memory([1.0, 0.0, 0.25], 3.0, last)],
+        memory=[[1.0, 0.0, 0.25, 3.0]],
+        last_actions=[last],
     )
     torques = wp.to_torch(quadruped.worlds.arrays.drives)
     torques.zero_()
@@ -83,7 +80,7 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
     quadruped.actions.zero_()
     quadruped.actions[0, 0] = 5.0
     observe(quadruped)
-    seen = dict(zip(Quadruped.observation_names, quadruped.observations[0].tolist(), strict=True))
+    seen = dict(zip(quadruped.observation_names, quadruped.observations[0].tolist(), strict=True))
     assert [seen[f"trunk_velocity_{axis}"] for axis in "xyz"] == pytest.approx([0.8, -0.1, 0.2], abs=1e-5)
     assert [seen[f"trunk_angular_velocity_{axis}"] for axis in "xyz"] == pytest.approx([0.0, -0.3, 0.5], abs=1e-5)
     assert [seen[f"gravity_{axis}"] for axis in "xyz"] == pytest.approx([0, 0, -1], abs=1e-6)

@@ -10,9 +10,9 @@ import pytest
 import torch
 import warp as wp
 
+from tests.support.worker.kernels.cartpole import Cartpole, CartpoleConfig
 from worker.errors import UserError
 from worker.learning.job import user_errors
-from worker.tasks.cartpole import Cartpole, CartpoleConfig
 
 MJCF = """<mujoco><worldbody><body pos="0 0 1">
   <joint name="hinge" type="hinge" axis="0 1 0"/>

@@ -1,0 +1,74 @@
+"""Muster's own training of a case: the task with the case's solver limits, network and steps, as a job has it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from worker.distributed import Placement, connect
+from worker.learning.job import Job, StopRequest
+from worker.learning.loop import Loop
+from worker.learning.training import Training
+from worker.tasks import find_task
+from worker.tasks.task import Task
+
+
+def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[str, Any]]:
+    """A task whose solver has these limits, and what a job's ``train`` section has to say for them.
+
+    Args:
+        task: Name of a task.
+        limits: ``iterations``, ``ls_iterations`` and ``tolerance`` of the solver.
+
+    Raises:
+        ValueError: No such task.
+    """
+    task_type = find_task(task)
+    known = {item.name for item in dataclasses.fields(task_type.config_type)}
+    settings: dict[str, Any] = {}
+    if "solver_iterations" in known:
+        settings = {
+            "solver_iterations": int(limits["iterations"]),
+            "solver_line_search": int(limits["ls_iterations"]),
+        }
+    options = {**task_type.solver_options, **limits}
+    if settings:  # then they are the configuration's
+        options = {**task_type.solver_options, "tolerance": limits["tolerance"]}
+    if options == dict(task_type.solver_options):
+        return task_type, settings
+    return type(task_type.__name__, (task_type,), {"solver_options": options}), settings
+
+
+def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Loop, **train: Any) -> Loop:
+    """The training loop as ``muster run`` has it, on a store of its own.
+
+    Args:
+        asked: ``task``, ``worlds``, ``iterations``, ``limits``, ``save_every`` and ``seed``; ``steps`` and ``hidden_sizes`` of
+            ``ppo`` where they are there.
+        store: Folder of the store.
+        loop_type: What is built.
+        **train: More of the job's ``train`` section.
+
+    Raises:
+        ValueError: No such task.
+        UserError: A setting that the task or the algorithm refuses.
+    """
+    task_type, settings = limited(asked["task"], asked["limits"])
+    placement = Placement.from_env(os.environ)
+    run = Store(store).open().run(f"peers-{asked['task']}-{asked['worlds']}-{asked['seed']}".lower())
+    run.create({"run": run.name})
+    raise_epoch(run, 1)
+    network = {name: asked[name] for name in ("steps", "hidden_sizes") if name in asked}
+    if train.get("algorithm", "ppo") != "ppo":  # another algorithm has networks and steps of its own
+        network = {}
+    section = {name: asked[name] for name in ("task", "worlds", "iterations", "seed")}
+    section |= settings | ({"ppo": network} if network else {}) | train
+    # every checkpoint stays: they are judged afterwards
+    spec = {"train": section, "checkpoint": {"every": asked["save_every"], "keep": 10**6}}
+    job = Job(spec, Store(store), run, 1, 1, "peers", section=section)
+    return loop_type(Training.of(job, task_type), connect(placement), StopRequest())

@@ -1,0 +1,187 @@
+"""Makes the environment of a peer, apart from this one and with the peer's own pins.
+
+    python -m benchmarks.peers.environment mjlab [--folder .peers/mjlab] [--python python3.11] [--torch-index URL]
+    python -m benchmarks.peers.environment isaaclab --python python3.12
+
+``--torch-index`` names pip's index of torch where the usual one has not the build for this machine. Isaac Lab's robots come from a
+server on the network; in its place stand Newton's own files of the same robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared_store.wording import nearest
+
+HERE = Path(__file__).parent
+FOLDER = HERE.parent.parent / ".peers"
+"""Where environments are made by default, a folder for each."""
+ASSETS = "assets"
+"""Folder of robots, inside Isaac Lab's environment."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """How an environment is made.
+
+    Attributes:
+        torch: What is installed first, from the index of torch: what comes afterwards takes it as it is.
+        pins: File of requirements, beside this module.
+        alone: Packages that are installed last, without what they ask for.
+        python: Versions of Python that will do, ``(3, 12)`` for 3.12.
+        finish: Called with the environment's folder in the end.
+    """
+
+    torch: tuple[str, ...]
+    pins: str
+    alone: tuple[str, ...]
+    python: tuple[tuple[int, int], ...]
+    finish: Callable[[Path], None] | None = None
+
+
+def make(name: str, folder: Path, python: str = sys.executable, torch_index: str | None = None) -> None:
+    """Make the environment; packages that are there already stay.
+
+    Args:
+        name: One of :data:`ENVIRONMENTS`.
+        folder: Where it is made.
+        python: The interpreter that it is made of.
+        torch_index: Address of a package index for torch; None: the usual one.
+
+    Raises:
+        ValueError: No such environment, or the interpreter can't be used for it.
+        CalledProcessError: pip could not install something; it has said what.
+    """
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"there is no environment {name!r}; {nearest(name, ENVIRONMENTS)}")
+    wanted = ENVIRONMENTS[name]
+    found = version_of(python)
+    if found not in wanted.python:
+        able = ", ".join(f"{major}.{minor}" for major, minor in wanted.python)
+        raise ValueError(
+            f"{name} needs Python {able}, {python} is {found[0]}.{found[1]}; name another one with --python"
+        )
+    if not (folder / "bin" / "python").exists():
+        subprocess.run([python, "-m", "venv", str(folder)], check=True)
+    pip = [
+        str(folder / "bin" / "python"),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-compile",
+        "--disable-pip-version-check",
+    ]
+    index = ["--index-url", torch_index] if torch_index else []
+    subprocess.run([*pip, *index, *wanted.torch], check=True)
+    subprocess.run([*pip, *wanted.torch, "--requirement", str(HERE / wanted.pins)], check=True)
+    for package in wanted.alone:
+        subprocess.run([*pip, "--no-deps", package], check=True)
+    if wanted.finish:
+        wanted.finish(folder)
+
+
+def version_of(python: str) -> tuple[int, int]:
+    """Major and minor version of an interpreter. Raises ValueError where it can't be started."""
+    asked = "import sys; print(*sys.version_info[:2])"
+    try:
+        said = subprocess.run([python, "-c", asked], check=True, capture_output=True, text=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise ValueError(f"{python} is no Python that can be started ({error}); name one with --python") from error
+    major, minor = map(int, said.split())
+    return major, minor
+
+
+ROBOTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "Ant/ant_instanceable.usd": ("ant.usda", {}),
+    "Humanoid/humanoid_instanceable.usd": (
+        "humanoid.usda",
+        {
+            "abdomen_x": "pelvis",
+            "right_knee": "right_shin",
+            "left_knee": "left_shin",
+            "right_elbow": "right_lower_arm",
+            "left_elbow": "left_lower_arm",
+        },
+    ),
+}
+"""What stands for each of Isaac Lab's robots: a file of Newton's, and its joints that Isaac Lab calls otherwise."""
+
+
+GROUND = "Isaac/IsaacLab/Environments/Grid/default_ground_plane_checker_v1/default_ground_plane.usda"
+"""Where Isaac Lab looks for the plane that robots stand on."""
+PLANE = """#usda 1.0
+(
+    defaultPrim = "ground"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "ground"
+{
+    def Plane "collision" (prepend apiSchemas = ["PhysicsCollisionAPI"])
+    {
+        uniform token axis = "Z"
+        uniform token purpose = "guide"
+    }
+}
+"""
+"""A plane that touches, and nothing to look at."""
+
+
+def put_robots(folder: Path) -> None:
+    """Put a plane, and Newton's files of the ant and the humanoid, where Isaac Lab looks for its own.
+
+    Raises:
+        ValueError: A file has not the joints of :data:`ROBOTS`.
+    """
+    (source,) = folder.glob("lib/python*/site-packages/newton/examples/assets")
+    ground = folder / ASSETS / GROUND
+    ground.parent.mkdir(parents=True, exist_ok=True)
+    ground.write_text(PLANE)
+    for place, (name, renamed) in ROBOTS.items():
+        target = folder / ASSETS / "Isaac" / "Robots" / "IsaacSim" / place
+        target.parent.mkdir(parents=True, exist_ok=True)
+        text = (source / name).read_text()
+        for joint, called in renamed.items():
+            text, found = re.subn(rf'(def Physics\w*Joint) "{joint}"', rf'\1 "{called}"', text)
+            if found != 1:
+                raise ValueError(
+                    f"{source / name} has {found} joints {joint}, one was expected; is it another release of Newton?"
+                )
+        target.write_text(text)
+
+
+ENVIRONMENTS: Mapping[str, Environment] = {
+    "mjlab": Environment(
+        ("torch==2.13.0", "torchvision==0.28.0"), "mjlab.txt", (), ((3, 10), (3, 11), (3, 12), (3, 13))
+    ),
+    "isaaclab": Environment(("torch==2.11.0",), "isaaclab.txt", ("isaaclab==3.0.0",), ((3, 12),), put_robots),
+}
+"""The environments by name."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", help=f"one of {', '.join(ENVIRONMENTS)}")
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--python", default=sys.executable)
+    parser.add_argument("--torch-index")
+    options = parser.parse_args(arguments)
+    folder = options.folder or FOLDER / options.name
+    try:
+        make(options.name, folder, options.python, options.torch_index)
+    except ValueError as error:
+        parser.error(str(error))
+    except subprocess.CalledProcessError as error:
+        raise SystemExit(f"{' '.join(error.cmd)} failed with exit code {error.returncode}") from error
+    print(f"made {folder}")
+
+
+if __name__ == "__main__":
+    main()

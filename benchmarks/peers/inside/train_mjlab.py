@@ -1,0 +1,84 @@
+"""One training of mjlab by its own script, in its own environment: ``python train_mjlab.py JSON``; ``benchmarks.peers.mjlab`` calls it.
+
+The JSON has ``task``, ``worlds``, ``iterations``, ``steps``, ``hidden_sizes``, ``limits``, ``save_every``, ``seed``, ``logs``, ``out``
+and ``began``. Changed are those numbers and the logger, which is TensorBoard instead of a service on the network.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from typing import Any
+
+from clock import Clock, device_facts, versions
+
+
+def contract(environment: Any) -> dict[str, Any]:
+    """What the numbers of the policy mean: its observations, and of each action the joint, scale [rad] and offset [rad]."""
+    from mjlab.rl.exporter_utils import get_base_metadata
+
+    known = get_base_metadata(environment, "-")
+    action = environment.action_manager.get_term("joint_pos")
+    widths = [shape[0] for shape in environment.observation_manager.group_obs_term_dim["actor"]]
+    return {
+        "observations": dict(zip(known["observation_names"], widths, strict=True)),
+        "observation_scales": known["observation_terms_scale"],
+        "joints": known["joint_names"],
+        "positions": known["default_joint_pos"],
+        "actions": list(action.target_names),
+        "action_scale": known["action_scale"],
+        "stiffness": known["joint_stiffness"],
+        "damping": known["joint_damping"],
+    }
+
+
+def probe(runner: Any, least: int = 8) -> dict[str, Any]:
+    """What mjlab's own policy makes of some observations, after the last iteration: whoever converts its weights can compare."""
+    import torch
+
+    seen = runner.env.get_observations().to(runner.device)[:least]
+    with torch.inference_mode():
+        actions = runner.get_inference_policy()(seen)
+    return {"observations": seen["actor"].tolist(), "actions": actions.tolist()}
+
+
+def main() -> None:
+    asked: dict[str, Any] = json.loads(sys.argv[1])
+    os.environ.setdefault("WANDB_MODE", "disabled")
+    import mjlab.tasks  # noqa: F401 - fills the registry
+    import torch
+    from mjlab.scripts.train import TrainConfig, launch_training
+    from mjlab.tasks.registry import list_tasks
+
+    if asked["task"] not in list_tasks():
+        raise SystemExit(f"mjlab has no task {asked['task']}; it has {', '.join(list_tasks())}")
+    device, wait = device_facts()
+    clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
+    clock.install()
+    training = TrainConfig.from_task(asked["task"])
+    environment, agent = training.env, training.agent
+    environment.scene.num_envs = asked["worlds"]
+    physics = environment.sim.mujoco
+    for name, value in asked["limits"].items():
+        setattr(physics, name, value)
+    agent.max_iterations, agent.num_steps_per_env = asked["iterations"], asked["steps"]
+    agent.actor.hidden_dims = agent.critic.hidden_dims = tuple(asked["hidden_sizes"])
+    agent.seed, agent.save_interval = asked["seed"], asked["save_every"]
+    agent.logger, agent.upload_model = "tensorboard", False
+    on = [0] if torch.cuda.is_available() else None
+    launch_training(asked["task"], dataclasses.replace(training, log_root=asked["logs"], gpu_ids=on))
+    clock.write(
+        asked["out"],
+        device=device,
+        solver={"timestep": physics.timestep, "decimation": environment.decimation, **dataclasses.asdict(physics)},
+        network={"actor": agent.actor.hidden_dims, "critic": agent.critic.hidden_dims},
+        contract=contract(clock.runner.env.unwrapped),
+        probe=probe(clock.runner),
+        versions=versions("mjlab", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib", "torch"),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,331 @@
+"""What a declared task is made of and what each part costs on this device: kernels, sensors, terms, and compiling it.
+
+    python -m benchmarks.tasks [--tasks Ant Quadruped] [--worlds 4096] [--no-compile] [--out DIRECTORY]
+
+A part is recorded many times over in one graph, and its share is that of one control step of the same task; all graphs take turns, so that
+what else happens on the machine happens to all of them. A sensor that the task does not have is added to it, and nothing reads it. A term
+is measured with and without: in a task with sixteen more of them. Compiling is done in processes of its own, with a kernel cache that is
+empty (cold) and then full (warm). Writes ``tasks.md`` on a GPU and ``tasks_cpu.md`` without one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+
+from benchmarks.load import Watch, add_option, told
+from benchmarks.training import CUDA, device_name, wait
+from worker.simulation.capture import CapturedStep
+from worker.simulation.episodes import STEP
+from worker.simulation.sensors.contact import ContactSensor
+from worker.simulation.sensors.frames import Frames
+from worker.simulation.sensors.height_scan import HeightScan
+from worker.simulation.sensors.imu import Imu
+from worker.simulation.sensors.momentum import AngularMomentum
+from worker.tasks import find_task, terms
+from worker.tasks.compiler import Kernels, further
+from worker.tasks.declaration import Declaration, Metric, Observation
+from worker.tasks.declared import DeclaredTask
+
+WORLDS, WORLDS_CPU = 4096, 32
+TASKS = ("Ant", "Quadruped")
+FEET = {"Ant": "*_foot", "Quadruped": "*_shank", "LiftCube": "?f_down"}
+"""Bodies that sensors are put on."""
+TRUNKS = {"Ant": "torso", "Quadruped": "trunk", "LiftCube": "link_6"}
+ROUNDS, SECONDS, COPIES = 9, 0.15, 20
+MORE = 16
+"""So many more terms."""
+DEVICE = "cuda:0" if CUDA else "cpu"
+LOADED = re.compile(r"^Module (\S+) \S+ load on device '.*' took ([\d.]+) ms", re.M)
+
+
+def sensors(task: str) -> dict[str, Any]:
+    """One of each kind, by what the table calls it."""
+    feet, trunk = FEET[task], TRUNKS[task]
+    return {
+        "contacts": ContactSensor(bodies=feet),
+        "frames": Frames(bodies=feet),
+        "imu": Imu(body=trunk),
+        "momentum": AngularMomentum(),
+        "heights": HeightScan(bodies=trunk),
+    }
+
+
+def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[DeclaredTask]:
+    """The task with another declaration."""
+    kind: Any = find_task(task)
+    return type(f"{task}Varied", (kind,), {"declare": lambda self, config: change(kind.declare(self, config))})
+
+
+def made(kind: Any, worlds: int) -> DeclaredTask:
+    """A task that acts at random; what Warp says of its modules is not shown."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        task: DeclaredTask = kind(kind.config_type(), worlds, seed=1, device=DEVICE)
+    task.actions.uniform_(-1.0, 1.0)
+    return task
+
+
+def parts(task: DeclaredTask) -> dict[str, Callable[[], None]]:
+    """What a control step is made of besides the physics, as launches."""
+    rows = [array for group in further(task.plan) for array in task._rows[group]]
+    common = [int(STEP), task.max_episode_length, *rows, *task._common]
+
+    def kernel(kernel: wp.Kernel, inputs: list[Any]) -> Callable[[], None]:
+        return lambda: wp.launch(kernel, dim=task.world_count, inputs=inputs, device=task.device)
+
+    return {
+        "actions": kernel(task._kernels.act, task._common),
+        "judge": kernel(task._kernels.judge, common),
+        "observe": lambda: task._observe_alone(int(STEP)),
+        "bodies": task.worlds.update_bodies,
+    }
+
+
+def measured(sensor: Any) -> Callable[[], None]:
+    """A control step's launches of a sensor."""
+
+    def launch() -> None:
+        sensor.advance()
+        sensor.settle()
+
+    return launch
+
+
+@contextlib.contextmanager
+def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
+    """Within it, a task measures only what the plain one does."""
+    sensors, needs = sensed.sensors, sensed._needs
+    sensed.sensors, sensed._needs = {key: sensors[key] for key in plain.sensors}, plain._needs
+    try:
+        yield
+    finally:
+        sensed.sensors, sensed._needs = sensors, needs
+
+
+def seconds(graphs: Mapping[str, Callable[[], None]]) -> dict[str, list[float]]:
+    """Time of one replay of each graph, of each round: they take turns."""
+    counts, found = {}, dict[str, list[float]]()
+    for name, launch in graphs.items():
+        launch()
+        wait()
+        started = time.perf_counter()
+        launch()
+        wait()
+        counts[name] = max(1, round(SECONDS / max(1e-6, time.perf_counter() - started)))
+    for _ in range(ROUNDS):
+        for name, launch in graphs.items():
+            started = time.perf_counter()
+            for _ in range(counts[name]):
+                launch()
+            wait()
+            found.setdefault(name, []).append((time.perf_counter() - started) / counts[name])
+    return found
+
+
+def copies(part: Callable[[], None]) -> Callable[[], None]:
+    """A graph that holds a part many times."""
+
+    def launch() -> None:
+        for _ in range(COPIES):
+            part()
+
+    return CapturedStep(launch, DEVICE).launch
+
+
+def more(name: str, declaration: Declaration) -> Declaration:
+    """A declaration with sixteen more terms of a kind."""
+    if name == "observation of each joint, with noise":
+        policy = dict(declaration.groups["policy"])
+        policy |= {f"more_{each}": Observation(terms.joint_velocity, noise=0.1, unit="rad/s") for each in range(MORE)}
+        return dataclasses.replace(declaration, observations={**declaration.groups, "policy": policy})
+    function = terms.joint_effort_squared if name == "reward of each joint" else terms.root_height
+    metrics = {f"more_{each}": Metric(function) for each in range(MORE)}
+    return dataclasses.replace(declaration, metrics={**declaration.metrics, **metrics})
+
+
+TERMS = ("reward of the root", "reward of each joint", "observation of each joint, with noise")
+
+
+def measure(name: str, worlds: int) -> dict[str, Any]:
+    """Seconds of a control step and of its parts, of each sensor, of a term."""
+    plain = made(find_task(name), worlds)
+    added = {key: each for key, each in sensors(name).items()}
+    sensed = made(varied(name, lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})), worlds)
+    graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._whole, DEVICE).launch}
+    # both of the same worlds, since what the solver has to do depends on what they are in
+    graphs["step, sensed"] = CapturedStep(sensed._whole, DEVICE).launch
+    with unmeasured(sensed, plain):
+        graphs["step, unmeasured"] = CapturedStep(sensed._whole, DEVICE).launch
+    graphs |= {part: copies(launch) for part, launch in parts(plain).items()}
+    graphs |= {f"sensor {key}": copies(measured(sensed.sensors[key])) for key in added}
+    for term in TERMS:
+        crowd = parts(made(varied(name, lambda given, term=term: more(term, given)), worlds))  # type: ignore[misc]
+        graphs[f"term {term}"] = copies(lambda crowd=crowd: (crowd["judge"](), crowd["observe"]()))  # type: ignore[misc]
+    own = parts(plain)
+    graphs["term none"] = copies(lambda: (own["judge"](), own["observe"]()))  # type: ignore[func-returns-value]
+    found = seconds(graphs)
+    times = {
+        key: statistics.median(values) / (1 if key.startswith("step") else COPIES) for key, values in found.items()
+    }
+    pairs = zip(found["step, sensed"], found["step, unmeasured"], strict=True)
+    times["sensors"] = statistics.median(more - less for more, less in pairs)
+    for term in TERMS:
+        pairs = zip(found[f"term {term}"], found["term none"], strict=True)
+        times[f"term {term}"] = statistics.median(more - less for more, less in pairs) / COPIES / MORE
+    started = time.perf_counter()
+    Kernels(name, plain.plan, plain._needs.apart)
+    columns = {key: len(sensed.sensors[key].names) for key in added}
+    return {"times": times, "text": time.perf_counter() - started, "columns": columns}
+
+
+def compiled(name: str, worlds: int) -> dict[str, Any]:
+    """Seconds until a task is there in a new process, and of them those for its own kernels and for all, cold and warm."""
+    found = {}
+    with tempfile.TemporaryDirectory() as cache:
+        for state in ("cold", "warm"):
+            command = [sys.executable, "-m", "benchmarks.tasks", "--build", name, str(worlds)]
+            environment = os.environ | {"WARP_CACHE_PATH": cache}
+            output = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+            loads = [(module, float(took) / 1000) for module, took in LOADED.findall(output)]
+            found[state] = {
+                "own": sum(took for module, took in loads if module.startswith("muster.")),
+                "all": sum(took for _, took in loads),
+                "built": float(output.rstrip().rsplit("\n", 1)[-1]),
+            }
+    return found
+
+
+def build(name: str, worlds: int) -> None:
+    """Build a task, and print in the last line how long it took."""
+    kind: Any = find_task(name)
+    started = time.perf_counter()
+    kind(kind.config_type(), worlds, seed=1, device=DEVICE)
+    wait()
+    print(time.perf_counter() - started)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        f"# What tasks are made of, on {device_name()}",
+        "",
+        f"Medians of {ROUNDS} rounds in which all graphs take turns; `python -m benchmarks.tasks`. {told(rows)}",
+        "",
+        "## A control step",
+        "",
+        "`judge` rewards, ends, resets and, where nothing of bodies or sensors is observed, observes; else `observe` does, which also "
+        "looks for what is not finite. Body poses are brought up to date only where a term or a sensor reads them.",
+        "",
+        "| task | worlds | step [ms] | actions | judge | observe | physics and the rest | body poses would add |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        times, step = row["times"], row["times"]["step"]
+        known = [times[part] / step for part in ("actions", "judge", "observe")]
+        cells = " | ".join(f"{share:.2%}" for share in (*known, 1.0 - sum(known)))
+        lines.append(
+            f"| {row['task']} | {row['worlds']:,} | {1000 * step:.3f} | {cells} | {times['bodies'] / step:+.2%} |"
+        )
+    lines += [
+        "",
+        "## Sensors",
+        "",
+        "Each by itself, measured once a control step; a contact sensor that is `fine` takes its cost in every physics step. Those that "
+        "look at bodies need their poses as well. All of them: the step with them, poses included, less the step without.",
+        "",
+        "| task | sensor | columns | [µs] | of a step |",
+        "|---|---|--:|--:|--:|",
+    ]
+    for row in rows:
+        times, step = row["times"], row["times"]["step"]
+        for key, columns in row["columns"].items():
+            took = times[f"sensor {key}"]
+            lines.append(f"| {row['task']} | {key} | {columns} | {1e6 * took:.1f} | {took / step:.2%} |")
+        took = times["sensors"]
+        lines.append(
+            f"| {row['task']} | all of them | {sum(row['columns'].values())} | {1e6 * took:.1f} | {took / step:+.2%} |"
+        )
+    lines += [
+        "",
+        "## A term",
+        "",
+        f"The kernels that judge and observe with {MORE} more terms, less those without, for one term.",
+        "",
+        "| task | one more | [µs] | of a step |",
+        "|---|---|--:|--:|",
+    ]
+    for row in rows:
+        times, step = row["times"], row["times"]["step"]
+        for term in TERMS:
+            took = times[f"term {term}"]
+            lines.append(f"| {row['task']} | {term} | {1e6 * took:.2f} | {took / step:+.3%} |")
+    return "\n".join([*lines, *compilation([row for row in rows if "compiled" in row])]) + "\n"
+
+
+def compilation(rows: list[dict[str, Any]]) -> list[str]:
+    """The part of the table that is about compiling."""
+    if not rows:
+        return []
+    lines = [
+        "",
+        "## Compiling",
+        "",
+        "In a new process, after imports: the text of the task's own kernels; loading its own module; loading all modules, the solver's "
+        "and the sensors' among them; until the task is there. Cold: with an empty kernel cache.",
+        "",
+        "| task | text [ms] | own module, cold [s] | warm | all modules, cold [s] | warm | task is there, cold [s] | warm |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        pairs = [(row["compiled"]["cold"][key], row["compiled"]["warm"][key]) for key in ("own", "all", "built")]
+        cells = " | ".join(f"{cold:.1f} | {warm:.2f}" for cold, warm in pairs)
+        lines.append(f"| {row['task']} | {1000 * row['text']:.1f} | {cells} |")
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(FEET))
+    parser.add_argument("--worlds", type=int, default=WORLDS if CUDA else WORLDS_CPU)
+    parser.add_argument("--no-compile", action="store_true", help="leave out the compile times, which take minutes")
+    parser.add_argument("--build", nargs=2, metavar=("TASK", "WORLDS"), help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
+    options = parser.parse_args()
+    if options.build:
+        build(options.build[0], int(options.build[1]))
+        return
+    torch.manual_seed(1)
+    watch, rows = Watch(options.loaded_anyway), list[dict[str, Any]]()
+    file = options.out / ("tasks.md" if CUDA else "tasks_cpu.md")
+    for task in options.tasks:
+        row = {"task": task, "worlds": options.worlds} | measure(task, options.worlds)
+        rows.append(row | watch.check(f"while {task} was measured"))
+        file.write_text(table(rows))
+    if not options.no_compile:
+        for row in rows:
+            row["compiled"] = compiled(row["task"], options.worlds)
+            row |= watch.check(f"while {row['task']} was compiled")
+            file.write_text(table(rows))
+            file.with_suffix(".json").write_text(json.dumps(rows, indent=1))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

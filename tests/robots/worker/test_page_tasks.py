@@ -1,0 +1,145 @@
+"""The tasks that the pages show: they run as they are printed there, and say what the pages say."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from tests.conftest import REPOSITORY
+from tests.support.worker.page_tasks import blocks, module
+from tests.support.worker.tasks import observe, put
+from worker.learning.job import configure
+from worker.tasks import find_task
+from worker.tasks.declared import DeclaredTask
+
+SIZES = re.compile(r"(\d+) observations, (\d+) actions?")
+
+
+def played(task: DeclaredTask, steps: int = 3) -> DeclaredTask:
+    """A task after some random steps, whose sizes are those of its docstring."""
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(steps):
+        task.step(torch.randn(task.world_count, task.action_size, generator=generator))
+    assert task.observations.isfinite().all()
+    told = SIZES.search(type(task).__doc__ or "")
+    assert not told or (len(task.observation_names), task.action_size) == (int(told[1]), int(told[2]))
+    return task
+
+
+def test_the_tutorial_shows_the_example_as_it_is() -> None:
+    example = (REPOSITORY / "job_specs/my_task.py").read_text()
+    shown = blocks("own-task.md")[:5]
+    assert "".join("".join(shown).split()) == "".join(example.split('"""', 2)[2].split())
+
+
+def test_the_page_on_kernels_shows_the_example_as_it_is() -> None:
+    example = (REPOSITORY / "job_specs/my_kernels.py").read_text()
+    shown = [block.rstrip() for block in blocks("tasks/kernels.md")]
+    missing = [block for block in shown if "@wp." in block and block not in example]
+    assert not missing and sum("@wp." in block for block in shown) == 4
+
+
+def test_the_tutorials_further_tasks_run(tmp_path: Path) -> None:
+    page = module("own-task.md", tmp_path)
+    task = played(page.Everything(page.PendulumConfig(), 3, seed=1), 40)
+    assert task.groups["policy"].shape == (3, 6) and task.groups["critic"].shape == (3, 8)
+    assert {"metric_power", "termination_spins", "termination_bored"} <= set(task.statistic_names)
+    angle, velocity = task.worlds.state.joint_q.numpy(), task.worlds.state.joint_qd.numpy()
+    energy = 0.5 * (-9.81 * 0.25) * math.cos(angle[1]) + 0.5 * 0.25 / 6.0 * velocity[1] ** 2
+    assert task.groups["critic"][1, 7].item() == pytest.approx(0.2 * energy, rel=1e-4)
+    assert "wanted: 1 x (rad - 0)" in page.contract(task)
+    assert page.Chooser.sketch(page.PendulumConfig()).action_names == ("left", "none", "right")
+    assert page.CheckedConfig(torque=0.5).torque == 0.5
+    with pytest.raises(ValueError, match="torque"):
+        page.CheckedConfig(torque=2.0)
+
+
+def test_a_cube_beside_the_pendulum_falls_onto_the_ground(tmp_path: Path) -> None:
+    page = module("own-task.md", tmp_path)
+    task = played(page.WithCube(page.PendulumConfig(), 2, seed=1), 30)
+    assert task.observation_names[-1] == "cube"
+    assert task.observations[:, 3].tolist() == pytest.approx([0.05, 0.05], abs=3e-3)
+
+
+def test_the_tutorials_jobs_fit_the_example() -> None:
+    page = (REPOSITORY / "docs/own-task.md").read_text()
+    jobs = [yaml.safe_load(block) for block in re.findall(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)]
+    assert len(jobs) == 2
+    for job in jobs:
+        task_type = find_task(job["train"]["task"])
+        config = configure(task_type, job["train"])
+        sketch = task_type.sketch(config)
+        for place in [name for name in config.curriculum if "." in name]:
+            sketch.plan.numbers.find(place, "curriculum")
+    assert sketch.plan.numbers.values[sketch.plan.numbers.places["rewards.upright.target"][0]] == 3.0
+
+
+def test_what_a_wrong_number_says(tmp_path: Path) -> None:
+    page = module("own-task.md", tmp_path)
+
+    class Pendulum(page.Pendulum):  # type: ignore[name-defined,misc]
+        def declare(self, config):  # type: ignore[no-untyped-def]
+            return page.dataclasses.replace(
+                super().declare(config),
+                rewards={**super().declare(config).rewards, "upright": page.Reward(page.pointing, targt=1.0)},
+            )
+
+    line = next(line for line in (REPOSITORY / "docs/own-task.md").read_text().splitlines() if "targt" in line)
+    with pytest.raises(ValueError, match="targt") as caught:
+        Pendulum.sketch(page.PendulumConfig())
+    assert str(caught.value) == line
+
+
+def test_isaac_labs_cartpole_as_it_is_on_the_page(tmp_path: Path) -> None:
+    page = module("tasks/ports.md", tmp_path)
+    task = played(page.IsaacCartpole(page.IsaacCartpoleConfig(), 4, seed=1))
+    assert task.max_episode_length == 300
+    put(task, joint_q=[[0.5, 0.3], [-3.5, -0.4 - 2.0 * math.pi]], joint_qd=[[-2.0, 4.0], [1.0, 0.0]])
+    observe(task)
+    # Isaac Lab's rewards by hand: weight x value x the control step
+    by_hand = [(1.0 - 0.3**2 - 0.01 * 2.0 - 0.005 * 4.0) / 60.0, (-2.0 - 0.4**2 - 0.01) / 60.0]
+    assert task.rewards[:2].tolist() == pytest.approx(by_hand, abs=1e-6)
+    assert task.dones[:2].tolist() == [False, True] and not task.time_outs[1]
+    assert task.observations[0].tolist() == pytest.approx([0.5, 0.3, -2.0, 4.0], abs=1e-6)
+    [action] = task.interface().actions
+    assert (action.name, action.scale, action.clip, action.effort_limit) == ("slider_to_cart", 100.0, None, 400.0)
+
+
+def test_the_ant_of_the_page_on_sensors_feels(tmp_path: Path) -> None:
+    page = module("tasks/sensors.md", tmp_path)
+    task = played(page.FeelingAnt(page.FeelingAntConfig(), 2, seed=1), 60)
+    touches = [task.observation_names.index(name) for name in task.observation_names if name.endswith("_touches")]
+    assert len(touches) == 4 and task.observations[:, touches].sum() > 0
+
+
+def test_the_climber_and_the_ridges_of_the_page_on_terrain(tmp_path: Path) -> None:
+    page = module("tasks/terrain.md", tmp_path)
+    task = played(page.Climber(page.ClimberConfig(), 6, seed=1), 5)
+    heights = [task.observation_names.index(f"heights_{point}") for point in range(49)]
+    assert ((task.observations[:, heights] + 0.5 - 0.62).abs() < 0.4).all()
+    assert page.ridges.heights.max() == pytest.approx(0.3, abs=0.02)
+
+
+def test_the_entries_of_the_page_on_randomisation_fit_an_ant(tmp_path: Path) -> None:
+    page = module("tasks/sensors.md", tmp_path)
+    entries = module("tasks/randomization.md", tmp_path).randomize
+
+    class Varied(page.FeelingAnt):  # type: ignore[name-defined,misc]
+        def declare(self, config):  # type: ignore[no-untyped-def]
+            return replace(super().declare(config), randomize=entries)
+
+    task = Varied(page.FeelingAntConfig(), 4, seed=1)
+    view, model = task.views["robot"], task.worlds.solver.mjw_model
+    masses = model.body_mass.numpy()[:, 1]
+    own = task.worlds.solver.mj_model.body_mass[1]
+    assert len(set(masses)) == 4 and (masses > 0.8 * own).all() and (masses < 1.2 * own + 0.5).all()
+    assert view.find_bodies("torso") == [0]
+    gravity = model.opt.gravity.numpy()[:, 2]
+    assert len(set(gravity)) == 4 and (abs(gravity + 9.81) <= 0.2001).all()
+    assert task.numbers("randomize.torso.range").flatten().tolist() == pytest.approx([0.8, 1.2])

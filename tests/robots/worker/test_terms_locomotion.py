@@ -1,0 +1,336 @@
+"""Terms of locomotion, contacts, sensors and the ground, judged by numpy."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.support.worker.terms_rig import JOINTS, ROOT, ROOT_DOF, WORLDS, Rig, array, rotations
+from worker.simulation.sensors.contact import ContactArrays
+from worker.simulation.sensors.frames import FrameArrays
+from worker.simulation.sensors.height_scan import HeightScanArrays
+from worker.simulation.sensors.imu import ImuArrays
+from worker.simulation.sensors.momentum import MomentumArrays
+from worker.simulation.terrain_arrays import TerrainArrays
+from worker.tasks.terms import contacts, ground, locomotion, sensing, tolerances
+
+MODULES = (contacts, ground, locomotion, sensing, tolerances)
+SHARED = ("touches", "planar_speed", "above_ground", "posture_within")
+FEET, POINTS, COMMAND = 4, 6, 10
+
+
+def near(found: np.ndarray, wanted: Any, name: str = "") -> None:
+    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=2e-4, atol=3e-5, err_msg=name)
+
+
+def matrix(rotation: np.ndarray) -> np.ndarray:
+    """Rotation matrices of quaternions xyzw, shape ``(..., 3, 3)``."""
+    x, y, z, w = np.moveaxis(np.asarray(rotation, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def structs() -> dict[Any, Any]:
+    random = np.random.default_rng(5)
+    touch = random.random((WORLDS, FEET)) < 0.5
+    touch[0] = [True, False, False, False]  # one foot stands
+    arrays = ContactArrays()
+    arrays.found = array(touch * random.integers(1, 4, touch.shape), wp.int32)
+    arrays.forces = array(20 * touch[..., None] * random.normal(size=(*touch.shape, 3)), wp.vec3)
+    arrays.air_time = array(~touch * random.uniform(0.02, 0.6, touch.shape))
+    arrays.contact_time = array(touch * random.choice([0.02, 0.3], touch.shape))
+    arrays.last_air_time = array(random.uniform(0, 0.5, touch.shape))
+    arrays.last_contact_time = array(random.uniform(0, 0.5, touch.shape))
+    arrays.peaks = array(random.uniform(0, 4, touch.shape))
+    arrays.history = array(random.uniform(0, 20, (*touch.shape, 5)))
+    arrays.step, arrays.seconds = 0.004, 0.02
+    frames = FrameArrays()
+    frames.positions = array(random.normal(size=(WORLDS, FEET, 3)), wp.vec3)
+    frames.rotations = array(rotations(random, WORLDS, FEET), wp.quat)
+    frames.linear = array(random.normal(size=(WORLDS, FEET, 3)), wp.vec3)
+    frames.angular = array(random.normal(size=(WORLDS, FEET, 3)), wp.vec3)
+    imu = ImuArrays()
+    for name in ("gyro", "accelerometer", "velocimeter"):
+        setattr(imu, name, array(random.normal(size=(WORLDS, 3)), wp.vec3))
+    imu.rotations = array(rotations(random, WORLDS), wp.quat)
+    momentum = MomentumArrays()
+    for name in ("angular", "velocities", "centers"):
+        setattr(momentum, name, array(random.normal(size=(WORLDS, 3)), wp.vec3))
+    momentum.masses = array(random.uniform(1, 2, WORLDS))
+    scan = HeightScanArrays()
+    scan.heights = array(random.normal(size=(WORLDS, POINTS)))
+    scan.points = array(random.normal(size=(WORLDS, POINTS, 3)), wp.vec3)
+    terrain = TerrainArrays()
+    terrain.levels, terrain.kinds = array([0, 1, 1], wp.int32), array([2, 0, 1], wp.int32)
+    terrain.origins = array(random.normal(size=(2, 3, 3)), wp.vec3)
+    slope = 0.3 * np.arange(13) - 1.8  # height = 0.3 (x + 6) - 1.8 = 0.3 x along x, whatever y
+    terrain.heights = array(np.tile(slope, (13, 1)))
+    terrain.corner, terrain.size, terrain.resolution = wp.vec2(-6.0, -6.0), wp.vec2(2.0, 3.0), 1.0
+    allowed = tolerances.ToleranceArrays()
+    allowed.columns = array([0, 3], wp.int32)
+    allowed.standing, allowed.walking, allowed.running = array([0.5, 1.0]), array([1.0, 2.0]), array([3.0, 4.0])
+    found = (arrays, frames, imu, momentum, scan, terrain, allowed)
+    kinds = (ContactArrays, FrameArrays, ImuArrays, MomentumArrays, HeightScanArrays, TerrainArrays)
+    return dict(zip((*kinds, tolerances.ToleranceArrays), found, strict=True))
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    functions = [
+        each
+        for module in MODULES
+        for each in vars(module).values()
+        if isinstance(each, wp.Function) and each.func.__module__ == module.__name__ and each.key not in SHARED
+    ]
+    made = Rig(functions, tmp_path_factory.mktemp("locomotion"), structs())
+    values = made.episodes.memory.numpy()
+    values[:, COMMAND : COMMAND + 3] = [[0.3, -0.4, 0.2], [0.0, 0.0, 0.04], [1.2, 0.5, 0.9]]  # walk, nearly stand, run
+    made.episodes.memory.assign(values)
+    made.episodes.sums = array(np.ones((WORLDS, 3)))
+    return made
+
+
+def root(rig: Rig) -> SimpleNamespace:
+    """What the root is and does, by hand."""
+    turn = matrix(rig.q[:, ROOT + 3 : ROOT + 7])
+    linear, angular = rig.qd[:, ROOT_DOF : ROOT_DOF + 3], rig.qd[:, ROOT_DOF + 3 : ROOT_DOF + 6]
+    coms = rig.bodies.coms.numpy()[:, rig.robot.root_body]
+    origin = linear - np.cross(angular, np.einsum("wij,wj->wi", turn, coms))
+    own = [np.einsum("wji,wj->wi", turn, each) for each in (origin, linear, angular)]
+    yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+    return SimpleNamespace(
+        turn=turn,
+        yaw=yaw,
+        linear=linear,
+        angular=angular,
+        origin=origin,
+        own=own[0],
+        own_com=own[1],
+        own_angular=own[2],
+    )
+
+
+def test_tracking_rewards_and_errors(rig: Rig) -> None:
+    r, asked = root(rig), rig.episodes.memory.numpy()[:, COMMAND : COMMAND + 3].astype(float)
+    planar = asked * [1, 1, 0]
+    seen = (r.linear[:, 0] + 1j * r.linear[:, 1]) * np.exp(-1j * r.yaw)
+    for name, error in {
+        "track_linear_velocity": ((r.own - planar) ** 2).sum(1),
+        "track_angular_velocity": ((r.own_angular - asked * [0, 0, 1]) ** 2).sum(1),
+        "track_planar_velocity": ((r.own_com - asked)[:, :2] ** 2).sum(1),
+        "track_planar_velocity_by_heading": np.abs(seen - asked[:, 0] - 1j * asked[:, 1]) ** 2,
+        "track_turning_velocity": (r.own_angular[:, 2] - asked[:, 2]) ** 2,
+        "track_turning_velocity_in_world": (r.angular[:, 2] - asked[:, 2]) ** 2,
+    }.items():
+        near(rig.call(getattr(locomotion, name), command=COMMAND, std=1.5), np.exp(-error / 2.25), name)
+    near(rig.call(locomotion.planar_velocity_error, command=COMMAND), np.linalg.norm((r.own - asked)[:, :2], axis=1))
+    near(rig.call(locomotion.turning_velocity_error, command=COMMAND), np.abs(r.own_angular[:, 2] - asked[:, 2]))
+    length = np.linalg.norm(planar, axis=1)
+    along = np.where(length > 0, (r.own * planar).sum(1) / np.maximum(length, 1e-9), 0)
+    near(rig.call(locomotion.velocity_along_command, command=COMMAND), np.minimum(along, length))
+    near(rig.call(locomotion.heading_error, command=COMMAND), np.abs(asked[:, 2]))
+    near(rig.call(locomotion.distance_left, command=COMMAND), length)
+    near(rig.call(locomotion.near_place, command=COMMAND, std=0.4), 1 - np.tanh(length / 0.4))
+
+
+def test_posture(rig: Rig) -> None:
+    offsets = rig.q[:, rig.robot.coordinates.numpy()] - rig.robot.defaults.numpy()
+    near(rig.call(locomotion.posture, std=1.2), np.exp(-(offsets**2).mean(1) / 1.44))
+    for joint in range(JOINTS):
+        found = rig.call(locomotion.deviation_when_standing, joint, command=COMMAND)
+        near(found, np.abs(offsets[:, joint]) * [0, 1, 0])
+    r = root(rig)
+    moves = (r.origin**2).sum(1) + (r.angular**2).sum(1)
+    near(rig.call(locomotion.motion_when_standing, command=COMMAND), moves * [0, 1, 0])
+    two = offsets[:, [0, 3]]
+    near(rig.call(tolerances.tolerant_posture), np.exp(-((two / [0.5, 1.0]) ** 2).mean(1)))
+    allowed = np.array([[1.0, 2.0], [0.5, 1.0], [3.0, 4.0]])
+    near(rig.call(tolerances.commanded_posture, command=COMMAND), np.exp(-((two / allowed) ** 2).mean(1)))
+
+
+def test_contacts(rig: Rig) -> None:
+    c, f = rig.structs[ContactArrays], rig.structs[FrameArrays]
+    touch, force = c.found.numpy() > 0, c.forces.numpy()
+    norm = np.linalg.norm(force, axis=-1)
+    came = (c.contact_time.numpy() > 0) & (c.contact_time.numpy() < 0.021)
+    went = (c.air_time.numpy() > 0) & (c.air_time.numpy() < 0.021)
+    air, speed = c.air_time.numpy(), np.linalg.norm(f.linear.numpy()[..., :2], axis=-1)
+    peaks, history = c.peaks.numpy(), c.history.numpy()
+    assert came.any() and not came.all() and touch.any()
+    asks = np.array([[True], [False], [True]])  # for 0.7, 0.04 and 2.2; planar 0.5, 0 and 1.3
+    for foot in range(FEET):
+        for name, wanted, numbers in (
+            ("in_contact", touch, {}),
+            ("contact_strength", norm, {}),
+            ("air_time", air, {}),
+            ("contact_time", c.contact_time.numpy(), {}),
+            ("touchdown", came, {}),
+            ("liftoff", went, {}),
+            ("time_in_air", (air > 0.05) & (air < 0.5), {}),
+            ("commanded_time_in_air", (air > 0.05) & (air < 0.5) & asks, {"command": COMMAND}),
+            ("step_time", came * asks * (c.last_air_time.numpy() - 0.4), {"command": COMMAND, "target": 0.4}),
+            ("foot_slip", asks * touch * speed**2, {"command": COMMAND, "threshold": 0.1}),
+            ("foot_slide", (peaks > 1) * speed, {}),
+            ("soft_landing", asks * came * norm, {"command": COMMAND}),
+            (
+                "foot_clearance",
+                asks * np.abs(f.positions.numpy()[..., 2] - 0.1) * speed,
+                {"command": COMMAND, "height": 0.1, "threshold": 0.1},
+            ),
+            ("foot_stumble", np.linalg.norm(force[..., :2], axis=-1) > 2 * np.abs(force[..., 2]), {"ratio": 2.0}),
+            ("contact_count", c.found.numpy(), {}),
+            ("column_hard_contact_steps", (history > 15).sum(-1), {"force": 15.0}),
+            ("undesired_contact", peaks > 2, {"force": 2.0}),
+            ("contact_force_excess", np.maximum(peaks - 2, 0), {"force": 2.0}),
+            ("illegal_contact", history.max(-1) > 18, {"force": 18.0}),
+        ):
+            near(rig.call(getattr(contacts, name), foot, **numbers), wanted[:, foot], name)
+        near(rig.call(contacts.contact_force, foot), force[:, foot])
+        near(rig.call(contacts.contact_force_logarithm, foot), (np.sign(force) * np.log1p(np.abs(force)))[:, foot])
+    near(rig.call(contacts.hard_contact_steps, force=18.0), (history.max(1) > 18).sum(-1))
+    near(rig.call(contacts.no_contact, force=3.0), ~(peaks > 3).any(1))
+    times = np.where(touch, c.contact_time.numpy(), air).min(1)
+    alone = (touch.sum(1) == 1) & asks[:, 0]
+    assert alone.any() and not alone.all()
+    near(rig.call(contacts.single_stance_time, command=COMMAND, greatest=0.3), alone * np.minimum(times, 0.3))
+
+
+@pytest.mark.parametrize("where", ["flat", "terrain"])
+def test_the_greatest_height_of_a_swing_counts_at_touchdown(rig: Rig, where: str) -> None:
+    c, f = rig.structs[ContactArrays], rig.structs[FrameArrays]
+    kept = c.found.numpy().copy(), c.contact_time.numpy().copy(), f.positions.numpy().copy()
+    term = contacts.swing_height_error if where == "flat" else ground.swing_height_error_above_ground
+    numbers = {"command": COMMAND, "memory": 20, "height": 0.1}
+    values = rig.episodes.memory.numpy()
+    values[:, 20:24] = 0.0
+    rig.episodes.memory.assign(values)
+    swing = (0.05, 0.13, 0.08)
+    for height in swing:
+        c.found.zero_()
+        c.contact_time.zero_()
+        places = kept[2].copy()
+        places[..., 2] = height + (0.3 * places[..., 0] if where == "terrain" else 0.0)
+        f.positions.assign(places)
+        assert not rig.call(term, 1, **numbers).any()
+    c.found.fill_(1)
+    c.contact_time.fill_(0.02)
+    near(rig.call(term, 1, threshold=0.1, **numbers), (max(swing) / 0.1 - 1) ** 2 * np.array([1, 0, 1]))
+    assert not rig.episodes.memory.numpy()[:, 20:24].any()
+    for each, values in zip((c.found, c.contact_time, f.positions), kept, strict=True):
+        each.assign(values)
+
+
+def test_sensors(rig: Rig) -> None:
+    imu, frames, momentum = rig.structs[ImuArrays], rig.structs[FrameArrays], rig.structs[MomentumArrays]
+    turn = matrix(imu.rotations.numpy())
+    near(rig.call(sensing.imu_angular_velocity), imu.gyro.numpy())
+    near(rig.call(sensing.imu_linear_velocity), imu.velocimeter.numpy())
+    near(rig.call(sensing.imu_acceleration), imu.accelerometer.numpy())
+    near(rig.call(sensing.imu_projected_gravity), -turn[:, 2, :])
+    near(rig.call(sensing.imu_acceleration_squared), ((imu.accelerometer.numpy() - 9.81 * turn[:, 2, :]) ** 2).sum(1))
+    near(matrix(rig.call(sensing.imu_orientation)), turn)
+    turns = matrix(frames.rotations.numpy())
+    for column in range(FEET):
+        near(rig.call(sensing.frame_position, column), frames.positions.numpy()[:, column])
+        near(rig.call(sensing.frame_height, column), frames.positions.numpy()[:, column, 2])
+        near(matrix(rig.call(sensing.frame_orientation, column)), turns[:, column])
+        near(rig.call(sensing.frame_linear_velocity, column), frames.linear.numpy()[:, column])
+        near(rig.call(sensing.frame_angular_velocity, column), frames.angular.numpy()[:, column])
+        own = np.einsum("wji,wj->wi", turns[:, column], frames.linear.numpy()[:, column])
+        near(rig.call(sensing.frame_velocity_in_own_frame, column), own)
+    for index in range(6):
+        near(rig.call(sensing.frame_orientation_element, index), turns[:, 0, :, :2].reshape(WORLDS, 6)[:, index])
+    near(rig.call(sensing.angular_momentum), momentum.angular.numpy())
+    near(rig.call(sensing.angular_momentum_squared), (momentum.angular.numpy() ** 2).sum(1))
+    near(rig.call(sensing.center_of_mass_velocity), momentum.velocities.numpy())
+    near(rig.call(sensing.center_of_mass), momentum.centers.numpy())
+
+
+def test_the_ground(rig: Rig) -> None:
+    scan, terrain, frames = rig.structs[HeightScanArrays], rig.structs[TerrainArrays], rig.structs[FrameArrays]
+    heights, here = scan.heights.numpy(), rig.q[:, ROOT : ROOT + 3].astype(float)
+    near(rig.call(ground.scanned_height, 4, offset=0.5), heights[:, 4] - 0.5)
+    near(rig.call(ground.scanned_height_mean), heights.mean(1))
+    near(rig.call(ground.scanned_height_error_squared, target=0.3), (heights.mean(1) - 0.3) ** 2)
+    r, wanted = root(rig), []
+    for world, points in enumerate(scan.points.numpy().astype(float)):
+        a, b, _ = np.linalg.lstsq(np.column_stack([points[:, :2], np.ones(POINTS)]), points[:, 2], rcond=None)[0]
+        local = r.turn[world].T @ (np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1))
+        wanted.append(np.exp(-(local[:2] ** 2).sum() / 0.64))
+    near(rig.call(ground.upright_on_ground, std=0.8), wanted)
+    above = here[:, 2] - 0.3 * here[:, 0]
+    near(rig.call(ground.height_above_ground), above)
+    near(rig.call(ground.too_low_above_ground, height=float(np.median(above))), above < np.median(above))
+    feet = frames.positions.numpy()
+    clear = feet[..., 2] - 0.3 * feet[..., 0]
+    speed = np.linalg.norm(frames.linear.numpy()[..., :2], axis=-1)
+    for foot in range(FEET):
+        near(rig.call(ground.frame_height_above_ground, foot), clear[:, foot])
+        found = rig.call(ground.foot_clearance_above_ground, foot, command=COMMAND, height=0.1, threshold=0.1)
+        near(found, np.abs(clear[:, foot] - 0.1) * speed[:, foot] * [1, 0, 1])
+    near(rig.call(ground.terrain_level), [0, 1, 1])
+    way = here - terrain.origins.numpy()[[0, 1, 1], [2, 0, 1]]
+    beyond = (np.abs(way[:, 0]) > 0.3) | (np.abs(way[:, 1]) > 0.45)
+    assert beyond.any()
+    near(rig.call(ground.left_patch, share=0.3), beyond & [False, True, True])  # the first has just begun
+    near(rig.call(ground.left_terrain, margin=-5.5), (np.abs(here[:, :2]) > 0.5).any(1))
+
+
+def test_worlds_are_placed_on_their_patch_and_walk_to_others(rig: Rig) -> None:
+    terrain = rig.structs[TerrainArrays]
+    origins = terrain.origins.numpy()
+    before = rig.worlds.joint_q.numpy().copy(), rig.worlds.joint_qd.numpy().copy()
+    rig.call(ground.reset_root_on_terrain, x=(0.5, 0.5))
+    places = rig.worlds.joint_q.numpy()[:, ROOT : ROOT + 3]
+    start = np.array(rig.robot.start)[:3]
+    near(places, start + origins[[0, 1, 1], [2, 0, 1]] + [0.5, 0, 0])
+    # half a patch is 1 m along x: the first walked far, the second not at all where it was to, the third was not asked to
+    values = rig.episodes.memory.numpy()
+    kept = values.copy()
+    values[:, COMMAND : COMMAND + 2] = [[1, 0], [1, 0], [0, 0]]
+    rig.episodes.memory.assign(values)
+    now = rig.worlds.joint_q.numpy()
+    now[:, ROOT : ROOT + 3] = origins[[0, 1, 1], [2, 0, 1]] + [[1.5, 0, 0], [0, 0.1, 0], [0, 0.1, 0]]
+    rig.worlds.joint_q.assign(now)
+    rig.call(ground.walk_to_levels, command=COMMAND, episode_seconds=2.0)
+    assert terrain.levels.numpy().tolist() == [1, 0, 1]
+    seen = set()
+    for seed in range(40):
+        rig.call(ground.draw_patch, stream=seed)
+        seen |= set(zip(terrain.levels.numpy().tolist(), terrain.kinds.numpy().tolist(), strict=True))
+    assert seen == {(level, kind) for level in range(2) for kind in range(3)}
+    terrain.levels.assign([0, 1, 1])
+    terrain.kinds.assign([2, 0, 1])
+    rig.episodes.memory.assign(kept)
+    rig.worlds.joint_q.assign(before[0])
+    rig.worlds.joint_qd.assign(before[1])
+
+
+def test_tolerances_by_pattern() -> None:
+    names = ["left_hip", "left_knee", "right_hip", "right_knee", "waist"]
+    view = SimpleNamespace(joint_names=names)
+    context: Any = SimpleNamespace(device="cpu", view=lambda name, what: view)
+    built = tolerances.Tolerances(standing={"*_hip": 0.1, "left_*": 0.2, "right_knee": 0.3}, running=0.9).build(context)
+    assert built.names == ("left_hip", "left_knee", "right_hip", "right_knee")
+    assert built.arrays.columns.numpy().tolist() == [0, 1, 2, 3]
+    near(built.arrays.standing.numpy(), [0.1, 0.2, 0.1, 0.3])
+    near(built.arrays.walking.numpy(), [0.1, 0.2, 0.1, 0.3])
+    near(built.arrays.running.numpy(), [0.9] * 4)
+    for wrong, said in (
+        ({"standing": {"*_hipp": 0.1}}, "Tolerances.standing: no joint matches '\\*_hipp'; .*left_hip"),
+        ({"standing": {"*": 0.0}}, "Tolerances.standing.\\*: a tolerance is a number above 0, found 0.0"),
+        (
+            {"standing": 0.1, "walking": {"*_hip": 0.2}},
+            "Tolerances.walking: no pattern fits left_knee, which standing has",
+        ),
+    ):
+        with pytest.raises(ValueError, match=said):
+            tolerances.Tolerances(**wrong).build(context)

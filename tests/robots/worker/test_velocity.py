@@ -1,0 +1,308 @@
+"""Go1 and G1 on the CPU: rewards and observations by numpy from MuJoCo's own engine, which steps beside them; commands, resets, levels."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from tests.support.worker.tasks import play, put, same
+from tests.support.worker.walkers import Twin, plain
+from worker.tasks import find_task
+from worker.tasks.configs.velocity import Go1FlatConfig, range_at, widest
+from worker.tasks.overrides import Refused
+from worker.tasks.velocity import Velocity
+
+WORLDS = 6
+FEET = {
+    "Go1Flat": [[f"{leg}_foot_collision"] for leg in ("FR", "FL", "RR", "RL")],
+    "G1Flat": [[f"{side}_foot{number}_collision" for number in range(1, 8)] for side in ("left", "right")],
+}
+JOINT = {
+    "Go1Flat": {"calf": (0.1, 0.6, 0.6), "": (0.05, 0.3, 0.3)},
+    "G1Flat": {
+        "hip_pitch": (0.05, 0.3, 0.5),
+        "hip_roll": (0.05, 0.15, 0.2),
+        "hip_yaw": (0.05, 0.15, 0.2),
+        "knee": (0.05, 0.35, 0.6),
+        "ankle_pitch": (0.05, 0.25, 0.35),
+        "ankle_roll": (0.05, 0.1, 0.15),
+        "waist_yaw": (0.05, 0.2, 0.3),
+        "waist_roll": (0.05, 0.08, 0.08),
+        "waist_pitch": (0.05, 0.1, 0.2),
+        "shoulder_pitch": (0.05, 0.15, 0.5),
+        "shoulder_roll": (0.05, 0.15, 0.2),
+        "shoulder_yaw": (0.05, 0.1, 0.15),
+        "elbow": (0.05, 0.15, 0.35),
+        "wrist": (0.05, 0.3, 0.3),
+    },
+}
+"""Tolerance of each joint while standing, walking and running [rad], as mjlab has them."""
+
+
+@pytest.fixture(scope="module")
+def tasks() -> dict[str, Velocity]:
+    """The robots on a plane, made when they are first asked for."""
+
+    class Made(dict):  # type: ignore[type-arg]
+        def __missing__(self, name: str) -> Velocity:
+            self[name] = plain(name, WORLDS)
+            return self[name]
+
+    return Made()
+
+
+def expected_rewards(
+    name: str, twin: Twin, command: np.ndarray, action: np.ndarray, before: np.ndarray
+) -> dict[str, float]:
+    """Each reward per second, from MuJoCo's state and contacts."""
+    data, view, walker = twin.data, twin.view, twin.task.walker
+    asked = float(np.linalg.norm(command[:2]) + abs(command[2]))
+    linear, angular = twin.velocity(mujoco.mjtObj.mjOBJ_XBODY, walker.base, True)
+    tilt = twin.turn(walker.torso)[2, :2]
+    tipping = twin.velocity(mujoco.mjtObj.mjOBJ_XBODY, walker.torso, False)[1][:2]
+    position = data.qpos[twin.places]
+    speed = 0 if asked < 0.05 else 1 if asked < 1.5 else 2
+    allowed = np.array([next(v for k, v in JOINT[name].items() if k in joint)[speed] for joint in view.joint_names])
+    ends = twin.model.jnt_range[[twin.model.joint(joint).id for joint in view.joint_names]]
+    middle, half = ends.mean(1), 0.45 * (ends[:, 1] - ends[:, 0])
+    heights, speeds = twin.soles()
+    moves = float(asked > 0.05)
+    twin.peak = np.where(twin.found == 0, np.maximum(twin.peak, heights), twin.peak)
+    landed = twin.landed()
+    swing = float(((twin.peak / 0.1 - 1.0) ** 2)[landed].sum())
+    twin.peak = np.where(landed, 0.0, twin.peak)
+    rewards = {
+        "track_linear_velocity": np.exp(-np.sum((linear - [command[0], command[1], 0.0]) ** 2) / 0.25),
+        "track_angular_velocity": np.exp(-np.sum((angular - [0.0, 0.0, command[2]]) ** 2) / 0.5),
+        "upright": np.exp(-np.sum(tilt**2) / 0.2),
+        "pose": np.exp(-np.mean((position - view.defaults) ** 2 / allowed**2)),
+        "body_ang_vel": np.sum(tipping**2),
+        "angular_momentum": np.sum(data.sensor("root_angmom").data ** 2),
+        "dof_pos_limits": np.maximum(np.abs(position - middle) - half, 0.0).sum(),
+        "action_rate_l2": np.sum((action - before) ** 2),
+        "air_time": float(((twin.air > 0.05) & (twin.air < 0.5)).sum()) * (asked > 0.5),
+        "foot_clearance": moves * np.sum(np.abs(heights - 0.1) * speeds),
+        "foot_swing_height": moves * swing,
+        "foot_slip": moves * np.sum(speeds[twin.found > 0] ** 2),
+        "soft_landing": moves * np.linalg.norm(twin.forces, axis=1)[landed].sum(),
+    }
+    return rewards | ({"self_collisions": float(twin.hits)} if name.startswith("G1") else {})
+
+
+def expected_groups(twin: Twin, command: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the policy and the critic see, without noise."""
+    data = twin.data
+    seen = np.concatenate(
+        [
+            data.sensor("imu_lin_vel").data,
+            data.sensor("imu_ang_vel").data,
+            -twin.turn(twin.task.walker.base)[2],
+            data.qpos[twin.places] - twin.view.defaults,
+            data.qvel[twin.rates],
+            action,
+            command,
+        ]
+    )
+    forces = twin.forces.ravel()
+    heights, _ = twin.soles()
+    known = [heights, twin.air, (twin.found > 0).astype(float), np.sign(forces) * np.log1p(np.abs(forces))]
+    return seen, np.concatenate([seen, *known])
+
+
+@pytest.mark.parametrize("name", ["Go1Flat", "G1Flat"])
+def test_rewards_and_observations_are_those_of_mujocos_own_engine(tasks: dict[str, Velocity], name: str) -> None:
+    task = tasks[name]
+    task.seed(3)
+    task.reset()
+    twins = [Twin(task, FEET[name]) for _ in range(WORLDS)]
+    state = task.state_dict()
+    heights = {"Go1Flat": 0.26, "G1Flat": 0.76}[name]
+    random = np.random.default_rng(2)
+    first = state["joint_q"].numpy()
+    first[:, 2] = heights + np.linspace(0.0, 0.02, WORLDS)  # some begin on the ground, some fall on it
+    state["joint_qd"][:] = torch.tensor(random.normal(scale=0.3, size=state["joint_qd"].shape), dtype=torch.float32)
+    memory = task.plan.binder.commands["twist"]
+    asked = [[0, 0, 0], [0.3, 0, 0], [0.6, -0.4, 0.2], [1.0, 1.0, 0.5], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.4]]
+    state["memory"][:, memory : memory + 3] = torch.tensor(asked)
+    state["memory"][:, memory + 3 : memory + 9] = 0.0
+    state["memory"][:, memory + 9] = 100.0  # they hold
+    task.load_state_dict(state)
+    before = np.zeros((WORLDS, task.action_size))
+    seen_terms: dict[str, float] = {}
+    for _ in range(14):
+        state = task.state_dict()
+        q, qd, sums = (state[key].numpy() for key in ("joint_q", "joint_qd", "episode_sums"))
+        action = random.normal(scale=0.4, size=before.shape).astype(np.float32)
+        task.step(torch.tensor(action))
+        controls = task.worlds.arrays.controls.numpy()
+        after = task.state_dict()["episode_sums"].numpy()
+        for world, twin in enumerate(twins):
+            scale = [next(v for k, v in scales(name).items() if k in joint) for joint in twin.view.joint_names]
+            targets = np.array(twin.view.defaults) + np.array(scale) * action[world]
+            np.testing.assert_allclose(controls[world, twin.view.actuators], targets, atol=1e-5)
+            twin.take(q[world], qd[world])
+            twin.step(targets)
+            if task.dones[world]:
+                pytest.fail("nobody falls in this time")
+            command = np.array(asked[world], float)
+            rewards = expected_rewards(name, twin, command, action[world], before[world])
+            assert list(rewards) == list(task.reward_terms)
+            got = (after[world] - sums[world])[2 : 2 + len(rewards)] / 0.02
+            for term, (value, wanted) in zip(rewards, zip(got, rewards.values(), strict=True), strict=True):
+                # a sum in float32 loses what it gained in a step, in proportion to itself
+                slack = 1e-4 * max(1.0, abs(float(after[world][2 + list(rewards).index(term)])))
+                assert float(value) == pytest.approx(float(wanted), rel=0.01, abs=2e-3 + slack), (term, world)
+                seen_terms[term] = max(seen_terms.get(term, 0.0), abs(float(wanted)))
+            policy, critic = expected_groups(twin, command, action[world])
+            np.testing.assert_allclose(task.observations[world], policy, atol=2e-3, rtol=2e-3)
+            np.testing.assert_allclose(task.groups["critic"][world], critic, atol=0.03, rtol=0.02)
+        before = action
+    quiet = {"self_collisions"} if name == "G1Flat" else set()
+    assert {term for term, value in seen_terms.items() if value == 0.0} <= quiet | {"dof_pos_limits", "air_time"}
+
+
+def scales(name: str) -> dict[str, float]:
+    """How far an action of 1 moves a joint's target: a quarter of effort over stiffness, by what its name contains [rad]."""
+
+    def of(rotor: float, effort: float) -> float:
+        return 0.25 * effort / (rotor * (20.0 * 3.1415926535) ** 2)
+
+    if name.startswith("Go1"):
+        return {"calf": of(0.000111842 * 81, 35.55), "": of(0.000111842 * 36, 23.7)}
+    small = 0.139e-4 * ((1 + 46 / 18) * (1 + 56 / 16)) ** 2 + 0.017e-4 * (1 + 56 / 16) ** 2 + 0.169e-4
+    middle = 0.489e-4 * (4.5 * (1 + 48 / 22)) ** 2 + 0.098e-4 * (1 + 48 / 22) ** 2 + 0.533e-4
+    large = 0.489e-4 * (4.5 * 5) ** 2 + 0.109e-4 * 25 + 0.738e-4
+    wrist = of(0.068e-4 * 625, 5.0)
+    names = {"hip_roll": of(large, 139.0), "knee": of(large, 139.0), "hip": of(middle, 88.0)}
+    names |= {"waist_yaw": of(middle, 88.0), "waist": of(small, 25.0), "ankle": of(small, 25.0)}
+    return names | {"wrist_pitch": wrist, "wrist_yaw": wrist, "": of(small, 25.0)}
+
+
+@pytest.mark.parametrize("name", ["Go1Flat", "G1Flat"])
+def test_the_contract_has_the_scales_and_offsets_of_the_robot(name: str) -> None:
+    task: Any = find_task(name).sketch(find_task(name).config_type())
+    view = task.views["robot"]
+    assert task.action_names == tuple(view.joint_names) and len(view.joint_names) == {"Go1Flat": 12, "G1Flat": 29}[name]
+    for driven in task.plan.driven:
+        numbers = task.plan.numbers.values
+        for index, joint in enumerate(view.joint_names):
+            assert numbers[driven.offset.first + index] == pytest.approx(view.defaults[index])
+            wanted = next(value for part, value in scales(name).items() if part in joint)
+            assert numbers[driven.scale.first + index] == pytest.approx(wanted, rel=1e-6)
+    home = dict(zip(view.joint_names, view.defaults, strict=True))
+    wanted = {
+        "Go1Flat": {"FR_hip_joint": 0.1, "RL_hip_joint": -0.1, "FL_thigh_joint": 0.9, "RR_calf_joint": -1.8},
+        "G1Flat": {"left_hip_pitch_joint": -0.312, "right_knee_joint": 0.669, "left_shoulder_roll_joint": 0.2},
+    }[name]
+    assert {joint: home[joint] for joint in wanted} == pytest.approx(wanted)
+
+
+def test_the_contract_names_what_was_commanded(tasks: dict[str, Velocity]) -> None:
+    interface = tasks["Go1Flat"].interface()
+    assert interface is not None
+    commands = [each for each in interface.observations if each.kind == "command"]
+    assert [each.range for each in commands] == [(-2.0, 3.0), (-1.0, 1.0), (-0.7, 0.7)]
+    assert [each.kind for each in interface.observations].count("previous_action") == 12
+    action = interface.actions[2]
+    assert (action.name, action.kind, action.clip) == ("FR_calf_joint", "position", None)
+    assert (action.effort_limit, action.offset) == pytest.approx((35.55, -1.8))
+
+
+def test_resets_and_commands_are_within_their_ranges(tasks: dict[str, Velocity]) -> None:
+    task = tasks["Go1Flat"]
+    column = task.plan.binder.commands["twist"]
+    roots, commands, headings = [], [], []
+    for seed in range(30):
+        task.seed(seed)
+        task.reset()
+        state = task.state_dict()
+        roots.append(state["joint_q"].numpy()[:, :7])
+        assert not state["joint_qd"].any()
+        np.testing.assert_allclose(
+            state["joint_q"].numpy()[:, task.views["robot"].coordinates], [task.views["robot"].defaults] * WORLDS
+        )
+        commands.append(state["memory"].numpy()[:, column : column + 3])
+        headings.append(state["memory"].numpy()[:, column + 3 : column + 6])
+    root, asked, hidden = np.concatenate(roots), np.concatenate(commands), np.concatenate(headings)
+    for axis, (least, greatest) in enumerate([(-0.5, 0.5), (-0.5, 0.5), (0.288, 0.328)]):
+        assert root[:, axis].min() >= least - 1e-6 and root[:, axis].max() <= greatest + 1e-6
+        assert np.ptp(root[:, axis]) > 0.9 * (greatest - least)
+    yaw = 2.0 * np.arctan2(root[:, 5], root[:, 6])
+    assert np.ptp(np.angle(np.exp(1j * yaw))) > 5.5
+    for axis, end in enumerate([1.0, 1.0, 0.5]):
+        assert np.abs(asked[:, axis]).max() <= end + 1e-6 and np.ptp(asked[:, axis]) > 1.7 * end
+    stands = hidden[:, 2] > 0
+    assert not asked[stands].any() and 0.03 < stands.mean() < 0.2
+    follows = (hidden[:, 1] > 0) & ~stands
+    turned = np.angle(np.exp(1j * (hidden[:, 0] - yaw)))
+    np.testing.assert_allclose(asked[follows, 2], np.clip(0.5 * turned, -0.5, 0.5)[follows], atol=1e-4)
+    assert 0.2 < (hidden[:, 1] > 0).mean() < 0.4
+    ahead = ~stands & (asked[:, 1] == 0.0)
+    assert 0.1 < ahead.mean() < 0.3 and (asked[ahead, 0] >= 0.3).all()
+
+
+def test_commands_grow_with_the_iterations(tasks: dict[str, Velocity]) -> None:
+    task = tasks["Go1Flat"]
+    for iteration, forward, turn in ((0, (-1, 1), (-0.5, 0.5)), (4999, (-1, 1), (-0.5, 0.5)), (5000, (-1.5, 2), (-0.7, 0.7)), (12000, (-2, 3), (-0.7, 0.7)), (0, (-1, 1), (-0.5, 0.5))):  # fmt: skip
+        task.begin_iteration(iteration, None, None)
+        assert task.numbers("commands.twist.forward").tolist() == list(forward)
+        assert task.numbers("commands.twist.left").tolist() == [-1.0, 1.0]
+        for place in ("commands.twist.turn", "commands.twist.update.turn"):
+            assert task.numbers(place).tolist() == pytest.approx(list(turn))
+
+
+def test_stages_of_commands() -> None:
+    stages = ((0, -1.0, 1.0), (10, -2.0, 0.5))
+    assert [range_at(stages, iteration) for iteration in (0, 9, 10, 99)] == [(-1, 1), (-1, 1), (-2, 0.5), (-2, 0.5)]
+    assert widest(stages) == (-2.0, 1.0)
+    made: Any = Go1FlatConfig.configured({"command_forward": [[0, -1, 1], [50, -1.0, 1.5]]})
+    assert range_at(made.command_forward, 60) == (-1.0, 1.5)
+    for wrong, words in (
+        ([[0, 1.0, -1.0]], "the least value comes before the greatest"),
+        ([[5, -1.0, 1.0]], "the first is 0"),
+        ([[0, -1, 1], [0, -1, 1]], "must grow"),
+        ([[0, -1]], r"expected stages \[iteration, least, greatest\]"),
+    ):
+        with pytest.raises(Refused, match=words):
+            Go1FlatConfig.configured({"command_forward": wrong})
+
+
+def test_a_fall_is_a_tilt_of_seventy_degrees(tasks: dict[str, Velocity]) -> None:
+    task = tasks["Go1Flat"]
+    rows = []
+    for world in range(WORLDS):
+        angle = math.radians((68.0, 72.0)[world % 2]) / 2
+        pose = [0.0, 0.0, 2.0, math.sin(angle), 0.0, 0.0, math.cos(angle)]
+        rows.append([*pose, *task.views["robot"].defaults])
+    put(task, joint_q=rows)
+    task.step(torch.zeros(WORLDS, 12))
+    assert task.dones.tolist() == [False, True] * 3 and not task.time_outs.any()
+
+
+def test_a_resumed_run_goes_on_bit_for_bit() -> None:
+    kind: Any = find_task("Go1Flat")
+    whole = kind(kind.config_type(episode_seconds=0.3), 4, seed=5)
+    play(whole, 10, 1)
+    state = whole.state_dict()
+    resumed = kind(kind.config_type(episode_seconds=0.3), 4, seed=5)
+    resumed.load_state_dict(state)
+    assert same(play(whole, 20, 2), play(resumed, 20, 2))
+
+
+def test_without_the_package_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "mjlab" else found(name, *rest)
+    )
+    kind: Any = find_task("G1Flat")
+    with pytest.raises(
+        ValueError, match=r"the Python package mjlab, which is not installed; .* pip install --no-deps mjlab==1\.6\.0"
+    ) as error:
+        kind(kind.config_type(), 1)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,359 @@
+"""Declared tasks: what their kernels compute follows from the declaration, by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+
+from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, TorchSliders, far_away
+from tests.support.worker.tasks import observe, play, put, same, statistics
+from worker.tasks import (
+    Action,
+    Adaptive,
+    Command,
+    Declaration,
+    Event,
+    Reward,
+    Robot,
+    Termination,
+    WorldArrays,
+    terms,
+)
+
+WORLDS = 6
+
+
+@pytest.fixture(scope="module")
+def sliders() -> Sliders:
+    return Sliders(SlidersConfig(), WORLDS, seed=1)
+
+
+def column(task: Sliders, name: str, group: str = "policy") -> torch.Tensor:
+    names = task.observation_names if group == "policy" else ("first_place", "second_place", "count")
+    return task.groups[group][:, names.index(name)]
+
+
+def test_columns_are_called_after_terms_and_joints(sliders: Sliders) -> None:
+    assert sliders.observation_names == (
+        *("first_place", "second_place", "first_late_2", "first_late_1", "first_late", "noisy", "target"),
+        *("first_last", "second_last"),
+    )
+    assert sliders.action_names == ("first", "second")
+    assert sliders.groups["critic"].shape == (WORLDS, 3)
+
+
+def test_an_action_is_clipped_scaled_and_offset(sliders: Sliders) -> None:
+    put(sliders)
+    sliders.step(torch.tensor([[1.0, -5.0]]).expand(WORLDS, 2))
+    controls = wp.to_torch(sliders.worlds.arrays.controls)
+    assert controls[0].tolist() == [0.25 + 0.5, 0.25 - 2.0]
+
+
+def test_observations_are_offset_clipped_scaled_and_noisy(sliders: Sliders) -> None:
+    put(sliders, joint_q=[[0.25, 0.3], [-1.0, 1.0]], joint_qd=[[0.0, 0.0]] * WORLDS)
+    observe(sliders)
+    assert column(sliders, "first_place")[:2].tolist() == pytest.approx([2 * (0.25 - 0.5), 2 * -0.8])
+    assert column(sliders, "second_place")[:2].tolist() == pytest.approx([0.3, 0.8])
+    noise = column(sliders, "noisy") - column(sliders, "second_place", "critic")
+    assert (noise.abs() <= 0.1).all() and noise.abs().max() > 0.0 and len(noise.unique()) == WORLDS
+
+
+def test_noise_fills_its_range_evenly() -> None:
+    task = Sliders(SlidersConfig(episode_seconds=1000.0, numbers={"events.kick.speed": 0.0}), 64, seed=2)
+    found = []
+    for _ in range(30):
+        task.step(torch.full((64, 2), -0.25))
+        found.append(column(task, "noisy") - column(task, "second_place", "critic"))
+    noise = torch.cat(found)
+    assert 0.09 < noise.max() <= 0.1 and noise.mean().abs() < 0.01
+    assert noise.std().item() == pytest.approx(0.2 / 12**0.5, rel=0.1)
+
+
+def test_late_observations_come_late_and_history_keeps_the_last_three(sliders: Sliders) -> None:
+    put(sliders)
+    lags = sliders.state_dict()["past"][:, 0]
+    assert set(lags.tolist()) <= {0.0, 1.0, 2.0} and len(lags.unique()) > 1, "each episode draws its own"
+    speeds = [torch.zeros(WORLDS)]
+    seen = [sliders.observations.clone()]
+    for step in range(5):
+        sliders.step(torch.full((WORLDS, 2), 0.1 * step))
+        assert not sliders.dones.any()
+        speeds.append(wp.to_torch(sliders.worlds.arrays.joint_qd)[:, 0].clone())
+        seen.append(sliders.observations.clone())
+    for step in range(6):
+        for back, name in enumerate(("first_late", "first_late_1", "first_late_2")):
+            index = sliders.observation_names.index(name)
+            for world in range(WORLDS):
+                at = max(step - back, 0)
+                expected = speeds[max(at - int(lags[world]), 0)][world]
+                assert seen[step][world, index] == expected, (step, back, world)
+
+
+def test_rewards_metrics_and_ends_by_hand(sliders: Sliders) -> None:
+    put(
+        sliders,
+        joint_q=[[0.5, 0.0], [1.6, 0.0], [0.0, 1.6], [1.6, 1.6]],
+        joint_qd=[[0.25, -0.5]] * 4,
+        last_actions=[[1.0, 0.0]] * 4,
+        lasting=[[0.0]] * WORLDS,
+        episode_length=[3, 3, 3, 3],
+    )
+    sliders.actions.zero_()
+    sliders.actions[:, 1] = 3.0
+    observe(sliders)
+    change = -0.5 * (1.0 + 9.0) * 0.1
+    expected = [0.5 + change + 2.0, 1.6 + change - 3.0, change + 2.0, 1.6 + change - 3.0]
+    assert sliders.rewards[:4].tolist() == pytest.approx(expected, abs=1e-6)
+    assert sliders.dones[:4].tolist() == [False, True, True, True]
+    assert sliders.time_outs[:4].tolist() == [False, False, True, False]
+    totals = statistics(sliders)
+    assert totals["episodes"] == 3 and totals["metric_speed"] == pytest.approx(3 * 0.75)
+    assert totals["termination_first_left"] == 2 and totals["termination_second_left"] == 2
+    assert totals["termination_time_out"] == 0
+    assert column(sliders, "count", "critic")[:4].tolist() == [0.0, 1.0, 1.0, 1.0], "it outlasts the episode"
+    assert sliders.terminal_groups["critic"][1].tolist() == pytest.approx([1.6, 0.0, 0.0])
+    assert column(sliders, "first_last")[:2].tolist() == [0.0, 0.0] and column(sliders, "second_last")[0] == 3.0
+    assert column(sliders, "second_last")[1] == 0.0, "a new episode has no last action"
+
+
+def test_the_clock_is_counted_by_its_own_name(sliders: Sliders) -> None:
+    put(sliders, episode_length=[11], joint_q=[[0.0, 0.0]] * WORLDS)
+    observe(sliders)
+    totals = statistics(sliders)
+    assert totals["termination_time_out"] == totals["episodes"] == 1 and sliders.time_outs[0]
+
+
+def test_commands_hold_for_their_time_and_events_come_at_intervals() -> None:
+    task = Sliders(SlidersConfig(episode_seconds=1000.0, numbers={"terminations.second_left.limit": 1e9}), 32, seed=5)
+    targets, speeds = [], []
+    for _ in range(40):
+        task.step(torch.tensor([[-0.5, -0.25]]).expand(32, 2))  # no force: scale and offset cancel
+        targets.append(column(task, "target").clone())
+        speeds.append(wp.to_torch(task.worlds.arrays.joint_qd)[:, 1].clone())
+    changes = torch.stack(targets).diff(dim=0) != 0
+    for world in range(32):
+        at = changes[:, world].nonzero().flatten()
+        lengths = set(at.diff().tolist())
+        assert lengths <= {3, 4, 5}, "0.3 to 0.5 s at 10 Hz"
+    assert (torch.stack(targets).abs() <= 1.0).all() and torch.stack(targets).std() > 0.4
+    kicked = (torch.stack(speeds) - 0.75).abs() < 1e-6
+    assert kicked[3::4].all(), "every 0.4 s"
+
+
+def test_numbers_are_data_and_a_curriculum_sets_them() -> None:
+    points = {
+        "rewards": {},
+        "curriculum": {"terminations.first_left.limit": [[0, 1.0], [10, 3.0]], "place": [[0, 2.0]]},
+    }
+    plain = Sliders.sketch(SlidersConfig())
+    task = Sliders(
+        SlidersConfig(numbers={"actions.force.scale": [5.0, 6.0]}, curriculum=points["curriculum"]), 2, seed=1
+    )
+    assert task._kernels is not None and task.numbers("actions.force.scale").tolist() == [5.0, 6.0]
+    assert plain.plan.numbers.places == task.plan.numbers.places
+    other = Sliders(SlidersConfig(), 2, seed=1)
+    assert other._kernels.judge is task._kernels.judge, "changing a number compiles nothing"
+    for iteration, expected in ((0, 1.0), (5, 2.0), (20, 3.0)):
+        task.begin_iteration(iteration, None, None)
+        assert task.numbers("terminations.first_left.limit").tolist() == pytest.approx([expected])
+    assert task._weights[0] == 2.0
+    put(task, joint_q=[[1.6, 0.0]])
+    observe(task)
+    assert not task.dones[0]
+
+
+def test_an_adaptive_number_follows_the_returns_and_goes_on_after_a_restart() -> None:
+    task = Sliders(SlidersConfig(), 2, seed=1)
+    speed = task.numbers("events.kick.speed")
+    found = []
+    for iteration, mean in enumerate((None, 6.0, 4.0, 6.0, 7.0, -6.0)):
+        task.begin_iteration(iteration, mean, 3.0)
+        task.begin_iteration(iteration, mean, 3.0)  # as an evaluation does
+        found.append(speed.item())
+    assert found == [0.75, 1.25, 1.25, 1.75, 1.75, 1.25]
+    other = Sliders(SlidersConfig(), 2, seed=1)
+    other.load_state_dict(task.state_dict())
+    assert other.numbers("events.kick.speed").item() == 1.25
+    other.begin_iteration(5, 6.0, 3.0)
+    assert other.numbers("events.kick.speed").item() == 1.25, "that iteration was begun already"
+    other.begin_iteration(6, 6.0, 3.0)
+    assert other.numbers("events.kick.speed").item() == 1.75
+
+
+def test_worlds_differ_as_declared_and_alike_on_any_number_of_ranks() -> None:
+    whole = Sliders(SlidersConfig(), 6, seed=3)
+    part = Sliders(SlidersConfig(), 3, seed=3, first_world=3)
+    masses = whole.worlds.solver.mjw_model.body_mass.numpy()
+    assert len(set(masses[:, 1])) == 6 and masses[:, 1].min() >= 0.5 and masses[:, 1].max() <= 2.0
+    assert (part.worlds.solver.mjw_model.body_mass.numpy() == masses[3:]).all()
+    assert same(
+        [tuple(each[3:] for each in step) for step in play(whole, 40, seed=9)],
+        play(part, 40, seed=9),
+    )
+
+
+@pytest.mark.parametrize("kind", [Sliders, TorchSliders])
+def test_it_goes_on_bit_for_bit(kind: type[Sliders]) -> None:
+    first, second = kind(SlidersConfig(), 4, seed=4), kind(SlidersConfig(), 4, seed=4)
+    play(first, 17, seed=1)
+    second.load_state_dict(first.state_dict())
+    assert same(play(first, 30, seed=2), play(second, 30, seed=2))
+    assert all(torch.equal(tensor, second.state_dict()[name]) for name, tensor in first.state_dict().items())
+
+
+def test_terms_in_torch() -> None:
+    task = TorchSliders(SlidersConfig(), 4, seed=1)
+    assert task.observation_names == ("both_0", "both_1", "first_place", "second_place")
+    put(task, joint_q=[[0.5, 0.25], [1.7, 0.0]])
+    task.actions.zero_()
+    task.actions[0] = 1.0
+    observe(task)
+    places = wp.to_torch(task.worlds.arrays.joint_q)
+    assert torch.equal(task.observations[:, :2], 3.0 * places), "after the reset of a world, too"
+    assert task.terminal_observations[1].tolist() == pytest.approx([5.1, 0.0, 1.7, 0.0])
+    sums = task.state_dict()["episode_sums"]
+    assert sums[0, 4] == 0.0 and sums[2, 4] == 2.0
+    steps = play(task, 20, seed=1)
+    assert all(torch.equal(step[0][:, :2], 3.0 * step[0][:, 2:]) for step in steps)
+
+
+def test_the_contract_follows(sliders: Sliders) -> None:
+    interface = sliders.interface()
+    by_name = {seen.name: seen for seen in interface.observations}
+    first = by_name["first_place"]
+    assert (first.scale, first.offset, first.kind) == (2.0, 0.5, "measured")
+    assert first.clip == pytest.approx((-0.8, 0.8))
+    assert (by_name["target"].kind, by_name["target"].range, by_name["target"].unit) == ("command", (-1.0, 1.0), "m")
+    assert by_name["first_last"].kind == "previous_action"
+    assert [by_name[name].back for name in ("first_late_2", "first_late_1", "first_late")] == [2, 1, 0]
+    force = interface.actions[0]
+    assert (force.kind, force.scale, force.offset, force.clip, force.effort_limit) == (
+        "effort",
+        1.0,
+        0.5,
+        (-2.0, 2.0),
+        2.0,
+    )
+
+
+def test_a_second_task_of_the_same_terms_shares_their_kernels(sliders: Sliders) -> None:
+    class Others(Sliders):
+        pass
+
+    assert Others(SlidersConfig(), 1, seed=1)._kernels.source == sliders._kernels.source
+
+
+@wp.func
+def _untyped(world: int, worlds: WorldArrays, joint) -> float:
+    return 0.0
+
+
+@wp.func
+def _nothing(world: int, worlds: WorldArrays):
+    worlds.joint_q[world, 0] = 0.0
+
+
+@wp.func
+def _vector(world: int) -> wp.vec3:
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+def refused(section: str, **changes: Any) -> dict[str, Any]:
+    return {section: changes}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (refused("rewards", place=Reward(_vector)), "rewards.place: _vector must give a float (-> float)"),
+        (refused("rewards", place=Reward(_nothing)), "rewards.place: _nothing must give a float"),
+        (refused("rewards", place=Reward(_untyped)), "rewards.place: _untyped: its parameter joint has no type"),
+        (refused("rewards", place=Reward("joint_position")), "rewards.place: 'joint_position' is no function"),
+        (
+            refused("rewards", place=Reward(terms.joint_position, joints="third")),
+            "rewards.place: no joint of robot matches 'third'; there are first, second",
+        ),
+        (
+            refused("rewards", place=Reward(terms.joint_position, robot="cube")),
+            "rewards.place: the task has no robot or object 'cube'; there are robot",
+        ),
+        (
+            refused("terminations", first_left=Termination(far_away, limt=3.0)),
+            "terminations.first_left: far_away has no parameter limt; did you mean limit?",
+        ),
+        (
+            refused("terminations", first_left=Termination(far_away)),
+            "terminations.first_left: far_away needs limit=float",
+        ),
+        (
+            refused("terminations", first_left=Termination(far_away, limit=3.0, limt=3.0)),
+            "terminations.first_left: far_away has no parameter limt; did you mean limit?",
+        ),
+        (
+            refused("terminations", first_left=Termination(terms.alive)),
+            "terminations.first_left: alive has a parameter terminated, which there is nothing for here",
+        ),
+        (
+            refused("terminations", time_out=Termination(far_away, limit=1.0)),
+            "terminations.time_out: the clock's own has this name",
+        ),
+        (
+            refused("rewards", place=Reward(terms.joint_velocity_excess, limit=(1.0, 2.0))),
+            "rewards.place.limit: expected a number, found (1.0, 2.0)",
+        ),
+        (
+            refused("rewards", plce=Reward(terms.alive)),
+            "rewards.plce: SlidersConfig.rewards has no weight of this name; did you mean place?",
+        ),
+        (refused("actions", more=Action(terms.effort)), "actions: joint first is driven by two terms"),
+        (
+            refused("actions", force=Action(terms.effort, scale={"frst": 1.0})),
+            "actions.force.scale: no column matches 'frst'; did you mean first?",
+        ),
+        (
+            refused("actions", force=Action(terms.effort, scale={"first": 1.0})),
+            "actions.force.scale: no pattern fits second; add one, such as '*'",
+        ),
+        (
+            refused("commands", target=Command(far_away, names=("a",), limit=1.0)),
+            "commands.target: far_away has a parameter joint, which there is nothing for here",
+        ),
+        (
+            refused("events", kick=Event(far_away, limit=1.0, when="interval")),
+            "events.kick: an interval needs seconds=(least, greatest), above 0",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+    class Wrong(Sliders):
+        def sections(self) -> dict[str, Any]:
+            sections = super().sections()
+            return {name: {**section, **changes.get(name, {})} for name, section in sections.items()}
+
+    with pytest.raises(ValueError) as refusal:
+        Wrong.sketch(SlidersConfig())
+    words = str(refusal.value)
+    assert words.startswith(f"task Wrong: {message}") and "\n" not in words
+
+
+def test_other_refusals() -> None:
+    with pytest.raises(ValueError, match=r"below is 2.0, which must be less than above, 1.0"):
+        Adaptive("events.kick.speed", 0.0, 1.0, above=1.0, below=2.0)
+    with pytest.raises(ValueError, match=r"config.numbers: the task has no number 'rewards.plac.x'; did you mean"):
+        Sliders.sketch(SlidersConfig(numbers={"rewards.plac.x": 1.0}))
+    with pytest.raises(ValueError, match=r"config.numbers.actions.force.scale: expected 2 numbers, found 1.0"):
+        Sliders.sketch(SlidersConfig(numbers={"actions.force.scale": 1.0}))
+    with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
+        Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
+    with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
+        Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})  # type: ignore[dict-item]
+
+    class Bare(Sliders):
+        def robot(self, config: SlidersConfig) -> Robot:
+            return Robot(MODEL.replace('<motor joint="second" gear="3"/>', ""), passive=True)
+
+    with pytest.raises(ValueError, match=r"actions.force: joint second has no actuator; give the robot one, or leave"):
+        Bare.sketch(SlidersConfig())

@@ -1,0 +1,317 @@
+"""Benchmarks beside peers: the table of records, the conversion of policies, what is judged, and what the commands refuse."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rsl_rl.models.mlp_model import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
+
+from benchmarks import walking
+from benchmarks.peers import cases, conversion, environment, judging, run, table
+from benchmarks.peers.building import limited
+from benchmarks.peers.inside.clock import Clock
+from benchmarks.stock import stock_runner
+from worker.learning.ppo.settings import PPOConfig
+from worker.tasks import find_task
+from worker.tasks.interface import Action, Interface, Observation
+
+
+def record(peer: str, rate: float, seed: int = 0, **more: Any) -> dict[str, Any]:
+    """A record of a training with 10 worlds, 24 steps and a warm iteration, at a constant rate."""
+    curve = [
+        {"seconds": number * 240 / rate, "env_steps": number * 240, "collect_s": 0.2, "learn_s": 0.1, "reward": 1.0}
+        for number in (1, 2, 3)
+    ]
+    facts = {"peer": peer, "case": "go1", "limits": "theirs", "worlds": 10, "steps": 24, "seed": seed, "warm": 1}
+    figures = {"rate": rate, "startup_s": 12.0, "first_s": 3.0, "device": "a GPU", "others": 0.01, "load_average": 0.5}
+    return facts | figures | {"curve": curve, "checkpoints": [], "versions": {"mjlab": "1.6.0"}} | more
+
+
+def test_the_table_has_medians_and_ratios_to_muster() -> None:
+    rows = [record("muster", rate, seed) for seed, rate in enumerate((900.0, 1000.0, 1300.0))]
+    rows += [record("mjlab", 250.0), record("rsl_rl", 400.0), record("muster", 700.0, algorithm="sac")]
+    rows.append(record("mjlab", 500.0, limits="ours"))
+    lines = [line for line in table.table(rows).splitlines() if line.startswith("| go1")]
+    shown = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert [row[3] for row in shown] == [
+        "Muster",
+        "Muster (sac)",
+        "rsl_rl's runner on Muster",
+        "mjlab 1.6.0",
+        "mjlab 1.6.0",
+    ]
+    assert shown[0][4:] == ["3", "1,000 (900 to 1,300)", "–", "200 ms", "100 ms", "12.0 s", "3.0 s"]
+    assert [row[6] for row in shown[1:]] == [
+        "1.4 ×",
+        "2.5 ×",
+        "4.0 ×",
+        "–",
+    ]  # none of ours under the limits of the last
+    assert [row[1] for row in shown[3:]] == ["theirs (10/20, 1e-08)", "ours (4/8, 1e-08)"]
+
+
+def test_the_table_says_when_muster_was_as_good_as_a_peer() -> None:
+    def row(seconds: float, linear: float, angular: float, length: float) -> dict[str, float]:
+        return {
+            "seconds": seconds,
+            "env_steps": 1e6,
+            "linear_error": linear,
+            "angular_error": angular,
+            "length_share": length,
+        }
+
+    facts = {"case": "go1", "limits": "theirs", "judged_limits": "theirs", "seed": 0, "device": "a GPU"}
+    theirs = {**facts, "peer": "mjlab", "rows": [row(300.0, 0.5, 0.5, 0.9), row(600.0, 0.2, 0.3, 0.98)]}
+    # the second is better at everything but the length
+    own = [row(50.0, 0.3, 0.2, 1.0), row(100.0, 0.1, 0.1, 0.97), row(150.0, 0.2, 0.3, 0.98), row(200.0, 0.1, 0.1, 1.0)]
+    ours = {**facts, "peer": "muster", "rows": own}
+    text = table.table([record("muster", 1000.0)], [theirs, ours, {**ours, "seed": 1, "rows": own[:2]}])
+    assert "| 98.0 % | 150.0 s (4.0 ×), 1 of 2 |" in text
+    assert table.reached(own[:2], theirs["rows"][-1]) is None
+
+
+def test_a_folder_without_records_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"there are no records in .*benchmarks\.peers\.muster"):
+        table.read_all(tmp_path)
+    (tmp_path / "muster.json").write_text(json.dumps({"peer": "muster"}))
+    with pytest.raises(ValueError, match=r"muster\.json is no record of a training: it has no case, limits"):
+        table.read_all(tmp_path)
+    (tmp_path / "muster.json").write_text("{")
+    with pytest.raises(ValueError, match="can't be read"):
+        table.read_all(tmp_path)
+    (tmp_path / "muster.json").write_text(json.dumps(record("muster", 10.0)))
+    assert table.read_all(tmp_path)[0][0]["rate"] == 10.0
+
+
+def test_a_rate_counts_what_follows_the_warm_iterations() -> None:
+    curve = [{"seconds": at, "env_steps": steps} for at, steps in ((50.0, 100), (60.0, 200), (65.0, 300), (70.0, 400))]
+    assert run.rate(curve, 2) == 200 / 10.0
+    assert run.rate(curve, 1) == 300 / 20.0
+    long = [{"seconds": float(number), "env_steps": number} for number in range(1, 1004)]
+    kept = run.thinned(long, 100)
+    assert len(kept) <= 101 and kept[-1] is long[-1] and kept[0]["env_steps"] == 11
+    assert run.thinned(curve) == curve
+
+
+def test_a_training_that_stopped_early_is_no_record() -> None:
+    case = cases.find_case("go1")
+    options = run.options_of("mjlab", None, ["go1"]).parse_args(["--iterations", "5"])
+    with pytest.raises(ValueError, match="5 iterations were asked for, 3 are in its log"):
+        run.record_of("mjlab", case, options, {}, {"curve": record("mjlab", 1.0)["curve"]})
+
+
+def saved_actor(path: Path, observations: int = 7, actions: int = 3, normalized: bool = True) -> MLPModel:
+    """An actor of rsl_rl that has met observations, and its checkpoint as rsl_rl writes it."""
+    torch.manual_seed(3)
+    example = TensorDict({"actor": torch.zeros(1, observations)}, batch_size=[1])
+    told: dict[str, Any] = {"class_name": GaussianDistribution, "init_std": 0.5}
+    shape = {"hidden_dims": (16, 8), "activation": "elu", "obs_normalization": normalized, "distribution_cfg": told}
+    actor = MLPModel(example, {"actor": ["actor"]}, "actor", actions, **shape)
+    if normalized:
+        actor.train()
+        actor.obs_normalizer.update(torch.randn(500, observations) * 4.0 + 2.0)
+    torch.save({"actor_state_dict": actor.state_dict(), "iter": 4, "infos": {"env_state": {"steps": 96}}}, path)
+    return actor.eval()
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_a_converted_policy_acts_as_rsl_rl_says(tmp_path: Path, normalized: bool) -> None:
+    path = tmp_path / "model_4.pt"
+    actor = saved_actor(path, normalized=normalized)
+    policy = conversion.read_rsl_rl(path)
+    seen = torch.randn(32, 7) * 3.0
+    with torch.no_grad():
+        expected = actor(TensorDict({"actor": seen}, batch_size=[32]))
+    assert (policy.observations, policy.actions) == (7, 3)
+    assert expected.std() > 0.01
+    torch.testing.assert_close(policy.act({"policy": seen}), expected)
+    probe = {"observations": seen.tolist(), "actions": expected.tolist()}
+    conversion.check_probe(policy, probe)
+    with pytest.raises(ValueError, match=r"acts otherwise than the one that was trained: actions are 0\.1"):
+        conversion.check_probe(policy, probe | {"actions": (expected + 0.1).tolist()})
+
+
+def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    with pytest.raises(ValueError, match="there is no checkpoint"):
+        conversion.read_rsl_rl(path)
+    path.write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match="is no checkpoint of rsl_rl: "):
+        conversion.read_rsl_rl(path)
+    torch.save({"model_state_dict": {}}, path)
+    with pytest.raises(ValueError, match="it has no actor_state_dict, but model_state_dict"):
+        conversion.read_rsl_rl(path)
+    torch.save({"actor_state_dict": {"rnn.weight": torch.zeros(1)}}, path)
+    with pytest.raises(ValueError, match=r"its actor is no plain network, it has rnn\.weight"):
+        conversion.read_rsl_rl(path)
+    saved_actor(path)
+    with pytest.raises(ValueError, match="there is no activation 'elo'; did you mean elu"):
+        conversion.read_rsl_rl(path, activation="elo")
+    with pytest.raises(ValueError, match="the policy sees 7 values, task Go1Flat has 48"):
+        conversion.check_fit(conversion.read_rsl_rl(path), 48, 12, "Go1Flat")
+    layers = [(torch.zeros(4, 2), torch.zeros(4)), (torch.zeros(1, 3), torch.zeros(1))]
+    with pytest.raises(ValueError, match="a layer of 4 outputs is followed by one of 3 inputs"):
+        conversion.PlainPolicy(layers, None, None)
+
+
+JOINTS = ("hip", "knee")
+CONTRACT: dict[str, Any] = {
+    "observations": {"base_lin_vel": 3, "joint_pos": 2, "joint_vel": 2, "actions": 2, "command": 3},
+    "joints": ["hip", "knee"],
+    "positions": [0.1, -0.2],
+    "actions": ["hip", "knee"],
+    "action_scale": [0.25, 0.5],
+}
+
+
+def interface(order: tuple[str, ...] = JOINTS, scale: float = 0.5, offset: float = -0.2) -> Interface:
+    """What a task of two joints says of its policy."""
+    names = [f"velocity_{axis}" for axis in "xyz"]
+    names += [f"{joint}_{what}" for what in ("position", "velocity", "action") for joint in order]
+    names += ["command_forward", "command_left", "command_turn"]
+    actions = {
+        "hip": Action("hip", "position", "rad", scale=0.25, default_position=0.1, offset=0.1),
+        "knee": Action("knee", "position", "rad", scale=scale, default_position=offset, offset=offset),
+    }
+    return Interface(tuple(map(Observation, names)), tuple(actions[joint] for joint in order))
+
+
+def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
+    conversion.check_contract(CONTRACT, interface(), "Own")
+    with pytest.raises(ValueError, match="action 0 moves joint hip in mjlab and knee in task Own"):
+        conversion.check_contract(CONTRACT, interface(("knee", "hip")), "Own")
+    with pytest.raises(ValueError, match=r"joint knee: its scale is 0\.5 in mjlab and 0\.4 in task Own"):
+        conversion.check_contract(CONTRACT, interface(scale=0.4), "Own")
+    with pytest.raises(ValueError, match=r"joint knee: its offset is -0\.2 in mjlab and 0 in task Own"):
+        conversion.check_contract(CONTRACT, interface(offset=0.0), "Own")
+    widths = CONTRACT["observations"]
+    with pytest.raises(ValueError, match="mjlab's policy sees 13 values, task Own has 12"):
+        conversion.check_contract(CONTRACT | {"observations": widths | {"command": 4}}, interface(), "Own")
+    turned = {name: widths[name] for name in ("joint_pos", "base_lin_vel", "joint_vel", "actions", "command")}
+    with pytest.raises(ValueError, match="mjlab sees joint_pos at 0 to 1, where task Own has velocity_x"):
+        conversion.check_contract(CONTRACT | {"observations": turned}, interface(), "Own")
+
+
+def test_vectors_turn_back_as_rotation_matrices_say() -> None:
+    random = np.random.default_rng(5)
+    rotation, vectors = Rotation.random(20, rng=random), random.normal(size=(20, 3))
+    expected = np.einsum("nji,nj->ni", rotation.as_matrix(), vectors)
+    found = judging.rotate_back(torch.tensor(rotation.as_quat()), torch.tensor(vectors))
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+
+
+def test_a_task_has_the_limits_of_its_case() -> None:
+    ours, theirs = (cases.find_case("ant").limits(whose) for whose in ("ours", "theirs"))
+    loose, settings = limited("Ant", vars(ours))
+    assert settings == {} and loose.solver_options["iterations"] == 3
+    exact, _ = limited("Ant", vars(theirs))
+    assert (exact.solver_options["iterations"], exact.solver_options["tolerance"]) == (100, 1e-6)
+    assert exact.solver_options["njmax"] == loose.solver_options["njmax"] and exact.__name__ == "Ant"
+    _, settings = limited("Go1Flat", vars(cases.find_case("go1").ours))
+    assert settings == {"solver_iterations": 4, "solver_line_search": 8}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("muster --case g11", "there is no case 'g11'; did you mean g1?"),
+        ("muster --worlds 0", "--worlds 0: it is at least 1"),
+        ("muster --iterations 10", "--iterations 10: of these 10 are not counted"),
+        ("muster --limits mine", "limits 'mine': there are theirs and ours"),
+        ("muster --algorithm td3", "--algorithm td3: there are ppo and sac"),
+        ("rsl_rl --seed -1", "--seed -1: it is at least 0"),
+        ("mjlab --case ant", "case ant: mjlab has no such task; its cases are go1, g1, go1-rough, g1-rough"),
+        ("mjlab --environment nowhere", "there is no environment with nowhere/bin/python"),
+        ("isaaclab --frontend numpy", "--frontend numpy: there are torch and warp"),
+        ("judge --out nowhere", "none of 0 records has checkpoints; train with --keep DIRECTORY"),
+        ("judge nowhere.json", "nowhere.json can't be read"),
+        ("table --records nowhere", "there are no records in nowhere"),
+        ("environment mjlabs", "there is no environment 'mjlabs'; did you mean mjlab?"),
+        ("environment mjlab --python nowhere", "nowhere is no Python that can be started"),
+    ],
+)
+def test_what_the_commands_refuse(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    name, *arguments = words.split()
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"benchmarks.peers.{name}").main(arguments)
+    assert ended.value.code == 2 and said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--task Ant", "--task Ant: it does not walk where it is told; there are Go1Flat, G1Flat"),
+        ("--task G1Flatt", "did you mean G1Flat?"),
+        ("--algorithm td3", "--algorithm td3: there are sac and ppo"),
+        ("--every 0", "--every 0.0: it is more than 0"),
+        ("--length 98", "--length 98.0: it is a share of the longest episode"),
+    ],
+)
+def test_what_the_walking_benchmark_refuses(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        walking.main(words.split())
+    assert ended.value.code == 2 and said in capsys.readouterr().err
+
+
+def test_a_policy_walks_that_keeps_to_all_bounds() -> None:
+    bounds = walking.Bounds(length=0.9, linear=0.3, angular=0.4)
+    found = {"episodes": 4, "full_length": 1.0, "mean_return": 1.0, "judging_s": 1.0}
+    good = {"linear_error": 0.3, "angular_error": 0.4, "length_share": 0.9}
+    assert bounds.met(judging.Judgement(**found, **good))
+    for worse in ({"linear_error": 0.31}, {"angular_error": 0.41}, {"length_share": 0.89}):
+        assert not bounds.met(judging.Judgement(**found, **(good | worse)))
+
+
+def test_isaac_labs_robots_are_newtons_with_its_own_names(tmp_path: Path) -> None:
+    import newton.examples
+
+    packages = tmp_path / "lib" / "python3.12" / "site-packages" / "newton" / "examples"
+    packages.mkdir(parents=True)
+    (packages / "assets").symlink_to(Path(newton.examples.get_asset_directory()))
+    environment.put_robots(tmp_path)
+    folder = tmp_path / environment.ASSETS / "Isaac" / "Robots" / "IsaacSim"
+    assert (folder / "Ant" / "ant_instanceable.usd").read_bytes() == (packages / "assets" / "ant.usda").read_bytes()
+    from pxr import Usd, UsdPhysics
+
+    stage = Usd.Stage.Open(str(folder / "Humanoid" / "humanoid_instanceable.usd"))
+    joints = {prim.GetName() for prim in stage.Traverse() if prim.IsA(UsdPhysics.RevoluteJoint)}
+    assert {"pelvis", "right_shin", "left_shin", "right_lower_arm", "left_lower_arm"} <= joints
+    assert not joints & {"abdomen_x", "right_knee", "left_knee"}
+
+
+def test_the_clock_notes_what_rsl_rls_runner_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl.utils.logger import Logger
+
+    for owner, name in ((OnPolicyRunner, "learn"), (Logger, "log")):
+        monkeypatch.setattr(owner, name, getattr(owner, name))  # put back afterwards
+    task = find_task("Cartpole")
+    own = task(task.config_type(episode_seconds=0.1), 4)
+    clock = Clock(time.time() - 5.0, 4, 8, lambda: None)
+    clock.install()
+    runner = stock_runner(own, PPOConfig(steps=8, minibatches=2), str(tmp_path), save_interval=2)
+    runner.learn(4)
+    clock.write(str(tmp_path / "found.json"), where=tmp_path)
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert clock.runner is runner and found["where"] == str(tmp_path)
+    assert 5.0 <= found["startup_s"] < 120.0
+    assert [point["env_steps"] for point in found["curve"]] == [32, 64, 96, 128]
+    times = [point["seconds"] for point in found["curve"]]
+    assert times == sorted(times) and all(
+        point["collect_s"] + point["learn_s"] <= after - before
+        for point, before, after in zip(found["curve"], [0.0, *times], times, strict=False)
+    )
+    assert found["curve"][-1]["episode_length"] <= own.max_episode_length
+    saved = [(Path(each["path"]).name, each["iteration"]) for each in found["checkpoints"]]
+    assert saved == [("model_0.pt", 1), ("model_2.pt", 3), ("model_3.pt", 4)]
+    assert conversion.read_rsl_rl(found["checkpoints"][-1]["path"]).actions == own.action_size

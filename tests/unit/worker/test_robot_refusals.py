@@ -1,0 +1,237 @@
+"""What is wrong with a robot's declaration is said in one line, with what there is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import newton
+import pytest
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation.actuators import (
+    DCMotorActuator,
+    EffortActuator,
+    ExplicitPDActuator,
+    PositionActuator,
+    VelocityActuator,
+)
+from worker.simulation.collisions import Collision
+from worker.simulation.objects import Box, Capsule, Sphere
+from worker.simulation.robot import Robot
+from worker.simulation.robot_view import RobotView
+
+SERVO = PositionActuator("*", 60.0, 3.0)
+LEG = """<mujoco model="leg">{assets}<worldbody><body name="thigh" pos="0 0 1"><joint name="left_hip" range="-60 60"/>
+  <geom name="thigh_collision" size=".1"/><site name="knee_mark"/>
+  <body name="shank" pos="0 0 -.3"><joint name="left_knee"/><geom name="shank_collision" size=".1"/>{geoms}</body></body>
+</worldbody>{actuators}</mujoco>"""
+
+
+def leg(assets: str = "", geoms: str = "", actuators: str = "") -> str:
+    return LEG.format(assets=assets, geoms=geoms, actuators=actuators)
+
+
+def template(*things: Any) -> newton.ModelBuilder:
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    for thing in things:
+        thing.add_to(builder)
+    return builder
+
+
+def robot(**options: Any) -> Callable[[], Any]:
+    return lambda: template(Robot(leg(), **{"actuators": (SERVO,), **options}))
+
+
+def view_of(actuators: Any, use: Callable[[RobotView], Any]) -> Callable[[], Any]:
+    return lambda: use(RobotView(template(Robot(leg(), actuators=actuators))))
+
+
+KNEES = PositionActuator("*_knee", 1.0, 0.1)
+CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
+    "no actuators": (
+        robot(actuators=()),
+        ["its XML has no actuators", "PositionActuator", "joints: left_hip, left_knee"],
+    ),
+    "no joint": (
+        robot(actuators=(PositionActuator("left_kne", 1.0, 1.0),)),
+        ["no joint of robot matches 'left_kne'", "did you mean left_knee?", "there are left_hip, left_knee"],
+    ),
+    "a regular expression": (
+        robot(actuators=(PositionActuator(".*_knee", 1.0, 1.0),)),
+        ["not regular expressions", "did you mean '*_knee'?"],
+    ),
+    "no pattern": (robot(actuators=(PositionActuator((), 1.0, 1.0),)), ["no pattern for a joint of robot was given"]),
+    "overlapping actuators": (
+        robot(actuators=(SERVO, KNEES)),
+        ["robot: two actuators drive the joint left_knee", "PositionActuator('*')", "PositionActuator('*_knee')"],
+    ),
+    "gains for some joints": (
+        robot(actuators=(PositionActuator("*", {"*_hip": 5.0}, 1.0),)),
+        ["no pattern of stiffness matches the joint left_knee", "add '*'"],
+    ),
+    "negative stiffness": (
+        lambda: PositionActuator("*", -1.0, 0.0),
+        ["PositionActuator('*'): stiffness must be 0 or more"],
+    ),
+    "effort limit of 0": (lambda: EffortActuator("*", effort_limit=0.0), ["effort_limit must be greater than 0"]),
+    "velocity limit of a motor": (
+        lambda: DCMotorActuator("*", 1.0, 1.0, saturation_effort=1.0, velocity_limit=0.0),
+        ["velocity_limit must be greater than 0, not 0.0"],
+    ),
+    "damping that is a text": (lambda: VelocityActuator("*", "high"), ["damping must be 0 or more, not 'high'"]),
+    "half a step of delay": (lambda: ExplicitPDActuator("*", 1.0, 1.0, delay=0.5), ["delay is a whole number", "0.5"]),
+    "default pose": (robot(joint_positions={"right_*": 1.0}), ["no joint of robot matches 'right_*'"]),
+    "armature": (robot(armature={"*_toe": 1.0}), ["no joint of robot matches '*_toe'"]),
+    "collision": (
+        robot(collisions=(Collision("foot_collision"),)),
+        ["no geom of robot matches 'foot_collision'", "thigh_collision, shank_collision"],
+    ),
+    "condim for some geoms": (
+        robot(collisions=(Collision("*", condim={"thigh*": 3}),)),
+        ["no pattern of condim", "shank_collision", "add '*'"],
+    ),
+    "condim": (lambda: Collision("*", condim=2), ["condim is 1, 3, 4 or 6, not 2"]),
+    "mask": (lambda: Collision("*", contype=-1), ["contype is a whole number from 0", "-1"]),
+    "two of one name": (lambda: template(Box("cube"), Sphere("cube")), ["two things in the world are called 'cube'"]),
+    "a name with a slash": (lambda: template(Box("a/b")), ["a word without slashes, not 'a/b'"]),
+    "no such robot": (
+        lambda: RobotView(template(Robot(leg(), name="walker", actuators=(SERVO,)), Box("cube")), "walkr"),
+        ["the world has no robot or object 'walkr'", "did you mean walker?"],
+    ),
+    "body": (
+        view_of((SERVO,), lambda view: view.find_bodies("shin")),
+        ["no body of robot matches 'shin'", "thigh, shank"],
+    ),
+    "site": (view_of((SERVO,), lambda view: view.find_sites("foot")), ["no site of robot matches 'foot'", "knee_mark"]),
+    "geom": (view_of((SERVO,), lambda view: view.find_geoms("x*")), ["no geom of robot matches 'x*'"]),
+    "no limits": (
+        view_of((SERVO,), lambda view: view.need_ranges([0, 1], "reward joint_limits")),
+        ["reward joint_limits needs limits of its position, which the joint left_knee of robot has not"],
+    ),
+    "no effort limit": (
+        view_of((SERVO,), lambda view: view.need_efforts([0], "action joints")),
+        ["action joints needs a limit of its force", "left_hip", "effort_limit"],
+    ),
+    "no actuator where an effort is needed": (
+        view_of((KNEES,), lambda view: view.need_efforts([0, 1], "action joints")),
+        ["action joints needs an actuator, which the joint left_hip", "left_knee"],
+    ),
+    "weightless box": (lambda: Box("cube", mass=0.0), ["Box 'cube': mass must be greater than 0"]),
+    "flat box": (lambda: Box("cube", size=(1.0, 1.0, 0.0)), ["Box 'cube': size must be greater than 0"]),
+    "flat capsule": (lambda: Capsule("rod", radius=-1.0), ["Capsule 'rod': radius must be greater than 0"]),
+    "friction": (lambda: Sphere("ball", friction=-1.0), ["Sphere 'ball': friction must be 0 or more"]),
+    "XML": (lambda: template(Robot("<mujoco><worldbody>")), ["the robot's XML: is not XML"]),
+    "MJCF": (lambda: template(Robot("<mujoco><worldbodyy/></mujoco>")), ["unrecognized element", "worldbodyy"]),
+    "neither MJCF nor URDF": (lambda: template(Robot("<sdf/>")), ["first element is <sdf>", "<mujoco>", "<robot>"]),
+    "no bodies": (lambda: template(Robot("<mujoco/>")), ["has no body that could be a robot's"]),
+    "no package": (
+        lambda: template(Robot("package:newtonn/a.xml")),
+        ["no Python package 'newtonn'", "did you mean newton?"],
+    ),
+    "no asset": (
+        lambda: template(Robot("newton:nv_antt.xml")),
+        ["no such file in Newton's assets", "did you mean nv_ant.xml?"],
+    ),
+    "no file in a package": (
+        lambda: template(Robot("package:newton/examples/assets/quadrupd.urdf")),
+        ["no such file in the package newton", "did you mean quadruped.urdf?"],
+    ),
+    "no folder in a package": (
+        lambda: template(Robot("package:newton/examples/asset/quadruped.urdf")),
+        ["no folder 'asset' in the package newton", "did you mean examples/assets/quadruped.urdf?"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("declare", "parts"), CASES.values(), ids=CASES)
+def test_what_is_wrong_is_said_in_one_line(declare: Callable[[], Any], parts: list[str]):
+    with pytest.raises(ValueError) as refused:
+        declare()
+    message = str(refused.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("legg.xml", ["there is no such file in", "did you mean leg.xml?"]),
+        ("leg.stl", ["a robot's file ends in .xml, .mjcf, .urdf", "not in '.stl'"]),
+        ("", ["is a folder; name a robot's file in it (leg.xml)"]),
+        ("nowhere/leg.xml", ["there is no folder", "nowhere", "relative paths begin at"]),
+    ],
+    ids=["file", "format", "folder", "folder that is not there"],
+)
+def test_a_file_that_is_not_there(tmp_path: Path, name: str, parts: list[str]):
+    (tmp_path / "leg.xml").write_text(leg())
+    (tmp_path / "leg.stl").write_text("")
+    with pytest.raises(ValueError) as refused:
+        template(Robot(tmp_path / name if name else tmp_path))
+    for part in parts:
+        assert part in str(refused.value)
+
+
+def test_a_missing_mesh_of_an_mjcf_file(tmp_path: Path):
+    """Newton alone would build the robot without it."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "shank.stl").write_text("")
+    assets = '<compiler meshdir="meshes"/><asset><mesh name="shank" file="shnk.stl"/></asset>'
+    (tmp_path / "leg.xml").write_text(leg(assets, '<geom type="mesh" mesh="shank"/>'))
+    with pytest.raises(
+        ValueError, match=r"leg\.xml: its mesh shnk\.stl is missing in .*meshes; did you mean shank\.stl\?"
+    ):
+        template(Robot(tmp_path / "leg.xml", actuators=(SERVO,)))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "words"),
+    [
+        ("meshes/base.obj", r"its mesh meshes/base\.obj is missing in .*meshes; did you mean bases\.obj\?"),
+        (
+            "package://arm/meshes/base.obj",
+            r"its mesh package://arm/meshes/base\.obj is missing in .*did you mean bases\.obj\?",
+        ),
+        ("package://leg/meshes/bases.obj", r"is of the package leg, but no folder above the file has that name"),
+    ],
+    ids=["beside the file", "in its package", "in another package"],
+)
+def test_a_missing_mesh_of_a_urdf_file(tmp_path: Path, mesh: str, words: str):
+    urdf = f'<robot name="arm"><link name="base"><visual><geometry><mesh filename="{mesh}"/></geometry></visual></link></robot>'
+    folder = tmp_path / "arm"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "meshes" / "bases.obj").write_text("")
+    (folder / "arm.urdf").write_text(urdf)
+    with pytest.raises(ValueError, match=r"arm\.urdf: .*" + words):
+        template(Robot(folder / "arm.urdf", actuators=(SERVO,)))
+    with pytest.raises(ValueError, match="give the path of the URDF file"):
+        template(Robot(urdf, actuators=(SERVO,)))
+
+
+# A tetrahedron with legs of 1 m: its volume is 1/6 m^3.
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def test_meshes_are_read(tmp_path: Path):
+    """URDF in a package, and MJCF in the folder that it names; the mass is the density's times the volume by hand."""
+    (tmp_path / "arm" / "meshes").mkdir(parents=True)
+    (tmp_path / "arm" / "meshes" / "base.obj").write_text(TETRAHEDRON)
+    (tmp_path / "arm" / "arm.urdf").write_text(
+        '<robot name="arm"><link name="base"><collision><geometry><mesh filename="package://arm/meshes/base.obj"/></geometry></collision>'
+        "</link></robot>"
+    )
+    (tmp_path / "arm" / "arm.xml").write_text(
+        '<mujoco><compiler meshdir="meshes"/><asset><mesh name="base" file="base.obj"/></asset><worldbody><body name="base"><freejoint/>'
+        '<geom type="mesh" mesh="base" density="1000"/></body></worldbody></mujoco>'
+    )
+    for name in ("arm.urdf", "arm.xml"):
+        builder = template(Robot(tmp_path / "arm" / name, fixed=False))
+        assert builder.body_mass[0] == pytest.approx(1000 / 6, rel=1e-4), name
+
+
+def test_a_robot_may_be_declared_passive():
+    door = Robot(leg(), name="door", passive=True)
+    assert RobotView(template(door), "door").actuators == [-1, -1]

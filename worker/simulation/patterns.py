@@ -1,0 +1,69 @@
+"""Names of joints, bodies, sites and geoms by pattern, as declarations of tasks give them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import TypeVar
+
+from shared_store.wording import nearest
+
+Value = TypeVar("Value")
+
+
+def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list[int]:
+    """The names that match any of the patterns.
+
+    Args:
+        names: All names, in the order of the model.
+        patterns: One pattern or several, as of file names (``*``, ``?``, ``[ab]``); a whole name matches itself.
+        what: What the names are, and of what, for the error: ``"joint of robot"``.
+
+    Returns:
+        Indices into ``names``, ascending.
+
+    Raises:
+        ValueError: A pattern matches nothing, or there is no pattern.
+    """
+    wanted = [patterns] if isinstance(patterns, str) else list(patterns)
+    if not wanted:
+        raise ValueError(f"no pattern for a {what} was given; there are {', '.join(names) or 'none'}")
+    found: set[int] = set()
+    for pattern in wanted:
+        matching = {index for index, name in enumerate(names) if name == pattern or fnmatchcase(name, pattern)}
+        if not matching:
+            raise ValueError(f"no {what} matches {pattern!r}; {_what_there_is(pattern, names)}")
+        found |= matching
+    return sorted(found)
+
+
+def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str) -> list[Value | None]:
+    """A value for each name; of the patterns that match a name, the first counts.
+
+    Args:
+        names: All names, in the order of the model.
+        values: One value for all names, or values by pattern.
+        what: As for :func:`find`.
+
+    Returns:
+        One value a name, None where no pattern matches.
+
+    Raises:
+        ValueError: A pattern matches nothing.
+    """
+    if not isinstance(values, Mapping):
+        return [values] * len(names)
+    resolved: list[Value | None] = [None] * len(names)
+    for pattern, value in reversed(values.items()):
+        for index in find(names, pattern, what):
+            resolved[index] = value
+    return resolved
+
+
+def _what_there_is(pattern: str, names: Sequence[str]) -> str:
+    everything = f"there are {', '.join(names) or 'none'}"
+    simple = pattern.strip("^$").replace(".*", "*")
+    if simple != pattern and any(fnmatchcase(name, simple) for name in names):
+        return f"patterns are like those of file names, not regular expressions: did you mean {simple!r}? {everything}"
+    near = nearest(pattern.replace("*", "").replace("?", ""), names, otherwise=" ")
+    return f"{near} {everything}".strip()

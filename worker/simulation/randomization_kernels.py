@@ -1,0 +1,283 @@
+"""Kernels that draw what differs between worlds, and that write it into the model."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays, numbered_stream, random_stream
+
+wp.set_module_options({"enable_backward": False})
+
+SCALE, ADD, SET = 0, 1, 2
+"""Operations, in the order of :data:`worker.tasks.randomize.OPERATIONS`."""
+UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2
+"""Distributions, in the order of :data:`worker.tasks.randomize.DISTRIBUTIONS`."""
+STARTUP, RESET, INTERVAL = 0, 1, 2
+"""When an entry is drawn, in the order of :data:`worker.tasks.randomize.MOMENTS`."""
+MASS, CENTER, INERTIA, PAYLOAD = 0, 1, 2, 3
+"""What a change of a body changes."""
+
+FIRST_STREAM = wp.constant(-200)
+"""Number of the stream from which a world's first entry is drawn at the beginning; the next has one less."""
+LEAST_MASS = wp.constant(0.01)
+"""A body keeps at least this part of its mass, whatever is drawn."""
+
+_SCALE, _ADD = wp.constant(SCALE), wp.constant(ADD)
+_LOG_UNIFORM, _NORMAL = wp.constant(LOG_UNIFORM), wp.constant(NORMAL)
+_RESET, _INTERVAL = wp.constant(RESET), wp.constant(INTERVAL)
+_MASS, _CENTER, _INERTIA = wp.constant(MASS), wp.constant(CENTER), wp.constant(INERTIA)
+
+
+@wp.struct
+class Entries:
+    """What is drawn, one row an entry; the drawn numbers of an entry are neighbouring columns of the draws.
+
+    Attributes:
+        first_columns: First column of an entry's draws, shape ``(entries,)``.
+        counts: How many there are, shape ``(entries,)``.
+        axes: After how many columns its ranges repeat, shape ``(entries,)``.
+        first_ranges: Its first row in ``ranges``, shape ``(entries,)``.
+        distributions: See :data:`UNIFORM`, shape ``(entries,)``.
+        moments: See :data:`STARTUP`, shape ``(entries,)``.
+        ranges: Least and greatest number, or mean and standard deviation, shape ``(ranges,)``.
+        seconds: Least and greatest time between the draws of an interval [s], shape ``(entries,)``.
+        control_hz: Control steps per simulated second [Hz].
+    """
+
+    first_columns: wp.array(dtype=wp.int32)
+    counts: wp.array(dtype=wp.int32)
+    axes: wp.array(dtype=wp.int32)
+    first_ranges: wp.array(dtype=wp.int32)
+    distributions: wp.array(dtype=wp.int32)
+    moments: wp.array(dtype=wp.int32)
+    ranges: wp.array(dtype=wp.vec2)
+    seconds: wp.array(dtype=wp.vec2)
+    control_hz: float
+
+
+@wp.struct
+class Changes:
+    """How draws change numbers of the model: those of number ``i`` are the changes ``starts[i]`` to ``starts[i + 1]``, in order.
+
+    Attributes:
+        columns: Column of each number in its array, or body, shape ``(numbers,)``.
+        least: Least value of each number, shape ``(numbers,)``.
+        greatest: Greatest value of each number, shape ``(numbers,)``.
+        starts: First change of each number, shape ``(numbers + 1,)``.
+        operations: See :data:`SCALE`, shape ``(changes,)``.
+        draws: Column of the draws, shape ``(changes,)``.
+        factors: Of the draw, where it is added or set, shape ``(changes,)``.
+        kinds: Of a body: see :data:`MASS`, shape ``(changes,)``.
+        axes: Of a body: 0, 1, 2, or -1 for all of it, shape ``(changes,)``.
+        points: Of a body: where a payload is, in its frame [m], shape ``(changes,)``.
+    """
+
+    columns: wp.array(dtype=wp.int32)
+    least: wp.array(dtype=wp.float32)
+    greatest: wp.array(dtype=wp.float32)
+    starts: wp.array(dtype=wp.int32)
+    operations: wp.array(dtype=wp.int32)
+    draws: wp.array(dtype=wp.int32)
+    factors: wp.array(dtype=wp.float32)
+    kinds: wp.array(dtype=wp.int32)
+    axes: wp.array(dtype=wp.int32)
+    points: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Bodies:
+    """Masses, centres of mass [m] in the bodies' frames, and inertias about these [kg m^2] along the frames' axes."""
+
+    masses: wp.array2d(dtype=wp.float32)
+    centers: wp.array2d(dtype=wp.vec3)
+    inertias: wp.array2d(dtype=wp.mat33)
+
+
+@wp.struct
+class BodyFields:
+    """Where a body's inertial properties are kept: by Newton, shape ``(worlds, bodies)``, and by mujoco_warp, which has the world as
+    body 0 and an order of its own, shape ``(worlds, 1 + bodies)``."""
+
+    columns: wp.array(dtype=wp.int32)
+    inverse_masses: wp.array2d(dtype=wp.float32)
+    inverse_inertias: wp.array2d(dtype=wp.mat33)
+    masses: wp.array2d(dtype=wp.float32)
+    centers: wp.array2d(dtype=wp.vec3)
+    moments: wp.array2d(dtype=wp.vec3)
+    frames: wp.array2d(dtype=wp.quat)
+
+
+@wp.func
+def _draw_entry(
+    entries: Entries, world: int, entry: int, stream: wp.uint32, draws: wp.array2d(dtype=wp.float32)
+) -> wp.uint32:
+    """Draw an entry's numbers of one world; returns the generator as it is afterwards."""
+    for index in range(entries.counts[entry]):
+        ends = entries.ranges[entries.first_ranges[entry] + index % entries.axes[entry]]
+        number = float(0.0)
+        if entries.distributions[entry] == _NORMAL:
+            number = ends[0] + ends[1] * wp.randn(stream)
+        elif entries.distributions[entry] == _LOG_UNIFORM:
+            number = wp.exp(wp.randf(stream, wp.log(ends[0]), wp.log(ends[1])))
+        else:
+            number = wp.randf(stream, ends[0], ends[1])
+        draws[world, entries.first_columns[entry] + index] = number
+    return stream
+
+
+@wp.func
+def _draw_countdown(
+    entries: Entries, world: int, entry: int, stream: wp.uint32, countdowns: wp.array2d(dtype=wp.int32)
+) -> wp.uint32:
+    """Draw the control steps until the next draw of an interval, at least one; returns the generator as it is afterwards."""
+    seconds = entries.seconds[entry]
+    steps = wp.randf(stream, seconds[0], seconds[1]) * entries.control_hz
+    countdowns[world, entry] = wp.max(1, int(wp.round(steps)))
+    return stream
+
+
+@wp.kernel
+def draw_at_start(
+    entries: Entries,
+    episodes: EpisodeArrays,
+    draws: wp.array2d(dtype=wp.float32),
+    countdowns: wp.array2d(dtype=wp.int32),
+):
+    """Draw one entry of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
+    world, entry = wp.tid()
+    stream = _draw_entry(entries, world, entry, numbered_stream(episodes, world, FIRST_STREAM - entry), draws)
+    if entries.moments[entry] == _INTERVAL:
+        _draw_countdown(entries, world, entry, stream, countdowns)
+
+
+@wp.kernel
+def draw_due(
+    entries: Entries,
+    episodes: EpisodeArrays,
+    draws: wp.array2d(dtype=wp.float32),
+    countdowns: wp.array2d(dtype=wp.int32),
+    changed: wp.array(dtype=wp.bool),
+):
+    """Draw what is due in one world: a new episode's entries, and intervals that are over. A new episode begins its intervals afresh."""
+    world = wp.tid()
+    begins = episodes.ages[world] == 0
+    any_drawn = bool(False)
+    for entry in range(entries.moments.shape[0]):
+        moment = entries.moments[entry]
+        if begins and moment == _RESET:
+            _draw_entry(entries, world, entry, random_stream(episodes, world), draws)
+            any_drawn = True
+        elif begins and moment == _INTERVAL:
+            _draw_countdown(entries, world, entry, random_stream(episodes, world), countdowns)
+        elif moment == _INTERVAL:
+            left = countdowns[world, entry] - 1
+            countdowns[world, entry] = left
+            if left <= 0:
+                stream = _draw_entry(entries, world, entry, random_stream(episodes, world), draws)
+                _draw_countdown(entries, world, entry, stream, countdowns)
+                any_drawn = True
+    changed[world] = any_drawn
+
+
+@wp.func
+def _combined(operation: int, value: float, number: float) -> float:
+    """What a drawn number makes of a value."""
+    if operation == _SCALE:
+        return value * number
+    if operation == _ADD:
+        return value + number
+    return number
+
+
+@wp.kernel
+def change_numbers(
+    changed: wp.array(dtype=wp.bool),
+    changes: Changes,
+    draws: wp.array2d(dtype=wp.float32),
+    defaults: wp.array2d(dtype=wp.float32),
+    values: wp.array2d(dtype=wp.float32),
+):
+    """Write one number of one world, from the model's own and all that was drawn for it."""
+    world, index = wp.tid()
+    if not changed[world]:
+        return
+    value = defaults[world, index]
+    for change in range(changes.starts[index], changes.starts[index + 1]):
+        number = draws[world, changes.draws[change]]
+        if changes.operations[change] != _SCALE:
+            number = number * changes.factors[change]
+        value = _combined(changes.operations[change], value, number)
+    values[world, changes.columns[index]] = wp.clamp(value, changes.least[index], changes.greatest[index])
+
+
+@wp.func
+def _stretched(inertia: wp.mat33, axis: int, factor: float) -> wp.mat33:
+    """Inertia of a mass whose squares of coordinates along an axis have become ``factor`` times as great.
+
+    With the second moments S = tr(I) / 2 - I, which are positive for every distribution of mass and stay so.
+    """
+    moments = wp.identity(n=3, dtype=float) * (0.5 * wp.trace(inertia)) - inertia
+    stretch = wp.vec3(1.0, 1.0, 1.0)
+    stretch[axis] = wp.sqrt(factor)
+    moments = wp.diag(stretch) * moments * wp.diag(stretch)
+    return wp.identity(n=3, dtype=float) * wp.trace(moments) - moments
+
+
+@wp.func
+def _principal_frame(axes: wp.mat33) -> wp.quat:
+    """Rotation from principal axes (columns) to the body's frame, real part first as in mujoco_warp."""
+    turn = axes
+    if wp.determinant(turn) < 0.0:
+        turn = turn * wp.diag(wp.vec3(1.0, 1.0, -1.0))
+    rotation = wp.normalize(wp.quat_from_matrix(turn))
+    return wp.quat(rotation[3], rotation[0], rotation[1], rotation[2])
+
+
+@wp.kernel
+def change_bodies(
+    changed: wp.array(dtype=wp.bool),
+    changes: Changes,
+    draws: wp.array2d(dtype=wp.float32),
+    defaults: Bodies,
+    values: Bodies,
+    fields: BodyFields,
+):
+    """Write the inertial properties of one body of one world, from the model's own and all that was drawn for it."""
+    world, index = wp.tid()
+    if not changed[world]:
+        return
+    mass = defaults.masses[world, index]
+    center = defaults.centers[world, index]
+    inertia = defaults.inertias[world, index]
+    least = LEAST_MASS * mass
+    for change in range(changes.starts[index], changes.starts[index + 1]):
+        kind, axis, operation = changes.kinds[change], changes.axes[change], changes.operations[change]
+        number = draws[world, changes.draws[change]]
+        if kind == _MASS:
+            before = mass
+            mass = wp.max(_combined(operation, mass, number), least)
+            inertia = inertia * (mass / before)
+        elif kind == _CENTER:
+            center[axis] = _combined(operation, center[axis], number)
+        elif kind == _INERTIA:
+            # A normal distribution has no least number, an inertia has.
+            number = wp.max(number, LEAST_MASS)
+            inertia = _stretched(inertia, axis, number) if axis >= 0 else inertia * number
+        elif number > 0.0:  # a payload, a point mass: the parallel axis theorem, for both about their common centre
+            arm = changes.points[change] - center
+            reduced = mass * number / (mass + number)
+            inertia = inertia + reduced * (wp.identity(n=3, dtype=float) * wp.dot(arm, arm) - wp.outer(arm, arm))
+            center = center + arm * (number / (mass + number))
+            mass = mass + number
+    body = changes.columns[index]
+    values.masses[world, body] = mass
+    values.centers[world, body] = center
+    values.inertias[world, body] = inertia
+    fields.inverse_masses[world, body] = 1.0 / mass
+    fields.inverse_inertias[world, body] = wp.inverse(inertia)
+    column = fields.columns[index]
+    axes, moments = wp.eig3(inertia)
+    fields.masses[world, column] = mass
+    fields.centers[world, column] = center
+    fields.moments[world, column] = moments
+    fields.frames[world, column] = _principal_frame(axes)

@@ -1,0 +1,331 @@
+"""Declared quantities of the model, drawn for each world at the beginning, at resets and at intervals.
+
+What is drawn is state; what the model holds follows from it and from the model's own values, so that nothing compounds and a run goes on
+from its state bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.inverse_weights import InverseWeights
+from worker.simulation.randomization_kernels import (
+    STARTUP,
+    Bodies,
+    BodyFields,
+    Changes,
+    Entries,
+    change_bodies,
+    change_numbers,
+    draw_at_start,
+    draw_due,
+)
+from worker.simulation.randomization_targets import Change, Target, body_column, find_target
+from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.worlds import Worlds
+from worker.tasks.randomize import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A change, and where its number is drawn."""
+
+    change: Change
+    entry: Randomize
+    column: int
+
+
+class Randomizations:
+    """All declared randomisations of a task: launches only, on arrays that stay where they are.
+
+    Construct it when the model holds its own values (after a ``Randomizer``, whose factors then count as the model's own) and before a
+    capture. It draws and applies every entry at once: what a reset or an interval draws later has a value from the beginning on.
+
+    Of a step, :meth:`settle` costs one launch for the draws, one for each array that entries of resets and intervals change, and
+    three where bodies or armatures are among them; threads of worlds in which nothing is due end at once.
+
+    Args:
+        entries: Declarations by name. Their order is that in which they are applied, and keys their random numbers: an entry
+            added at the end leaves the others' as they were.
+        worlds: The task's worlds; their model is changed here.
+        episodes: The task's buffers; ``random`` holds seed and global indices already.
+        views: Robots and objects by name.
+        robots: Their arrays by name, for the encoders' bias.
+        control_hz: Control steps per simulated second [Hz].
+
+    Raises:
+        ValueError: An entry names a robot that is not there, a pattern without a match, or a part that has nothing of the kind.
+
+    Attributes:
+        names: Of what each column of the draws is, as ``entry/part/axis``; of a shared draw ``entry/axis``.
+        draws: The drawn numbers, shape ``(worlds, len(names))``, float32.
+    """
+
+    def __init__(
+        self,
+        entries: Mapping[str, Randomize],
+        worlds: Worlds,
+        episodes: EpisodeArrays,
+        views: Mapping[str, RobotView],
+        robots: Mapping[str, RobotArrays],
+        control_hz: float,
+    ) -> None:
+        self._worlds, self._episodes = worlds, episodes
+        self._device = worlds.model.device
+        self._entries = dict(entries)
+        count = worlds.world_count
+        targets = {}
+        for name, entry in self._entries.items():
+            try:
+                targets[name] = find_target(entry, worlds, views)
+            except ValueError as error:
+                raise ValueError(f"randomize.{name}: {error}") from error
+        self._list_entries(targets, control_hz)
+        draws = wp.zeros((count, len(self.names)), dtype=wp.float32, device=self._device)
+        countdowns = wp.zeros((count, len(self._entries)), dtype=wp.int32, device=self._device)
+        self._draws, self._countdowns = draws, countdowns
+        self.draws = wp.to_torch(draws)
+        self._changed = wp.zeros(count, dtype=wp.bool, device=self._device)
+        self._all = wp.full(count, True, dtype=wp.bool, device=self._device)
+        self._group(targets, robots)
+        self.restart()
+
+    def restart(self) -> None:
+        """Draw everything as at the beginning of the worlds' lives, and apply it; where ``episodes.random`` was seeded afresh."""
+        if not self._entries:
+            return
+        shape = (self._worlds.world_count, len(self._entries))
+        inputs = [self._table, self._episodes, self._draws, self._countdowns]
+        wp.launch(draw_at_start, dim=shape, inputs=inputs, device=self._device)
+        self.apply()
+
+    def settle(self) -> None:
+        """At the end of every control step, and of a reset, after worlds were placed: draw what is due, and apply it.
+
+        Due are the entries of a reset in worlds with ``episodes.ages[world] == 0``, and the intervals that are over; a new episode begins
+        its intervals afresh.
+        """
+        if not self._is_live:
+            return
+        inputs = [self._table, self._episodes, self._draws, self._countdowns, self._changed]
+        wp.launch(draw_due, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+        self._write(self._changed, live=True)
+
+    def apply(self) -> None:
+        """Bring the whole model in line with the draws: after :meth:`state_tensors` were filled from a saved state."""
+        self._write(self._all, live=False)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Live views of what outlasts a control step, each with leading dimension worlds. Whoever fills them calls :meth:`apply`.
+
+        ``randomization_draws`` are the drawn numbers, float32; ``randomization_countdowns`` the control steps until each interval ends,
+        int32, one column an entry.
+        """
+        if not self._entries:
+            return {}
+        return {
+            "randomization_draws": self.draws,
+            "randomization_countdowns": wp.to_torch(self._countdowns),
+        }
+
+    def numbers(self) -> dict[str, torch.Tensor]:
+        """Live views of the ranges by place, which a curriculum may change; they count from the next draw on, unchecked.
+
+        Returns:
+            ``<entry>.range``, shape ``(axes, 2)``, or, of a range declared by axis, ``<entry>.range.<axis>``, shape ``(2,)``; and of an
+            interval ``<entry>.seconds``, shape ``(2,)``; float32.
+        """
+        ranges, seconds = wp.to_torch(self._table.ranges), wp.to_torch(self._table.seconds)
+        found = {}
+        for index, (name, entry) in enumerate(self._entries.items()):
+            first = self._first_ranges[index]
+            if isinstance(entry.range, Mapping):
+                found |= {f"{name}.range.{axis}": ranges[first + row] for row, axis in enumerate(entry.drawn_axes)}
+            else:
+                found[f"{name}.range"] = ranges[first : first + len(entry.ends)]
+            if entry.when == "interval":
+                found[f"{name}.seconds"] = seconds[index]
+        return found
+
+    def _list_entries(self, targets: Mapping[str, Target], control_hz: float) -> None:
+        """Give every drawn number a column, and every entry its row in the tables."""
+        self.names: list[str] = []
+        self._first_columns: list[int] = []
+        self._first_ranges: list[int] = []
+        ranges: list[tuple[float, float]] = []
+        counts = []
+        for name, entry in self._entries.items():
+            self._first_columns.append(len(self.names))
+            self._first_ranges.append(len(ranges))
+            ranges += entry.ends
+            parts = [name] if entry.shared else [f"{name}/{part}" for part in targets[name].names]
+            new = [f"{part}/{axis}" if axis else part for part in parts for axis in entry.drawn_axes or ("",)]
+            counts.append(len(new))
+            self.names += new
+        every = list(self._entries.values())
+        table = self._table = Entries()
+        for field, values in {
+            "first_columns": self._first_columns,
+            "counts": counts,
+            "axes": [len(entry.ends) for entry in every],
+            "first_ranges": self._first_ranges,
+            "distributions": [DISTRIBUTIONS.index(entry.distribution) for entry in every],
+            "moments": [MOMENTS.index(entry.when) for entry in every],
+        }.items():
+            setattr(table, field, wp.array(values, dtype=wp.int32, device=self._device))
+        table.ranges = _pairs(ranges, self._device)
+        table.seconds = _pairs([entry.seconds or (0.0, 0.0) for entry in every], self._device)
+        table.control_hz = control_hz
+
+    def _group(self, targets: Mapping[str, Target], robots: Mapping[str, RobotArrays]) -> None:
+        """Gather the changes of each array, in the order of the entries."""
+        grouped: dict[str, list[_Drawn]] = {}
+        for (name, entry), first in zip(self._entries.items(), self._first_columns, strict=True):
+            for change in targets[name].changes:
+                element = 0 if entry.shared else change.element
+                drawn = _Drawn(change, entry, first + element * len(entry.ends) + change.axis)
+                grouped.setdefault(change.array, []).append(drawn)
+        self._is_live = any(_is_live(entry) for entry in self._entries.values())
+        weighty = [*grouped.get("bodies", ()), *grouped.get("dof_armature", ())]
+        self._weights = InverseWeights(self._worlds) if weighty else None
+        self._weights_live = any(_is_live(drawn.entry) for drawn in weighty)
+        bodies = grouped.pop("bodies", None)
+        self._bodies = _BodyChanges(bodies, self._worlds) if bodies else None
+        self._arrays = [
+            _NumberChanges(changes, _array(array, self._worlds, robots)) for array, changes in grouped.items()
+        ]
+
+    def _write(self, changed: wp.array, live: bool) -> None:
+        """Write the model's numbers of the worlds with ``changed``; with ``live``, those that can have changed since the beginning."""
+        if self._bodies and (self._bodies.is_live or not live):
+            self._bodies.launch(changed, self._draws)
+        written = [array for array in self._arrays if array.is_live or not live]
+        for array in written:
+            array.launch(changed, self._draws)
+        if self._weights and (self._weights_live or not live):
+            self._weights.update(changed)
+            if self._weights.whole:  # Newton also resolves damping ratios anew, in all worlds
+                for array in self._arrays:
+                    array.launch(self._all, self._draws)
+
+
+class _NumberChanges:
+    """Changes of numbers in one array.
+
+    Args:
+        drawn: The changes.
+        values: The array as numbers, shape ``(worlds, columns)``; it holds the model's own values.
+    """
+
+    def __init__(self, drawn: list[_Drawn], values: wp.array) -> None:
+        self.is_live = any(_is_live(each.entry) for each in drawn)
+        self._device = values.device
+        self._values = values
+        self._changes, columns = _table(drawn, self._device)
+        self._defaults = wp.array(values.numpy()[:, columns], dtype=wp.float32, device=self._device)
+
+    def launch(self, changed: wp.array, draws: wp.array) -> None:
+        inputs = [changed, self._changes, draws, self._defaults, self._values]
+        wp.launch(change_numbers, dim=self._defaults.shape, inputs=inputs, device=self._device)
+
+
+class _BodyChanges:
+    """Changes of bodies' inertial properties, in Newton's model and in mujoco_warp's."""
+
+    def __init__(self, drawn: list[_Drawn], worlds: Worlds) -> None:
+        self.is_live = any(_is_live(each.entry) for each in drawn)
+        model, solver = worlds.model, worlds.solver
+        self._device = model.device
+        self._changes, bodies = _table(drawn, self._device)
+        shape = (worlds.world_count, model.body_count // worlds.world_count)
+        self._values, self._defaults, self._fields = Bodies(), Bodies(), BodyFields()
+        for field, source in {
+            "masses": model.body_mass,
+            "centers": model.body_com,
+            "inertias": model.body_inertia,
+        }.items():
+            values = source.reshape(shape)
+            setattr(self._values, field, values)
+            own = wp.array(values.numpy()[:, bodies], dtype=source.dtype, device=self._device)
+            setattr(self._defaults, field, own)
+        self._fields.columns = wp.array(
+            [body_column(worlds, body) for body in bodies], dtype=wp.int32, device=self._device
+        )
+        self._fields.inverse_masses = model.body_inv_mass.reshape(shape)
+        self._fields.inverse_inertias = model.body_inv_inertia.reshape(shape)
+        self._fields.masses, self._fields.centers = solver.mjw_model.body_mass, solver.mjw_model.body_ipos
+        self._fields.moments, self._fields.frames = solver.mjw_model.body_inertia, solver.mjw_model.body_iquat
+        self._shape = (worlds.world_count, len(bodies))
+
+    def launch(self, changed: wp.array, draws: wp.array) -> None:
+        inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields]
+        wp.launch(change_bodies, dim=self._shape, inputs=inputs, device=self._device)
+
+
+def _is_live(entry: Randomize) -> bool:
+    """Whether it is drawn again after the beginning."""
+    return MOMENTS.index(entry.when) != STARTUP
+
+
+def _pairs(values: Iterable[tuple[float, float]], device: wp.Device) -> wp.array:
+    return wp.array(np.array(list(values), np.float32).reshape(-1, 2), dtype=wp.vec2, device=device)
+
+
+def _table(drawn: list[_Drawn], device: wp.Device) -> tuple[Changes, list[int]]:
+    """The changes as a kernel reads them, and the columns that they change, ascending."""
+    columns = sorted({each.change.column for each in drawn})
+    of_column: dict[int, list[_Drawn]] = {column: [] for column in columns}
+    for each in drawn:
+        of_column[each.change.column].append(each)
+    ordered = [each for column in columns for each in of_column[column]]
+    starts = np.cumsum([0, *(len(of_column[column]) for column in columns)])
+    table = Changes()
+    for name, dtype, values in (
+        ("columns", wp.int32, columns),
+        ("least", wp.float32, [max(each.change.least for each in of_column[column]) for column in columns]),
+        ("greatest", wp.float32, [min(each.change.greatest for each in of_column[column]) for column in columns]),
+        ("starts", wp.int32, starts),
+        ("operations", wp.int32, [OPERATIONS.index(each.entry.operation) for each in ordered]),
+        ("draws", wp.int32, [each.column for each in ordered]),
+        ("factors", wp.float32, [each.change.factor for each in ordered]),
+        ("kinds", wp.int32, [each.change.kind for each in ordered]),
+        ("axes", wp.int32, [each.change.body_axis for each in ordered]),
+        ("points", wp.vec3, [each.entry.at for each in ordered]),
+    ):
+        setattr(table, name, wp.array(values, dtype=dtype, device=device))
+    return table, columns
+
+
+def _array(name: str, worlds: Worlds, robots: Mapping[str, RobotArrays]) -> wp.array:
+    """The array of a :class:`Change` as rows of numbers, one row a world: a view, which keeps the array."""
+    model: Any = worlds.solver.mjw_model
+    if name.startswith("bias "):
+        return robots[name.removeprefix("bias ")].encoder_bias
+    if name == "gravity":
+        source = worlds.model.gravity[: worlds.world_count]  # the last row is that of what belongs to no world
+    elif name == "opt.gravity":
+        source = model.opt.gravity
+    elif name.startswith("muster."):
+        motors: Any = worlds.model.muster
+        source = getattr(motors, name.removeprefix("muster.")).reshape((worlds.world_count, -1))
+    else:
+        source = getattr(model, name)
+    if source.shape[0] != worlds.world_count or not source.is_contiguous:
+        raise RuntimeError(f"{name} has shape {source.shape}: it is shared by the {worlds.world_count} worlds")
+    rows = wp.array(
+        ptr=source.ptr,
+        shape=(worlds.world_count, source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // worlds.world_count),
+        dtype=wp.float32,
+        device=source.device,
+        copy=False,
+    )
+    rows.owner_of_memory = source
+    return rows

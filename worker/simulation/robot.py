@@ -1,0 +1,203 @@
+"""A robot of a scene: its file, its pose at the start, what moves it and what it touches."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import newton
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation import actuators as actuation
+from worker.simulation import collisions as contacts
+from worker.simulation import robot_files
+from worker.simulation.actuators import Actuator, Number
+from worker.simulation.collisions import Collision
+from worker.simulation.patterns import resolve
+from worker.simulation.robot_view import RobotView, actuator_value
+
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot from an MJCF, URDF or USD file.
+
+    Patterns are like those of file names (``*``, ``?``, ``[ab]``); of several that match a name, the first counts. Names are those of
+    the file, with underscores for what USD does not allow in names, such as dashes.
+
+    Args:
+        file: A path, ``"package:NAME/path"`` (a file inside an installed Python package), ``"newton:NAME"`` (one of Newton's assets), or
+            the text of an MJCF or URDF file.
+        name: What it is called in its world; labels in the model begin with it.
+        position: Of its root at the start [m]; None: as in the file.
+        rotation: Of its root at the start (quaternion xyzw); None: as in the file, or upright where a position is given.
+        joint_positions: Positions of its joints at the start [rad, m], by pattern; the others' are as in the file.
+        actuators: What moves it; they replace those of the file, which are kept where none are given.
+        fixed: Whether its root is fixed to the world; None: as in the file.
+        self_collisions: Whether its own geoms may touch each other; None: as in the file and in ``collisions``.
+        collisions: How its geoms collide; geoms that they don't match, and all without them, as in the file.
+        armature: Inertia of rotors, seen from the joint [kg m^2, kg], by pattern or for all joints; None: as in the file.
+        friction_loss: Dry friction of joints [N m, N]; None: as in the file.
+        viscous_damping: Damping of joints [N m s/rad, N s/m]; None: as in the file.
+        ignore: Patterns of bodies and geoms of the file that are left out, such as its own floor (MJCF and USD).
+        passive: Whether it may have joints without any actuator, as a door has.
+        visuals: Whether geoms that are only seen are read, as cameras and pictures need them (they are always read from URDF).
+        file_options: Whether solver options of an MJCF or USD file count where the task says nothing; those of the robot added last win.
+    """
+
+    file: str | Path
+    name: str = field(default="robot", kw_only=True)
+    position: tuple[float, float, float] | None = field(default=None, kw_only=True)
+    rotation: tuple[float, float, float, float] | None = field(default=None, kw_only=True)
+    joint_positions: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    actuators: Sequence[Actuator] = field(default=(), kw_only=True)
+    fixed: bool | None = field(default=None, kw_only=True)
+    self_collisions: bool | None = field(default=None, kw_only=True)
+    collisions: Sequence[Collision] = field(default=(), kw_only=True)
+    armature: Number | None = field(default=None, kw_only=True)
+    friction_loss: Number | None = field(default=None, kw_only=True)
+    viscous_damping: Number | None = field(default=None, kw_only=True)
+    ignore: Sequence[str] = field(default=("floor", "ground"), kw_only=True)
+    passive: bool = field(default=False, kw_only=True)
+    visuals: bool = field(default=True, kw_only=True)
+    file_options: bool = field(default=True, kw_only=True)
+
+    def add_to(self, builder: newton.ModelBuilder) -> None:
+        """Add the robot to a builder that holds one world.
+
+        Args:
+            builder: ``SolverMuJoCo.register_custom_attributes`` was called on it.
+
+        Raises:
+            ValueError: The file or a mesh is missing or can't be read, the name is taken, a pattern matches nothing, two actuators
+                drive one joint, or nothing would move the robot's joints.
+        """
+        check_name(builder, self.name)
+        file = robot_files.read(self.file)
+        own = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(own)
+        self._import(file, own)
+        if not own.body_count:
+            raise ValueError(f"{self.name}: {self._shown()} has no body that could be a robot's")
+        _name_hinges(own, file.hinges)
+        _take_controls(own)
+        view = RobotView(own, "")
+        self._set_joints(own, view)
+        if self.actuators:
+            actuation.clear(own)
+            actuation.add(own, view.joint_names, view.dofs, self.actuators, self.name)
+        self._check_driven(own, view)
+        contacts.apply(own, view.geom_names, view.geoms, self.collisions, self.name)
+        if self.self_collisions is False:
+            contacts.without_self(own, builder)
+        self._place(own, view)
+        builder.add_builder(own, label_prefix=self.name)
+
+    def _shown(self) -> str:
+        text = str(self.file)
+        return "its XML" if text.lstrip().startswith("<") else text
+
+    def _import(self, file: robot_files.RobotFile, own: newton.ModelBuilder) -> None:
+        floating = None if self.fixed is None else not self.fixed
+        ignored = [fnmatch.translate(pattern) for pattern in self.ignore]
+        try:
+            if file.format == "mjcf":
+                own.add_mjcf(
+                    file.source,
+                    floating=floating,
+                    ctrl_direct=True,
+                    ignore_names=ignored,
+                    parse_visuals=self.visuals,
+                    parse_mujoco_options=self.file_options,
+                )
+            elif file.format == "urdf":
+                own.add_urdf(file.source, floating=floating)
+            else:
+                own.add_usd(
+                    file.source,
+                    floating=floating,
+                    ignore_paths=[f".*/{pattern}" for pattern in ignored],
+                    load_visual_shapes=self.visuals,
+                    parse_mujoco_options=self.file_options,
+                )
+        except (ValueError, KeyError, RuntimeError) as error:
+            raise ValueError(f"{self.name}: {self._shown()} can't be read: {' '.join(str(error).split())}") from error
+
+    def _set_joints(self, own: newton.ModelBuilder, view: RobotView) -> None:
+        for values, starts, given in (
+            (own.joint_q, view.coordinates, self.joint_positions),
+            (own.joint_armature, view.dofs, self.armature),
+            (own.joint_friction, view.dofs, self.friction_loss),
+            (own.joint_damping, view.dofs, self.viscous_damping),
+        ):
+            if given is None or given == {}:
+                continue
+            resolved = resolve(view.joint_names, given, f"joint of {self.name}")
+            for column, value in zip(starts, resolved, strict=True):
+                if value is not None:
+                    values[column] = float(value)
+
+    def _check_driven(self, own: newton.ModelBuilder, view: RobotView) -> None:
+        if view.joint_names and not self.passive and not own.custom_attributes["mujoco:actuator_trnid"].values:
+            raise ValueError(
+                f"{self.name}: {self._shown()} has no actuators that a task could control; declare them, such as "
+                "actuators=(PositionActuator('*', stiffness=20.0, damping=0.5),), or say passive=True "
+                f"(joints: {', '.join(view.joint_names)})"
+            )
+
+    def _place(self, own: newton.ModelBuilder, view: RobotView) -> None:
+        """Move the root, and what of the file is fixed to the world beside a fixed root."""
+        if self.position is None and self.rotation is None:
+            return
+        position = wp.vec3(*(self.position or tuple(view.start.p)))
+        pose = wp.transform(position, wp.normalize(wp.quat(*(self.rotation or UPRIGHT))))
+        own.body_q[view.root_body] = pose
+        if view.root_coordinate >= 0:
+            own.joint_q[view.root_coordinate : view.root_coordinate + 7] = [*pose.p, *pose.q]
+            return
+        change = pose * wp.transform_inverse(view.start)
+        for joint, parent in enumerate(own.joint_parent):
+            if parent == -1:
+                own.joint_X_p[joint] = change * wp.transform(*own.joint_X_p[joint])
+        for shape, body in enumerate(own.shape_body):
+            if body == -1:
+                own.shape_transform[shape] = change * wp.transform(*own.shape_transform[shape])
+
+
+def check_name(builder: newton.ModelBuilder, name: str) -> None:
+    """Refuse a name that something in the world already has, or that can't begin a label."""
+    if not name or "/" in name:
+        raise ValueError(f"the name of a robot or object is a word without slashes, not {name!r}")
+    if any(label.startswith(f"{name}/") for label in builder.body_label):
+        raise ValueError(f"two things in the world are called {name!r}; give one of them another name")
+
+
+def _name_hinges(own: newton.ModelBuilder, hinges: Mapping[str, Sequence[str]]) -> None:
+    labels: Any = own.custom_attributes["mujoco:joint_dof_label"]
+    labels.values = labels.values or {}
+    for joint, label in enumerate(own.joint_label):
+        for index, name in enumerate(hinges.get(label.rpartition("/")[2], ())):
+            labels.values[own.joint_qd_start[joint] + index] = f"{label.rpartition('/')[0]}/{name}"
+
+
+def _take_controls(own: newton.ModelBuilder) -> None:
+    """Let every actuator of the file follow the controls, and none Newton's joint targets, which a task does not write."""
+    for dof in range(own.joint_dof_count):
+        own.joint_target_mode[dof] = int(newton.JointTargetMode.NONE)
+        own.joint_target_ke[dof] = own.joint_target_kd[dof] = 0.0
+    rows: Any = own.custom_attributes["mujoco:actuator_trnid"].values
+    labels: Any = own.custom_attributes["mujoco:joint_dof_label"].values or {}
+    dofs = {label: dof for dof, label in labels.items()}
+    for actuator, target in enumerate(rows or ()):
+        own.custom_attributes["mujoco:ctrl_source"].values[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
+        label = actuator_value(own, "actuator_target_label", actuator)
+        if int(target[0]) < 0 and label in dofs:  # a USD file's: the label would not say of which of two equal robots
+            rows[actuator] = wp.vec2i(dofs[label], 0)
+    actuation.register(own)
+    for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():
+        own.custom_attributes[f"muster:{name}"].values = [default] * len(rows or ())

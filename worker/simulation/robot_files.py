@@ -1,0 +1,185 @@
+"""Robot files: where they are, which format they have, and what is missing before an importer reads them."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import newton.examples
+
+from shared_store.wording import nearest
+
+FORMATS = {".xml": "", ".mjcf": "mjcf", ".urdf": "urdf", ".usd": "usd", ".usda": "usd", ".usdc": "usd", ".usdz": "usd"}
+"""Format of a file by its ending; an ``.xml`` says it in its first element."""
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """A file that an importer can read.
+
+    Attributes:
+        source: Path, or the XML itself.
+        format: ``"mjcf"``, ``"urdf"`` or ``"usd"``.
+        hinges: Names of the joints between one body and its parent, where MJCF has several: Newton makes one joint of them.
+            By the name that Newton gives to that joint, in the order of its degrees of freedom.
+    """
+
+    source: str
+    format: str
+    hinges: dict[str, list[str]]
+
+
+def read(file: str | Path) -> RobotFile:
+    """Find a robot's file and look into it.
+
+    Args:
+        file: A path; ``"package:NAME/path"``, a file inside an installed Python package, which is not imported;
+            ``"newton:NAME"``, one of Newton's own assets; or the text of an MJCF or URDF file.
+
+    Raises:
+        ValueError: The file, the package or the asset does not exist, the format is unknown, the XML can't be read, or a mesh that
+            it names is missing.
+    """
+    text = str(file)
+    if text.lstrip().startswith("<"):
+        source, kind = text, _kind_of_xml(text, "the robot's XML")
+    else:
+        path = _path(text)
+        source = str(path)
+        if path.suffix.lower() not in FORMATS:
+            raise ValueError(
+                f"{text}: a robot's file ends in {', '.join(FORMATS)}, not in {path.suffix or 'nothing'!r}"
+            )
+        kind = FORMATS[path.suffix.lower()] or _kind_of_xml(path.read_text(encoding="utf-8"), text)
+    shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
+    hinges: dict[str, list[str]] = {}
+    if kind == "mjcf":
+        spec = _parse_mjcf(source, shown)
+        _check_mjcf_assets(spec, shown)
+        hinges = _hinges(spec)
+    elif kind == "urdf":
+        _check_urdf_meshes(source, shown)
+    return RobotFile(source, kind, hinges)
+
+
+def _path(file: str) -> Path:
+    scheme, _, rest = file.partition(":")
+    if scheme == "package":
+        return _in_package(file, rest)
+    if scheme == "newton":
+        return _in_folder(file, Path(newton.examples.get_asset_directory()), rest, "Newton's assets")
+    path = Path(file).expanduser()
+    if not path.parent.is_dir():
+        raise ValueError(f"{file}: there is no folder {path.parent}; relative paths begin at {Path.cwd()}")
+    return _in_folder(file, path.parent, path.name, str(path.parent))
+
+
+def _in_package(file: str, rest: str) -> Path:
+    package, _, inside = rest.partition("/")
+    found = importlib.util.find_spec(package) if package.isidentifier() else None
+    if found is None or not found.submodule_search_locations:
+        known = [name for name in metadata.packages_distributions() if not name.startswith("_")]
+        near = nearest(package, known, "install it in the workers' environment", cutoff=0.7)
+        raise ValueError(f"{file}: there is no Python package {package!r}; {near}")
+    return _in_folder(file, Path(next(iter(found.submodule_search_locations))), inside, f"the package {package}")
+
+
+def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
+    path = folder / name
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise ValueError(
+            f"{file}: is a folder; name a robot's file in it ({', '.join(_files(path)) or 'there is none'})"
+        )
+    parent = path.parent
+    if not parent.is_dir():
+        whole = sorted(str(item.relative_to(folder)) for item in folder.rglob("*") if item.suffix in FORMATS)
+        raise ValueError(
+            f"{file}: there is no folder {parent.name!r} in {where}; {nearest(name, whole, 'look for it')}"
+        )
+    raise ValueError(f"{file}: there is no such file in {where}; {nearest(path.name, _files(parent))}")
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(item.name for item in folder.iterdir() if item.suffix.lower() in FORMATS)
+
+
+def _kind_of_xml(text: str, shown: str) -> str:
+    try:
+        root = ElementTree.fromstring(text).tag
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{shown}: is not XML: {error}") from error
+    kinds = {"mujoco": "mjcf", "mujocoinclude": "mjcf", "robot": "urdf"}
+    if root not in kinds:
+        raise ValueError(f"{shown}: its first element is <{root}>; MJCF begins with <mujoco>, URDF with <robot>")
+    return kinds[root]
+
+
+def _parse_mjcf(source: str, shown: str) -> Any:
+    parse = mujoco.MjSpec.from_string if source.lstrip().startswith("<") else mujoco.MjSpec.from_file
+    try:
+        return parse(source)
+    except ValueError as error:
+        raise ValueError(f"{shown}: {' '.join(str(error).split())}") from error
+
+
+def _check_mjcf_assets(spec: Any, shown: str) -> None:
+    """Newton leaves out a mesh that it can't find; its robot would be another one."""
+    folders = [(spec.meshdir, mesh.file) for mesh in spec.meshes]
+    folders += [(spec.meshdir, field.file) for field in spec.hfields]
+    for folder, name in folders:
+        if name and not (Path(spec.modelfiledir) / folder / name).is_file():
+            _refuse_mesh(shown, name, Path(spec.modelfiledir) / folder)
+
+
+def _check_urdf_meshes(source: str, shown: str) -> None:
+    """Newton warns of a mesh that it can't find, and goes on without it."""
+    is_text = source.lstrip().startswith("<")
+    root = ElementTree.fromstring(source if is_text else Path(source).read_text(encoding="utf-8"))
+    folder = Path(source).resolve().parent if not is_text else Path()
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if is_text:
+            raise ValueError(
+                f"{shown}: it names the mesh {name}, whose place is known of a file alone; give the path of the URDF file"
+            )
+        scheme, is_uri, inside = name.partition("://")
+        place = folder / name.removeprefix("file://")
+        if scheme == "package" and is_uri:
+            package = inside.partition("/")[0]
+            above = next((base for base in (folder, *folder.parents) if base.name == package), None)
+            if above is None:
+                raise ValueError(
+                    f"{shown}: its mesh {name} is of the package {package}, but no folder above the file has that name"
+                )
+            place = above.parent / inside
+        if not place.is_file():
+            _refuse_mesh(shown, name, place.parent)
+
+
+def _refuse_mesh(shown: str, name: str, folder: Path) -> None:
+    there = sorted(item.name for item in folder.iterdir() if item.is_file()) if folder.is_dir() else []
+    near = nearest(Path(name).name, there, "put it there") if there else "that folder does not exist or is empty"
+    raise ValueError(f"{shown}: its mesh {name} is missing in {folder}; {near}")
+
+
+def _hinges(spec: Any) -> dict[str, list[str]]:
+    """Newton's joint holds slides first, then hinges, and is called by all their names."""
+    hinges = {}
+    one_dof = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+    for body in spec.bodies:
+        names = [
+            (joint.type, re.sub(r"[^\w]", "_", joint.name or f"{body.name}_joint_{index}"))
+            for index, joint in enumerate(body.joints)
+        ]
+        if len(names) > 1 and all(kind in one_dof for kind, _ in names):
+            slides = [name for kind, name in names if kind == one_dof[0]]
+            hinges["_".join(name for _, name in names)] = slides + [name for kind, name in names if kind == one_dof[1]]
+    return hinges

@@ -1,0 +1,248 @@
+"""What of a world belongs to one robot or object: its joints, bodies, sites and geoms by name, and their columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from shared_store.wording import nearest
+from worker.simulation.patterns import find
+from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.worlds import Worlds
+
+UNLIMITED_EFFORT = 1e6
+"""From this on an effort limit of Newton's builder means that there is none (its default) [N, N m]."""
+
+Patterns = str | Iterable[str]
+
+
+class RobotView:
+    """A robot or object in a builder of one world, before it is replicated.
+
+    Labels of what belongs to it begin with its name and a slash, as ``Robot.add_to`` and the objects' ``add_to`` make them.
+
+    Args:
+        template: Builder holding one world.
+        name: Name of the robot or object; "" for all that there is.
+
+    Raises:
+        ValueError: Nothing in the world has this name.
+
+    Attributes:
+        joint_names: Joints of one degree of freedom, as in the file; a joint of several counts as so many.
+        body_names: Bodies, as in the file.
+        site_names: Sites, as in the file.
+        geom_names: Geoms that aren't sites, those that are only seen included. Formats without names of geoms have numbered ones.
+        coordinates: Column of each joint in ``WorldArrays.joint_q``.
+        dofs: Column of each joint in ``WorldArrays.joint_qd`` and ``drives``.
+        actuators: Column of each joint's actuator in ``WorldArrays.controls``, -1 where it has none.
+        defaults: Default position of each joint [m, rad].
+        ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
+        efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
+        bodies: Column of each body in ``BodyArrays``.
+        sites: Index of each site among the shapes of a world.
+        site_bodies: Column of the body that each site is on; -1: it is on the world.
+        site_poses: Pose of each site in its body's frame [m, quaternion xyzw].
+        geoms: Index of each geom among the shapes of a world.
+        geom_bodies: Column of the body that each geom is on; -1: it is on the world.
+        root_coordinate: First column of the free root in ``joint_q``; -1: it is fixed.
+        root_dof: First column of the free root in ``joint_qd``; -1: it is fixed.
+        root_body: Column of its first body.
+        start: Pose of the root at the start, in the world frame.
+    """
+
+    def __init__(self, template: newton.ModelBuilder, name: str = "robot") -> None:
+        self.name = name
+        self._prefix = f"{name}/" if name else ""
+        self.bodies = self._mine(template.body_label)
+        if not self.bodies:
+            there = sorted({label.partition("/")[0] for label in template.body_label})
+            raise ValueError(f"the world has no robot or object {name!r}; {nearest(name, there)}")
+        self.body_names = [_short(template.body_label[body]) for body in self.bodies]
+        self._read_joints(template)
+        self._read_shapes(template)
+
+    def _mine(self, labels: list[str]) -> list[int]:
+        return [index for index, label in enumerate(labels) if label.startswith(self._prefix)]
+
+    def _read_joints(self, template: newton.ModelBuilder) -> None:
+        self.joint_names: list[str] = []
+        self.coordinates: list[int] = []
+        self.dofs: list[int] = []
+        self.root_coordinate = self.root_dof = -1
+        self.root_body = self.bodies[0]
+        self.start = wp.transform(*template.body_q[self.root_body])
+        for joint in self._mine(template.joint_label):
+            first, dof = template.joint_q_start[joint], template.joint_qd_start[joint]
+            if template.joint_type[joint] == newton.JointType.FREE:
+                if template.joint_child[joint] == self.root_body:
+                    self.root_coordinate, self.root_dof = first, dof
+                    self.start = wp.transform(*template.joint_q[first : first + 7])
+                continue
+            if template.joint_type[joint] == newton.JointType.BALL:
+                continue  # four coordinates to three degrees of freedom: none of them is a joint of its own
+            for axis, joint_name in enumerate(dof_names(template, joint)):
+                self.joint_names.append(joint_name)
+                self.coordinates.append(first + axis)
+                self.dofs.append(dof + axis)
+        self.defaults = [float(template.joint_q[column]) for column in self.coordinates]
+        self.ranges = [
+            (_limit(template.joint_limit_lower[dof], -1), _limit(template.joint_limit_upper[dof], 1))
+            for dof in self.dofs
+        ]
+        columns = _actuators_of_dofs(template)
+        self.actuators = [columns.get(dof, -1) for dof in self.dofs]
+        self.efforts = [
+            _effort(template, dof, actuator) for dof, actuator in zip(self.dofs, self.actuators, strict=True)
+        ]
+
+    def _read_shapes(self, template: newton.ModelBuilder) -> None:
+        mine = self._mine(template.shape_label)
+        self.sites = [shape for shape in mine if template.shape_flags[shape] & newton.ShapeFlags.SITE]
+        self.geoms = [shape for shape in mine if not template.shape_flags[shape] & newton.ShapeFlags.SITE]
+        self.site_names = [_short(template.shape_label[shape]) for shape in self.sites]
+        self.geom_names = [_short(template.shape_label[shape]) for shape in self.geoms]
+        self.site_bodies = [template.shape_body[shape] for shape in self.sites]
+        self.geom_bodies = [template.shape_body[shape] for shape in self.geoms]
+        self.site_poses = [wp.transform(*template.shape_transform[shape]) for shape in self.sites]
+
+    def find_joints(self, patterns: Patterns) -> list[int]:
+        """Indices into :attr:`joint_names`, in the model's order. Raises ValueError where a pattern matches nothing."""
+        return find(self.joint_names, patterns, f"joint of {self.name}")
+
+    def find_bodies(self, patterns: Patterns) -> list[int]:
+        """Indices into :attr:`body_names`, in the model's order. Raises ValueError where a pattern matches nothing."""
+        return find(self.body_names, patterns, f"body of {self.name}")
+
+    def find_sites(self, patterns: Patterns) -> list[int]:
+        """Indices into :attr:`site_names`, in the model's order. Raises ValueError where a pattern matches nothing."""
+        return find(self.site_names, patterns, f"site of {self.name}")
+
+    def find_geoms(self, patterns: Patterns) -> list[int]:
+        """Indices into :attr:`geom_names`, in the model's order. Raises ValueError where a pattern matches nothing."""
+        return find(self.geom_names, patterns, f"geom of {self.name}")
+
+    def need_ranges(self, joints: Iterable[int], purpose: str) -> None:
+        """Refuse joints without limits.
+
+        Args:
+            joints: Indices into :attr:`joint_names`.
+            purpose: What needs them, for the error: ``"reward joint_limits"``.
+
+        Raises:
+            ValueError: A joint has no lower or no upper limit.
+        """
+        missing = [joint for joint in joints if not all(map(math.isfinite, self.ranges[joint]))]
+        self._refuse(missing, purpose, "limits of its position", "give it a range in the robot's file, or leave it out")
+
+    def need_efforts(self, joints: Iterable[int], purpose: str) -> None:
+        """Refuse joints whose actuator is missing or not limited, as :meth:`need_ranges` those without limits."""
+        joints = list(joints)
+        undriven = [joint for joint in joints if self.actuators[joint] < 0]
+        self._refuse(undriven, purpose, "an actuator", "declare one, or leave it out")
+        missing = [joint for joint in joints if not math.isfinite(self.efforts[joint])]
+        self._refuse(missing, purpose, "a limit of its force", "give its actuator an effort_limit, or leave it out")
+
+    def _refuse(self, joints: list[int], purpose: str, lacking: str, remedy: str) -> None:
+        if joints:
+            having = [name for joint, name in enumerate(self.joint_names) if joint not in joints]
+            raise ValueError(
+                f"{purpose} needs {lacking}, which the joint {self.joint_names[joints[0]]} of {self.name} has not; {remedy} "
+                f"(joints of {self.name} beside {', '.join(self.joint_names[joint] for joint in joints)}: {', '.join(having) or 'none'})"
+            )
+
+    def arrays(self, worlds: Worlds) -> RobotArrays:
+        """The robot as kernels see it, on the device of ``worlds``, which were built from this view's template."""
+        device = worlds.model.device
+        arrays = RobotArrays()
+        arrays.root_coordinate, arrays.root_dof, arrays.root_body = self.root_coordinate, self.root_dof, self.root_body
+        arrays.start = self.start
+        for name in ("coordinates", "dofs", "actuators"):
+            setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.int32, device=device))
+        for name in ("defaults", "efforts"):
+            setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.float32, device=device))
+        ranges = np.array(self.ranges, np.float32).reshape(-1, 2)
+        arrays.ranges = wp.array(ranges, dtype=wp.vec2, device=device)
+        arrays.encoder_bias = wp.zeros((worlds.world_count, len(self.joint_names)), dtype=wp.float32, device=device)
+        return arrays
+
+
+def body_arrays(worlds: Worlds) -> BodyArrays:
+    """Poses, velocities and centres of mass of all bodies: views of ``worlds``, current after ``worlds.update_bodies``."""
+    shape = (worlds.world_count, worlds.model.body_count // worlds.world_count)
+    arrays = BodyArrays()
+    arrays.poses = worlds.state.body_q.reshape(shape)
+    arrays.velocities = worlds.state.body_qd.reshape(shape)
+    arrays.coms = worlds.model.body_com.reshape(shape)
+    return arrays
+
+
+def dof_names(template: newton.ModelBuilder, joint: int) -> list[str]:
+    """A name for each degree of freedom of a joint: Newton makes one joint of all hinges between two bodies.
+
+    ``Robot.add_to`` writes the names of such hinges to MuJoCo's ``joint_dof_label``; where nobody did, they are numbered.
+    """
+    short, count = _short(template.joint_label[joint]), sum(template.joint_dof_dim[joint])
+    if count == 1:
+        return [short]
+    labels: Any = template.custom_attributes["mujoco:joint_dof_label"].values or {}
+    first = template.joint_qd_start[joint]
+    return [_short(labels[dof]) if labels.get(dof) else f"{short}_{dof - first}" for dof in range(first, first + count)]
+
+
+def actuator_value(template: newton.ModelBuilder, attribute: str, actuator: int) -> Any:
+    """One of the builder's ``mujoco:actuator_...`` values, or its default where the file didn't give it."""
+    attributes = template.custom_attributes[f"mujoco:{attribute}"]
+    values: Any = attributes.values
+    value = values.get(actuator) if isinstance(values, dict) else values[actuator] if values else None
+    return attributes.default if value is None else value
+
+
+def _actuators_of_dofs(template: newton.ModelBuilder) -> dict[int, int]:
+    """The first actuator on each degree of freedom that a joint transmits to; the others are not reached by its name."""
+    columns: dict[int, int] = {}
+    labels: Any = template.custom_attributes["mujoco:joint_dof_label"].values or {}
+    dofs_of_labels = {label: dof for dof, label in labels.items()}
+    joint_like = (int(SolverMuJoCo.TrnType.JOINT), int(SolverMuJoCo.TrnType.JOINT_IN_PARENT))
+    for actuator in range(len(template.custom_attributes["mujoco:actuator_trnid"].values or ())):
+        if int(actuator_value(template, "actuator_trntype", actuator)) not in joint_like:
+            continue
+        dof = int(actuator_value(template, "actuator_trnid", actuator)[0])
+        if dof < 0:
+            dof = dofs_of_labels.get(actuator_value(template, "actuator_target_label", actuator), -1)
+        columns.setdefault(dof, actuator)
+    return columns
+
+
+def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
+    """The least of what limits an actuator: its own range, the range of a motor's input, and the joint's."""
+    joint_limit = float(template.joint_effort_limit[dof])
+    limits = [joint_limit if joint_limit < UNLIMITED_EFFORT else math.inf]
+    if actuator >= 0:
+        gear = abs(float(actuator_value(template, "actuator_gear", actuator)[0]))
+        if _is_limited(template, "force", actuator):
+            limits.append(gear * max(map(abs, actuator_value(template, "actuator_forcerange", actuator))))
+        if not int(actuator_value(template, "actuator_biastype", actuator)) and _is_limited(template, "ctrl", actuator):
+            gain = abs(float(actuator_value(template, "actuator_gainprm", actuator)[0]))
+            limits.append(gear * gain * max(map(abs, actuator_value(template, "actuator_ctrlrange", actuator))))
+    return float(min(limits))
+
+
+def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:
+    """MuJoCo's rule: yes, no, or (2) yes where a range is given."""
+    limited = int(actuator_value(template, f"actuator_{what}limited", actuator))
+    return bool(actuator_value(template, f"actuator_has_{what}range", actuator)) if limited == 2 else limited == 1
+
+
+def _limit(value: float, sign: int) -> float:
+    return sign * math.inf if abs(value) >= newton.MAXVAL else float(value)
+
+
+def _short(label: str) -> str:
+    return label.rpartition("/")[2]

@@ -1,0 +1,349 @@
+"""Contacts of bodies or geoms: forces, how long they last, how hard they were within a control step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import mujoco
+import torch
+import warp as wp
+
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.contact_rows import ContactRows, contact_rows
+from worker.simulation.sensors.places import place_names
+from worker.simulation.sensors.sensor import SensorContext, views_of
+
+wp.set_module_options({"enable_backward": False})
+
+_PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
+
+
+@wp.struct
+class ContactArrays:
+    """What a contact sensor measured last, one row a world, one column a body or geom.
+
+    Attributes:
+        found: Contacts in the last physics step, shape ``(worlds, columns)``.
+        forces: Sum of the contact forces on the body or geom in the last physics step, in the world frame [N], shape
+            ``(worlds, columns)``. Forces between two geoms of one column cancel.
+        air_time: For how long it has been without contact, 0 while it has one [s], shape ``(worlds, columns)``.
+        contact_time: For how long it has been in contact, 0 while it is not [s], shape ``(worlds, columns)``.
+        last_air_time: How long its last time without contact was, up to the end of the step in which contact came [s], shape
+            ``(worlds, columns)``; 0 until there was one in this episode.
+        last_contact_time: The same of its last contact [s], shape ``(worlds, columns)``.
+        peaks: Greatest norm of ``forces`` in the physics steps of ``history`` [N], shape ``(worlds, columns)``.
+        history: Norm of the strongest single contact in each of the last physics steps [N], the last one first, shape
+            ``(worlds, columns, steps)``: those of one control step where the sensor is ``fine``, else the last one alone.
+        step: Time between two measurements [s]: a physics step where the sensor is ``fine``, else a control step.
+        seconds: Length of a control step [s].
+    """
+
+    found: wp.array2d(dtype=wp.int32)
+    forces: wp.array2d(dtype=wp.vec3)
+    air_time: wp.array2d(dtype=wp.float32)
+    contact_time: wp.array2d(dtype=wp.float32)
+    last_air_time: wp.array2d(dtype=wp.float32)
+    last_contact_time: wp.array2d(dtype=wp.float32)
+    peaks: wp.array2d(dtype=wp.float32)
+    history: wp.array3d(dtype=wp.float32)
+    step: float
+    seconds: float
+
+
+@wp.func
+def first_contact(contacts: ContactArrays, world: int, column: int) -> bool:
+    """Whether a contact that still lasts began within the last control step."""
+    time = contacts.contact_time[world, column]
+    return time > 0.0 and time < contacts.seconds + 0.5 * contacts.step
+
+
+@wp.func
+def first_air(contacts: ContactArrays, world: int, column: int) -> bool:
+    """Whether contact was lost within the last control step, and has not come back."""
+    time = contacts.air_time[world, column]
+    return time > 0.0 and time < contacts.seconds + 0.5 * contacts.step
+
+
+@wp.func
+def strongest_contact(contacts: ContactArrays, world: int, column: int) -> float:
+    """Norm of the strongest single contact in ``history`` [N]."""
+    strongest = float(0.0)
+    for step in range(contacts.history.shape[2]):
+        strongest = wp.max(strongest, contacts.history[world, column, step])
+    return strongest
+
+
+@wp.func
+def steps_above(contacts: ContactArrays, world: int, column: int, force: float) -> int:
+    """In how many physics steps of ``history`` a single contact was stronger than ``force`` [N]."""
+    steps = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
+    for step in range(contacts.history.shape[2]):
+        if contacts.history[world, column, step] > force:
+            steps = steps + 1
+    return steps
+
+
+@wp.struct
+class _Solved:
+    """The solver's contacts of one physics step, those of all worlds in one list, as in ``mujoco_warp.Data.contact``."""
+
+    cone: int
+    rows: int
+    count: wp.array(dtype=wp.int32)
+    worlds: wp.array(dtype=wp.int32)
+    geoms: wp.array(dtype=wp.vec2i)
+    dims: wp.array(dtype=wp.int32)
+    frames: wp.array(dtype=wp.mat33)
+    friction: wp.array2d(dtype=wp.float32)
+    adhesion: wp.array(dtype=wp.float32)
+    addresses: wp.array2d(dtype=wp.int32)
+    forces: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class _Sums:
+    """The contacts of one physics step summed up, shape ``(worlds, columns)``; cleared by the kernel that reads them."""
+
+    found: wp.array2d(dtype=wp.int32)
+    forces: wp.array2d(dtype=wp.vec3)
+    strongest: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def _constraint_force(solved: _Solved, world: int, address: int) -> float:
+    """Force of one row of constraints; rows beyond the solver's memory were dropped."""
+    if address < 0 or address >= solved.rows:
+        return 0.0
+    return solved.forces[world, address]
+
+
+@wp.func
+def _contact_force(solved: _Solved, contact: int, world: int) -> wp.vec3:
+    """Force of a contact on its second geom, in the world frame [N]; ``mj_contactForce`` of MuJoCo without the torque.
+
+    An elliptic cone has one row of constraints for each direction. A pyramid has two edges for each direction of friction,
+    n + mu t and n - mu t, and the force is the sum over the edges.
+    """
+    force = wp.vec3(0.0, 0.0, 0.0)
+    dim = solved.dims[contact]
+    if dim == 1 or solved.cone != _PYRAMIDAL:
+        for axis in range(wp.min(dim, 3)):
+            force[axis] = _constraint_force(solved, world, solved.addresses[contact, axis])
+    else:
+        for edge in range(dim - 1):
+            address = solved.addresses[contact, 0] + 2 * edge
+            plus = _constraint_force(solved, world, address)
+            minus = _constraint_force(solved, world, address + 1)
+            force[0] = force[0] + plus + minus
+            if edge < 2:
+                force[edge + 1] = solved.friction[contact, edge] * (plus - minus)
+    force[0] = force[0] - solved.adhesion[contact]
+    return wp.transpose(solved.frames[contact]) * force
+
+
+@wp.func
+def _add(sums: _Sums, world: int, column: int, force: wp.vec3, strength: float):
+    wp.atomic_add(sums.found, world, column, 1)
+    wp.atomic_add(sums.forces, world, column, force)
+    wp.atomic_max(sums.strongest, world, column, strength)
+
+
+@wp.kernel
+def _gather(solved: _Solved, columns: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32), sums: _Sums):
+    """Sum one contact up for the geoms that have a column, if the other geom is one of ``others``."""
+    contact = wp.tid()
+    if contact >= solved.count[0] or solved.addresses[contact, 0] < 0:
+        return
+    pair = solved.geoms[contact]
+    if pair[0] < 0 or pair[1] < 0:
+        return
+    first = columns[pair[0]]
+    second = columns[pair[1]]
+    if others[pair[1]] == 0:
+        first = -1
+    if others[pair[0]] == 0:
+        second = -1
+    if first < 0 and second < 0:
+        return
+    world = solved.worlds[contact]
+    force = _contact_force(solved, contact, world)
+    strength = wp.length(force)
+    if first == second:
+        _add(sums, world, first, wp.vec3(0.0, 0.0, 0.0), strength)
+        return
+    if first >= 0:
+        _add(sums, world, first, -force, strength)
+    if second >= 0:
+        _add(sums, world, second, force, strength)
+
+
+@wp.kernel
+def _measure(sums: _Sums, contacts: ContactArrays, norms: wp.array3d(dtype=wp.float32)):
+    """What the contacts of one physics step mean for one column; ``norms`` is the past of the net force."""
+    world, column = wp.tid()
+    found = sums.found[world, column]
+    force = sums.forces[world, column]
+    strongest = sums.strongest[world, column]
+    sums.found[world, column] = 0
+    sums.forces[world, column] = wp.vec3(0.0, 0.0, 0.0)
+    sums.strongest[world, column] = 0.0
+
+    contacts.found[world, column] = found
+    contacts.forces[world, column] = force
+    peak = wp.length(force)
+    steps = contacts.history.shape[2]
+    for back in range(steps - 1):
+        slot = steps - 1 - back
+        contacts.history[world, column, slot] = contacts.history[world, column, slot - 1]
+        norms[world, column, slot] = norms[world, column, slot - 1]
+        peak = wp.max(peak, norms[world, column, slot])
+    contacts.history[world, column, 0] = strongest
+    norms[world, column, 0] = wp.length(force)
+    contacts.peaks[world, column] = peak
+
+    air = contacts.air_time[world, column]
+    touch = contacts.contact_time[world, column]
+    if found > 0:
+        if air > 0.0:
+            contacts.last_air_time[world, column] = air + contacts.step
+        contacts.air_time[world, column] = 0.0
+        contacts.contact_time[world, column] = touch + contacts.step
+    else:
+        if touch > 0.0:
+            contacts.last_contact_time[world, column] = touch + contacts.step
+        contacts.contact_time[world, column] = 0.0
+        contacts.air_time[world, column] = air + contacts.step
+
+
+@wp.kernel
+def _forget(ages: wp.array(dtype=wp.int32), contacts: ContactArrays, norms: wp.array3d(dtype=wp.float32)):
+    """Clear a column of a world that was placed afresh."""
+    world, column = wp.tid()
+    if ages[world] != 0:
+        return
+    contacts.found[world, column] = 0
+    contacts.forces[world, column] = wp.vec3(0.0, 0.0, 0.0)
+    contacts.air_time[world, column] = 0.0
+    contacts.contact_time[world, column] = 0.0
+    contacts.last_air_time[world, column] = 0.0
+    contacts.last_contact_time[world, column] = 0.0
+    contacts.peaks[world, column] = 0.0
+    for step in range(norms.shape[2]):
+        contacts.history[world, column, step] = 0.0
+        norms[world, column, step] = 0.0
+
+
+@dataclass(frozen=True)
+class ContactSensor:
+    """Contacts of bodies or of geoms with the ground, a robot, an object or anything.
+
+    Attributes:
+        bodies: Pattern or patterns of the bodies that are measured, each a column; all geoms of a body count. Give this or ``geoms``.
+        geoms: Pattern or patterns of the geoms that are measured, each a column. What can't collide is left out of a pattern.
+        robot: Whose bodies or geoms they are.
+        against: What they must touch to count: ``"ground"`` (what is fixed to the world and belongs to no robot or object, and planes),
+            the name of a robot or object (that of ``robot``: contacts of the robot with itself), or None: anything.
+        fine: Whether every physics step is measured, and not the last of a control step alone: times are exact to a physics step, and
+            ``history`` and ``peaks`` cover a control step. It costs two launches a physics step instead of a control step.
+        together: Whether all that is measured is one column, named after the robot.
+    """
+
+    bodies: str | Sequence[str] | None = None
+    geoms: str | Sequence[str] | None = None
+    robot: str = "robot"
+    against: str | None = "ground"
+    fine: bool = False
+    together: bool = False
+    arrays_type: ClassVar[Any] = ContactArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
+        if self.together:
+            return [self.robot]
+        return place_names(views, "ContactSensor", self.robot, bodies=self.bodies, geoms=self.geoms)
+
+    def build(self, context: SensorContext) -> Contacts:
+        """The sensor of these worlds.
+
+        Raises:
+            ValueError: Neither or both of ``bodies`` and ``geoms`` are given, a pattern or a name matches nothing that can
+                collide, or the solver computes no contacts.
+        """
+        if not context.worlds.solver.mjw_data.naconmax:
+            raise ValueError(
+                "ContactSensor: the solver computes no contacts; give solver_options nconmax and no disable_contacts"
+            )
+        return Contacts(contact_rows(self, context), self.fine, context)
+
+
+class Contacts:
+    """A :class:`ContactSensor` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        rows: Which geoms are measured against which.
+        fine: Whether every physics step is measured.
+        context: The worlds.
+    """
+
+    needs_bodies = False
+
+    def __init__(self, rows: ContactRows, fine: bool, context: SensorContext) -> None:
+        self.names = rows.names
+        self._fine, self._episodes, self._device = fine, context.episodes, context.device
+        worlds = context.worlds
+        self._shape = (worlds.world_count, len(rows.names))
+        self._columns = wp.array(rows.columns, dtype=wp.int32, device=self._device)
+        self._others = wp.array(rows.others, dtype=wp.int32, device=self._device)
+        steps = worlds.substeps if fine else 1
+        self.arrays = ContactArrays()
+        for name in ("air_time", "contact_time", "last_air_time", "last_contact_time", "peaks"):
+            setattr(self.arrays, name, context.array(self._shape, wp.float32))
+        self.arrays.history = context.array((*self._shape, steps), wp.float32)
+        self.arrays.seconds = 1.0 / context.control_hz
+        self.arrays.step = worlds.timestep if fine else self.arrays.seconds
+        self._norms = context.array((*self._shape, steps), wp.float32)
+        self._sums = _Sums()
+        for struct in (self.arrays, self._sums):
+            struct.found = context.array(self._shape, wp.int32)
+            struct.forces = context.array(self._shape, wp.vec3)
+        self._sums.strongest = context.array(self._shape, wp.float32)
+        self._solved = _solved(worlds.solver)
+        if fine:
+            worlds.after_substep.append(self._measure)
+
+    def advance(self) -> None:
+        """Measure the last physics step, unless each was measured when it was taken."""
+        if not self._fine:
+            self._measure()
+
+    def settle(self) -> None:
+        """Worlds that were placed afresh have had neither contact nor time in the air."""
+        inputs = [self._episodes.ages, self.arrays, self._norms]
+        wp.launch(_forget, dim=self._shape, inputs=inputs, device=self._device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Everything measured: the times go on from it, and what acts before the next physics reads it."""
+        times = ("air_time", "contact_time", "last_air_time", "last_contact_time")
+        tensors = views_of(self.arrays, "found", "forces", *times, "peaks", "history")
+        return tensors | {"norms": wp.to_torch(self._norms)}
+
+    def _measure(self) -> None:
+        count = self._solved.worlds.shape[0]
+        if count:
+            inputs = [self._solved, self._columns, self._others, self._sums]
+            wp.launch(_gather, dim=count, inputs=inputs, device=self._device)
+        wp.launch(_measure, dim=self._shape, inputs=[self._sums, self.arrays, self._norms], device=self._device)
+
+
+def _solved(solver: Any) -> _Solved:
+    """Views of the solver's own arrays, which stay where they are for ever."""
+    data, solved = solver.mjw_data, _Solved()
+    contact = data.contact
+    solved.cone, solved.rows = int(solver.mjw_model.opt.cone), int(data.njmax)
+    solved.count, solved.worlds, solved.geoms = data.nacon, contact.worldid, contact.geom
+    solved.dims, solved.frames, solved.adhesion = contact.dim, contact.frame, contact.adhesion
+    solved.friction = contact.friction.view(wp.float32).reshape((contact.friction.shape[0], -1))
+    solved.addresses, solved.forces = contact.efc_address, data.efc.force
+    return solved

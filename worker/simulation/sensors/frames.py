@@ -1,0 +1,150 @@
+"""Poses and velocities of bodies and sites, in the world's frame or in that of another body or site."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import warp as wp
+
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose, place_velocity
+from worker.simulation.sensors.sensor import SensorContext, views_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class FrameArrays:
+    """Where bodies or sites are and how they move, one row a world, one column a body or site.
+
+    Attributes:
+        positions: Of the origins [m], shape ``(worlds, columns)``.
+        rotations: From the body's or site's axes [quaternion xyzw], shape ``(worlds, columns)``.
+        linear: Velocities of the origins [m/s], shape ``(worlds, columns)``.
+        angular: Angular velocities [rad/s], shape ``(worlds, columns)``.
+    """
+
+    positions: wp.array2d(dtype=wp.vec3)
+    rotations: wp.array2d(dtype=wp.quat)
+    linear: wp.array2d(dtype=wp.vec3)
+    angular: wp.array2d(dtype=wp.vec3)
+
+
+@wp.kernel
+def _measure(
+    bodies: BodyArrays,
+    columns: wp.array(dtype=wp.int32),
+    locals: wp.array(dtype=wp.transform),
+    reference: int,
+    reference_local: wp.transform,
+    frames: FrameArrays,
+):
+    """One frame in one world. In a moving frame of reference velocities are as one who moves and turns with it sees them."""
+    world, column = wp.tid()
+    pose = place_pose(bodies, world, columns[column], locals[column])
+    position = wp.transform_get_translation(pose)
+    linear, angular = place_velocity(bodies, world, columns[column], position)
+
+    seen_from = place_pose(bodies, world, reference, reference_local)
+    origin = wp.transform_get_translation(seen_from)
+    turned = wp.transform_get_rotation(seen_from)
+    origin_linear, origin_angular = place_velocity(bodies, world, reference, origin)
+    offset = position - origin
+    frames.positions[world, column] = wp.quat_rotate_inv(turned, offset)
+    frames.rotations[world, column] = wp.quat_inverse(turned) * wp.transform_get_rotation(pose)
+    relative = linear - origin_linear - wp.cross(origin_angular, offset)
+    frames.linear[world, column] = wp.quat_rotate_inv(turned, relative)
+    frames.angular[world, column] = wp.quat_rotate_inv(turned, angular - origin_angular)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Poses and velocities of bodies or sites.
+
+    They are those of MuJoCo's ``framepos``, ``framequat``, ``framelinvel`` and ``frameangvel``, with and without a reference.
+
+    Attributes:
+        bodies: Pattern or patterns of the bodies, each a column. Give this or ``sites``.
+        sites: Pattern or patterns of the sites, each a column.
+        robot: Whose bodies or sites they are.
+        relative_to: Body in whose frame everything is told, seen by one who moves with it; None: the world's, unless
+            ``relative_to_site`` is given.
+        relative_to_site: The same of a site.
+        reference_robot: Whose body or site that is; None: ``robot``'s.
+    """
+
+    bodies: str | Sequence[str] | None = None
+    sites: str | Sequence[str] | None = None
+    robot: str = "robot"
+    relative_to: str | None = None
+    relative_to_site: str | None = None
+    reference_robot: str | None = None
+    arrays_type: ClassVar[Any] = FrameArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
+        return place_names(views, "Frames", self.robot, bodies=self.bodies, sites=self.sites)
+
+    def build(self, context: SensorContext) -> FrameSensor:
+        """The sensor of these worlds.
+
+        Raises:
+            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern or a name matches nothing, or the reference is not
+                one body or site.
+        """
+        places = find_places(context, "Frames", self.robot, self.bodies, self.sites)
+        return FrameSensor(places, self._reference(context), context)
+
+    def _reference(self, context: SensorContext) -> Place:
+        if self.relative_to is None and self.relative_to_site is None:
+            if self.reference_robot is not None:
+                raise ValueError(
+                    "Frames.reference_robot: name its body as relative_to, or its site as relative_to_site"
+                )
+            return Place("world", -1, wp.transform_identity())
+        if self.relative_to is not None and self.relative_to_site is not None:
+            raise ValueError("Frames: give either relative_to, a body, or relative_to_site, and not both")
+        owner = self.robot if self.reference_robot is None else self.reference_robot
+        found = find_places(context, "Frames.relative_to", owner, self.relative_to, self.relative_to_site)
+        return only_one(found, "Frames.relative_to")
+
+
+class FrameSensor:
+    """:class:`Frames` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        places: What is measured.
+        reference: In whose frame.
+        context: The worlds.
+    """
+
+    needs_bodies = True
+
+    def __init__(self, places: list[Place], reference: Place, context: SensorContext) -> None:
+        self.names = tuple(place.name for place in places)
+        self._bodies, self._device = context.bodies, context.device
+        self._shape = (context.worlds.world_count, len(places))
+        self._columns = wp.array([place.body for place in places], dtype=wp.int32, device=self._device)
+        self._locals = wp.array([place.pose for place in places], dtype=wp.transform, device=self._device)
+        self._reference = reference
+        self.arrays = FrameArrays()
+        for name in ("positions", "linear", "angular"):
+            setattr(self.arrays, name, context.array(self._shape, wp.vec3))
+        self.arrays.rotations = context.array(self._shape, wp.quat)
+
+    def advance(self) -> None:
+        """Measure the present poses and velocities."""
+        inputs = [self._bodies, self._columns, self._locals, self._reference.body, self._reference.pose, self.arrays]
+        wp.launch(_measure, dim=self._shape, inputs=inputs, device=self._device)
+
+    def settle(self) -> None:
+        """Measure again: worlds that were placed afresh are elsewhere."""
+        self.advance()
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Everything measured: what acts before the next physics reads it."""
+        return views_of(self.arrays, "positions", "rotations", "linear", "angular")

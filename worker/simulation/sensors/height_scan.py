@@ -1,0 +1,257 @@
+"""Heights of the ground around bodies or sites, on a pattern of points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import Place, find_places, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.terrain_arrays import TerrainArrays, flat_ground, ground_height
+
+wp.set_module_options({"enable_backward": False})
+
+ALIGNMENTS = ("yaw", "base", "world")
+_BASE = wp.constant(ALIGNMENTS.index("base"))
+_WORLD = wp.constant(ALIGNMENTS.index("world"))
+
+FEW_POINTS = 100_000
+"""More points than these are a mistake in the pattern's resolution."""
+
+
+@wp.struct
+class HeightScanArrays:
+    """The ground under the points of a scan, one row a world; all points of the first frame come first.
+
+    Attributes:
+        heights: Of the sensor's frame above the ground at each point [m], shape ``(worlds, points)``.
+        points: Of the ground, in the world's frame [m], shape ``(worlds, points)``.
+    """
+
+    heights: wp.array2d(dtype=wp.float32)
+    points: wp.array2d(dtype=wp.vec3)
+
+
+@wp.struct
+class _Scan:
+    bodies: wp.array(dtype=wp.int32)
+    locals: wp.array(dtype=wp.transform)
+    pattern: wp.array(dtype=wp.vec2)
+    alignment: int
+    farthest: float
+
+
+@wp.func
+def turned_by_yaw(rotation: wp.quat, point: wp.vec3) -> wp.vec3:
+    """A point turned about the vertical as a rotation turns the x axis, seen from above; a rotation that points x straight up turns nothing."""
+    forward = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))
+    length = wp.sqrt(forward[0] * forward[0] + forward[1] * forward[1])
+    cosine = float(1.0)
+    sine = float(0.0)
+    if length > 1.0e-6:
+        cosine = forward[0] / length
+        sine = forward[1] / length
+    return wp.vec3(cosine * point[0] - sine * point[1], sine * point[0] + cosine * point[1], point[2])
+
+
+@wp.kernel
+def _scan(
+    fresh_only: bool,
+    episodes: EpisodeArrays,
+    bodies: BodyArrays,
+    terrain: TerrainArrays,
+    scan: _Scan,
+    arrays: HeightScanArrays,
+):
+    """One point of one world."""
+    world, point = wp.tid()
+    if fresh_only and episodes.ages[world] != 0:
+        return
+    count = scan.pattern.shape[0]
+    frame = point // count
+    pose = place_pose(bodies, world, scan.bodies[frame], scan.locals[frame])
+    origin = wp.transform_get_translation(pose)
+    rotation = wp.transform_get_rotation(pose)
+    place = scan.pattern[point - frame * count]
+    offset = wp.vec3(place[0], place[1], 0.0)
+    if scan.alignment == _BASE:
+        offset = wp.quat_rotate(rotation, offset)
+    elif scan.alignment != _WORLD:
+        offset = turned_by_yaw(rotation, offset)
+    above = origin + offset
+    ground = ground_height(terrain, above[0], above[1])
+    arrays.heights[world, point] = wp.min(above[2] - ground, scan.farthest)
+    arrays.points[world, point] = wp.vec3(above[0], above[1], ground)
+
+
+@dataclass(frozen=True)
+class GridPattern:
+    """Points of a rectangle around the frame, row by row from behind on the right; in a row x grows.
+
+    Attributes:
+        size: Lengths of the rectangle along x (ahead) and y (to the left) [m].
+        resolution: Distance between neighbouring points [m].
+    """
+
+    size: tuple[float, float] = (1.6, 1.0)
+    resolution: float = 0.1
+
+    def points(self) -> np.ndarray:
+        """Places x and y relative to the frame [m], shape ``(points, 2)``.
+
+        Raises:
+            ValueError: A length is negative, the resolution is not positive, or there are too many points.
+        """
+        if not self.resolution > 0:
+            raise ValueError(f"GridPattern.resolution is {self.resolution}; use a number of metres > 0")
+        if not min(self.size) >= 0:
+            raise ValueError(f"GridPattern.size is {self.size}; use two lengths >= 0")
+        # from minus half a length on, as many steps as fit: the pattern of Isaac Lab and mjlab
+        counts = [math.floor(length / self.resolution + 1e-6) + 1 for length in self.size]
+        if math.prod(counts) > FEW_POINTS:
+            raise ValueError(
+                f"GridPattern has {math.prod(counts):,} points; use a resolution coarser than {self.resolution:g} m, or a smaller size"
+            )
+        x, y = (
+            -length / 2 + self.resolution * np.arange(count) for length, count in zip(self.size, counts, strict=True)
+        )
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class RingPattern:
+    """Points of a circle around the frame, the first ahead, then to the left.
+
+    Attributes:
+        radius: Of the circle [m].
+        count: Number of points on it.
+        center: Whether the frame's own place is a point too, the first.
+    """
+
+    radius: float
+    count: int = 4
+    center: bool = False
+
+    def points(self) -> np.ndarray:
+        """Places x and y relative to the frame [m], shape ``(points, 2)``.
+
+        Raises:
+            ValueError: The radius is negative, or there is no point.
+        """
+        if not self.radius >= 0 or not 1 <= self.count <= FEW_POINTS:
+            raise ValueError(
+                f"RingPattern has {self.count} points at {self.radius} m; use 1 to {FEW_POINTS:,} and a radius >= 0"
+            )
+        angles = 2 * np.pi * np.arange(self.count) / self.count
+        ring = self.radius * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+        return np.concatenate((np.zeros((1, 2)), ring)) if self.center else ring
+
+
+@dataclass(frozen=True)
+class HeightScan:
+    """How high frames on a robot are above the ground around them.
+
+    The heights are looked up in those of the terrain, exactly on the triangles that shapes collide with, which is what vertical rays
+    that see nothing but the ground would hit, at a small part of their cost. Without a terrain the ground is the plane z = 0.
+
+    Attributes:
+        bodies: Pattern or patterns of the bodies, each a frame. Give this or ``sites``.
+        sites: Pattern or patterns of the sites, each a frame.
+        robot: Whose bodies or sites they are.
+        pattern: Points around each frame.
+        alignment: What the pattern turns with: ``yaw``, with the frame about the vertical alone; ``base``, with the frame in all
+            axes, so that each height is from the tilted pattern straight down; ``world``, with nothing.
+        offset: Place of the sensor's frame in that of the body or site [m].
+        max_distance: Heights are at most this [m].
+    """
+
+    bodies: str | Sequence[str] | None = None
+    sites: str | Sequence[str] | None = None
+    robot: str = "robot"
+    pattern: GridPattern | RingPattern = GridPattern()
+    alignment: Literal["yaw", "base", "world"] = "yaw"
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    max_distance: float = 5.0
+    arrays_type: ClassVar[Any] = HeightScanArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
+        frames = place_names(views, "HeightScan", self.robot, bodies=self.bodies, sites=self.sites)
+        return [str(point) for point in range(len(frames) * len(self.pattern.points()))]
+
+    def build(self, context: SensorContext) -> HeightScanSensor:
+        """The sensor of these worlds.
+
+        Raises:
+            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern matches nothing, the alignment is none, or the
+                points can't be measured.
+        """
+        if self.alignment not in ALIGNMENTS:
+            raise ValueError(f"HeightScan.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
+        if not self.max_distance > 0:
+            raise ValueError(f"HeightScan.max_distance is {self.max_distance}; use a number of metres > 0")
+        places = find_places(context, "HeightScan", self.robot, self.bodies, self.sites)
+        return HeightScanSensor(self, places, context)
+
+
+class HeightScanSensor:
+    """:class:`HeightScan` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        declaration: What is measured.
+        places: Its frames.
+        context: The worlds.
+
+    Attributes:
+        names: Of each point: body or site, and its place in the pattern [m].
+    """
+
+    needs_bodies = True
+
+    def __init__(self, declaration: HeightScan, places: list[Place], context: SensorContext) -> None:
+        pattern = declaration.pattern.points()
+        self.names = tuple(f"{place.name} {x:+.2f} {y:+.2f}" for place in places for x, y in pattern)
+        self._context = context
+        self._shape = (context.worlds.world_count, len(self.names))
+        ground = context.worlds.ground
+        self._terrain = ground.arrays if ground else flat_ground(context.device)
+        offset = wp.transform(declaration.offset, wp.quat_identity())
+        frames = [wp.transform_multiply(place.pose, offset) for place in places]
+        scan = self._scan = _Scan()
+        scan.bodies = wp.array([place.body for place in places], dtype=wp.int32, device=context.device)
+        scan.locals = wp.array(frames, dtype=wp.transform, device=context.device)
+        scan.pattern = wp.array(pattern.astype(np.float32), dtype=wp.vec2, device=context.device)
+        scan.alignment = ALIGNMENTS.index(declaration.alignment)
+        scan.farthest = declaration.max_distance
+        self.arrays = HeightScanArrays()
+        self.arrays.heights = context.array(self._shape, wp.float32)
+        self.arrays.points = context.array(self._shape, wp.vec3)
+
+    def advance(self) -> None:
+        """Measure all worlds."""
+        self._launch(False)
+
+    def settle(self) -> None:
+        """Measure the worlds that were placed afresh, which are elsewhere."""
+        self._launch(True)
+
+    def _launch(self, fresh_only: bool) -> None:
+        wp.launch(
+            _scan,
+            dim=self._shape,
+            inputs=[fresh_only, self._context.episodes, self._context.bodies, self._terrain, self._scan, self.arrays],
+            device=self._context.device,
+        )
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Everything measured: what acts before the next physics reads it."""
+        return views_of(self.arrays, "heights", "points")

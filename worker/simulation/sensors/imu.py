@@ -1,0 +1,250 @@
+"""An inertial measurement unit: what gyro, accelerometer and velocimeter on a body say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose, place_velocity
+from worker.simulation.sensors.sensor import SensorContext, views_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class ImuArrays:
+    """What an inertial measurement unit measured last, one row a world, in its own frame.
+
+    Attributes:
+        gyro: Angular velocity [rad/s], shape ``(worlds,)``.
+        accelerometer: Acceleration less gravity, that of the last physics step [m/s^2], shape ``(worlds,)``; at rest it points up. A
+            world that was placed afresh counts as at rest until its first step.
+        velocimeter: Linear velocity [m/s], shape ``(worlds,)``.
+        rotations: From its frame to the world's [quaternion xyzw], shape ``(worlds,)``.
+    """
+
+    gyro: wp.array(dtype=wp.vec3)
+    accelerometer: wp.array(dtype=wp.vec3)
+    velocimeter: wp.array(dtype=wp.vec3)
+    rotations: wp.array(dtype=wp.quat)
+
+
+@wp.func
+def projected_gravity(imu: ImuArrays, world: int) -> wp.vec3:
+    """The direction of down in the frame of the unit, of length 1."""
+    return wp.quat_rotate_inv(imu.rotations[world], wp.vec3(0.0, 0.0, -1.0))
+
+
+@wp.struct
+class _Dynamics:
+    """The solver's kinematic tree and the motion of one physics step, named as in ``mujoco_warp.Model`` and ``Data``."""
+
+    timestep: float
+    gravity: wp.array(dtype=wp.vec3)
+    body_parentid: wp.array(dtype=wp.int32)
+    body_rootid: wp.array(dtype=wp.int32)
+    body_jntnum: wp.array(dtype=wp.int32)
+    body_dofnum: wp.array(dtype=wp.int32)
+    body_dofadr: wp.array(dtype=wp.int32)
+    xpos: wp.array2d(dtype=wp.vec3)
+    xmat: wp.array2d(dtype=wp.mat33)
+    subtree_com: wp.array2d(dtype=wp.vec3)
+    cvel: wp.array2d(dtype=wp.spatial_vector)
+    cdof: wp.array2d(dtype=wp.spatial_vector)
+    cdof_dot: wp.array2d(dtype=wp.spatial_vector)
+    qvel: wp.array2d(dtype=wp.float32)
+    qacc: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def _gravity(dynamics: _Dynamics, world: int) -> wp.vec3:
+    return dynamics.gravity[world % dynamics.gravity.shape[0]]
+
+
+@wp.func
+def _motion_cross(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spatial_vector:
+    """How ``motion`` changes in a frame that moves with ``velocity`` (Featherstone's cross product; angular part first)."""
+    turn = wp.spatial_top(velocity)
+    return wp.spatial_vector(
+        wp.cross(turn, wp.spatial_top(motion)),
+        wp.cross(turn, wp.spatial_bottom(motion)) + wp.cross(wp.spatial_bottom(velocity), wp.spatial_top(motion)),
+    )
+
+
+@wp.func
+def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vector:
+    """What a body accelerates beyond its parent though its joints don't: sum of d/dt(axis) times rate over its joints.
+
+    The rates are those before the step, which has overwritten them since: they are taken from the bodies' velocities. Several joints
+    on one body can't be told apart there, and their rates are calculated back from the acceleration.
+    """
+    first = dynamics.body_dofadr[body]
+    count = dynamics.body_dofnum[body]
+    bias = wp.spatial_vector()
+    if count == 0:
+        return bias
+    of_parent = dynamics.cvel[world, dynamics.body_parentid[body]]
+    if count == 1:
+        return _motion_cross(of_parent, dynamics.cvel[world, body])
+    turn = wp.spatial_top(dynamics.cvel[world, body]) - wp.spatial_top(of_parent)
+    for dof in range(first, first + count):
+        rate = dynamics.qvel[world, dof] - dynamics.timestep * dynamics.qacc[world, dof]
+        # a free or ball joint alone: its axes of rotation are at right angles, and those that shift have no bias
+        if dynamics.body_jntnum[body] == 1:
+            rate = wp.dot(wp.spatial_top(dynamics.cdof[world, dof]), turn)
+        bias = bias + rate * dynamics.cdof_dot[world, dof]
+    return bias
+
+
+@wp.kernel
+def _accelerate(dynamics: _Dynamics, chain: wp.array(dtype=wp.int32), local: wp.transform, imu: ImuArrays):
+    """What the accelerometer says of the last physics step: as ``mj_rnePostConstraint`` and ``mj_objectAcceleration`` of MuJoCo.
+
+    Everything is in the state before that step, about the centre of mass of the whole tree.
+    """
+    world = wp.tid()
+    acceleration = wp.spatial_vector(wp.vec3(0.0, 0.0, 0.0), -_gravity(dynamics, world))
+    for index in range(chain.shape[0]):
+        body = chain[index]
+        first = dynamics.body_dofadr[body]
+        for dof in range(first, first + dynamics.body_dofnum[body]):
+            acceleration = acceleration + dynamics.qacc[world, dof] * dynamics.cdof[world, dof]
+        acceleration = acceleration + _bias(dynamics, world, body)
+    body = chain[chain.shape[0] - 1]
+    turn = dynamics.xmat[world, body] * wp.quat_to_matrix(wp.transform_get_rotation(local))
+    position = dynamics.xpos[world, body] + dynamics.xmat[world, body] * wp.transform_get_translation(local)
+    arm = position - dynamics.subtree_com[world, dynamics.body_rootid[body]]
+    velocity = dynamics.cvel[world, body]
+    angular = wp.spatial_top(velocity)
+    linear = wp.spatial_bottom(velocity) + wp.cross(angular, arm)
+    here = wp.spatial_bottom(acceleration) + wp.cross(wp.spatial_top(acceleration), arm) + wp.cross(angular, linear)
+    imu.accelerometer[world] = wp.transpose(turn) * here
+
+
+@wp.kernel
+def _rest(ages: wp.array(dtype=wp.int32), dynamics: _Dynamics, imu: ImuArrays):
+    """What the accelerometer of a world that was placed afresh says."""
+    world = wp.tid()
+    if ages[world] == 0:
+        imu.accelerometer[world] = -wp.quat_rotate_inv(imu.rotations[world], _gravity(dynamics, world))
+
+
+@wp.kernel
+def _move(bodies: BodyArrays, body: int, local: wp.transform, imu: ImuArrays):
+    """What gyro and velocimeter say, and how the unit is turned, now."""
+    world = wp.tid()
+    pose = place_pose(bodies, world, body, local)
+    turn = wp.transform_get_rotation(pose)
+    linear, angular = place_velocity(bodies, world, body, wp.transform_get_translation(pose))
+    imu.rotations[world] = turn
+    imu.gyro[world] = wp.quat_rotate_inv(turn, angular)
+    imu.velocimeter[world] = wp.quat_rotate_inv(turn, linear)
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Gyro, accelerometer, velocimeter and orientation of a site or body, as MuJoCo's sensors define them.
+
+    Attributes:
+        site: The site on which it is. Give this or ``body``.
+        body: The body in whose origin it is.
+        robot: Whose site or body that is.
+    """
+
+    site: str | None = None
+    body: str | None = None
+    robot: str = "robot"
+    arrays_type: ClassVar[Any] = ImuArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
+        return place_names(views, "Imu", self.robot, bodies=self.body, sites=self.site)
+
+    def build(self, context: SensorContext) -> ImuSensor:
+        """The sensor of these worlds.
+
+        Raises:
+            ValueError: Neither or both of ``site`` and ``body`` are given, a name matches nothing or several, or what is named is fixed
+                to the world.
+        """
+        if (self.site is None) == (self.body is None):
+            raise ValueError("Imu: give either site or body, and not both")
+        place = only_one(find_places(context, "Imu", self.robot, self.body, self.site), "Imu")
+        return ImuSensor(place, context)
+
+
+class ImuSensor:
+    """An :class:`Imu` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        place: Where it is.
+        context: The worlds.
+
+    Raises:
+        ValueError: It is fixed to the world.
+    """
+
+    needs_bodies = True
+
+    def __init__(self, place: Place, context: SensorContext) -> None:
+        self.names = (place.name,)
+        self._place, self._bodies, self._device = place, context.bodies, context.device
+        self._episodes: EpisodeArrays = context.episodes
+        worlds = context.worlds
+        self._count = worlds.world_count
+        self._dynamics = _dynamics(worlds.solver, worlds.timestep)
+        self._chain = wp.array(_chain(place, worlds.solver), dtype=wp.int32, device=self._device)
+        self.arrays = ImuArrays()
+        for name in ("gyro", "accelerometer", "velocimeter"):
+            setattr(self.arrays, name, context.array((self._count,), wp.vec3))
+        self.arrays.rotations = context.array((self._count,), wp.quat)
+
+    def advance(self) -> None:
+        """Measure the present velocities, and the acceleration of the last physics step."""
+        self._move()
+        inputs = [self._dynamics, self._chain, self._place.pose, self.arrays]
+        wp.launch(_accelerate, dim=self._count, inputs=inputs, device=self._device)
+
+    def settle(self) -> None:
+        """Measure the velocities again; worlds that were placed afresh are at rest."""
+        self._move()
+        inputs = [self._episodes.ages, self._dynamics, self.arrays]
+        wp.launch(_rest, dim=self._count, inputs=inputs, device=self._device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Everything measured: what acts before the next physics reads it."""
+        return views_of(self.arrays, "gyro", "accelerometer", "velocimeter", "rotations")
+
+    def _move(self) -> None:
+        inputs = [self._bodies, self._place.body, self._place.pose, self.arrays]
+        wp.launch(_move, dim=self._count, inputs=inputs, device=self._device)
+
+
+def _dynamics(solver: Any, timestep: float) -> _Dynamics:
+    """Views of the solver's own arrays, which stay where they are for ever."""
+    model, data, dynamics = solver.mjw_model, solver.mjw_data, _Dynamics()
+    dynamics.timestep, dynamics.gravity = timestep, model.opt.gravity
+    for name in ("parentid", "rootid", "jntnum", "dofnum", "dofadr"):
+        setattr(dynamics, f"body_{name}", getattr(model, f"body_{name}"))
+    for name in ("xpos", "xmat", "subtree_com", "cvel", "cdof", "cdof_dot", "qvel", "qacc"):
+        setattr(dynamics, name, getattr(data, name))
+    return dynamics
+
+
+def _chain(place: Place, solver: Any) -> list[int]:
+    """The solver's bodies from the root of the tree to that of the place."""
+    columns = solver.mjc_body_to_newton.numpy()[0].tolist()
+    if place.body not in columns[1:]:
+        raise ValueError(f"Imu: {place.name} is fixed to the world, so that it never moves; name one on a moving body")
+    body, chain = columns.index(place.body, 1), []
+    while body:
+        chain.insert(0, body)
+        body = int(solver.mj_model.body_parentid[body])
+    return chain

@@ -1,0 +1,50 @@
+"""Whether the arguments of a task, and what it says of itself, can be right."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from worker.tasks.interface import Interface, Observation
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+
+def check_arguments(kind: type[Task], config: Any, world_count: int, seed: int, first_world: int) -> None:
+    """Raise ValueError of one sentence for an argument of a task that is not valid."""
+    task = kind.__name__
+    if not isinstance(config, kind.config_type):
+        raise ValueError(
+            f"task {task} takes a {kind.config_type.__name__}, not a {type(config).__name__}; "
+            f"make one with {kind.config_type.__name__}(...)"
+        )
+    if not kind.reward_terms:
+        raise ValueError(
+            f"task {task} has no reward terms; give {kind.config_type.__name__} a field "
+            "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
+        )
+    if world_count < 1:
+        raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
+    if first_world < 0:
+        raise ValueError(f"task {task}: first_world is {first_world}; use an index >= 0")
+    if seed < 0:
+        raise ValueError(f"task {task}: seed is {seed}; use an integer >= 0")
+
+
+def checked_interface(task: Task) -> Interface:
+    """The task's interface, or the names of its observations alone.
+
+    Raises:
+        ValueError: It is of other numbers than the task's, or in another order.
+    """
+    interface = task.interface() or Interface(tuple(map(Observation, task.observation_names)), ())
+    for what, declared, names in (
+        ("observations", interface.observations, task.observation_names),
+        ("actions", interface.actions, task.action_names),
+    ):
+        if declared and tuple(item.name for item in declared) != tuple(names):
+            raise ValueError(
+                f"task {type(task).__name__}: interface() has other {what} than the task, or in another order; "
+                f"they are {', '.join(names)}"
+            )
+    return interface

@@ -1,0 +1,116 @@
+"""The policy's contract that follows from a declaration: what each observation and each action means on a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from worker.tasks.declaration import Action as DeclaredAction
+from worker.tasks.declaration import Choice, Command
+from worker.tasks.interface import Action, Interface, Observation
+
+if TYPE_CHECKING:
+    from worker.tasks.plan import Column, Driven, Plan, Seen
+
+
+def contract(plan: Plan, model: Any) -> Interface:
+    """Observations and actions of the policy, in order.
+
+    Args:
+        plan: The task's.
+        model: MuJoCo's, of one world: gains and limits of the actuators are read from it.
+    """
+    observations = [
+        column for seen in plan.groups["policy"] for back in backs(seen) for column in described(plan, seen, back)
+    ]
+    if plan.choice:
+        assert isinstance(plan.choice.term, Choice)
+        actions = [Action(name, "choice", "1", scale=1.0, default_position=0.0) for name in plan.choice.term.names]
+    else:
+        actions = [action for driven in plan.driven for action in _actions(plan, driven, model)]
+    return Interface(tuple(observations), tuple(actions))
+
+
+def backs(seen: Seen) -> range:
+    """How many steps ago each part of a term's history is, the oldest first."""
+    return range(seen.term.history - 1, -1, -1)
+
+
+def described(plan: Plan, seen: Seen, back: int = 0) -> list[Observation]:
+    """What each column of a term is, of the present step or of ``back`` steps ago."""
+    term, names = seen.term, seen.names
+    units = [term.unit] * len(names) if isinstance(term.unit, str) else list(term.unit)
+    kind = term.kind or ("command" if seen.bound.takes("command") else None)
+    kind = kind or ("previous_action" if seen.bound.takes("action") else "measured")
+    ranges: Sequence[Any] = [None] * len(names)
+    if kind == "command":
+        units, ranges = _commanded(plan, seen, units)
+    clip = None if seen.clip is None else (plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1])
+    return [
+        Observation(
+            f"{name}_{back}" if back else name,
+            units[index],
+            value_of(plan, seen.scale, index, 1.0),
+            value_of(plan, seen.offset, index, 0.0),
+            kind,
+            ranges[index],
+            clip,
+            back,
+        )
+        for index, name in enumerate(names)
+    ]
+
+
+def value_of(plan: Plan, column: Column | None, index: int, otherwise: float) -> float:
+    """The number that a kernel applies to a column."""
+    if column is None:
+        return otherwise
+    return plan.numbers.values[column.first + (index if column.each else 0)]
+
+
+def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], list[Any]]:
+    """Units and ranges of a command's columns, where the term gives them all."""
+    name = seen.bound.term.parameters.get("command") or next(iter(plan.declaration.commands))
+    command: Command = plan.declaration.commands[name]
+    if len(command.names) != len(seen.names):
+        return units, [None] * len(seen.names)
+    ranges = [_range(plan, name, command, column) for column in command.names]
+    return (list(command.units) if seen.term.unit == "1" else units), ranges
+
+
+def _range(plan: Plan, name: str, command: Command, column: str) -> tuple[float, float] | None:
+    if column in command.ranges:
+        return command.ranges[column]
+    first, count = plan.numbers.places.get(f"commands.{name}.{column}", (0, 0))
+    return (plan.numbers.values[first], plan.numbers.values[first + 1]) if count == 2 else None
+
+
+def _actions(plan: Plan, driven: Driven, model: Any) -> list[Action]:
+    term = driven.bound.term
+    assert isinstance(term, DeclaredAction)
+    view = plan.views[term.robot]
+    clip = None
+    if driven.clip is not None:
+        clip = (plan.numbers.values[driven.clip], plan.numbers.values[driven.clip + 1])
+    found = []
+    for index, joint in enumerate(driven.bound.elements or ()):
+        actuator = view.actuators[joint]
+        gain = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
+        scale, offset = value_of(plan, driven.scale, index, 1.0), value_of(plan, driven.offset, index, 0.0)
+        is_effort = term.kind == "effort"
+        effort = view.efforts[joint]
+        found.append(
+            Action(
+                view.joint_names[joint],
+                term.kind,
+                term.unit,
+                scale=scale * gain if is_effort else scale,
+                default_position=view.defaults[joint],
+                offset=offset * gain if is_effort else offset,
+                clip=clip,
+                stiffness=gain if term.kind == "position" else 0.0,
+                damping=0.0 if is_effort else -float(model.actuator_biasprm[actuator, 2]),
+                effort_limit=effort if effort != float("inf") else abs(gain) if is_effort else None,
+            )
+        )
+    return found

@@ -1,0 +1,362 @@
+"""A task by declaration: its robot, its scene and its named terms; the kernels follow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import newton
+import torch
+import warp as wp
+
+from shared_store.wording import nearest
+from worker.simulation.camera import paint
+from worker.simulation.capture import on_torch_stream
+from worker.simulation.episodes import STEP, check_group, check_observations
+from worker.simulation.randomizations import Randomizations
+from worker.simulation.robot_view import RobotView, body_arrays
+from worker.simulation.sensors.camera import Camera
+from worker.simulation.sensors.sensor import SensorContext
+from worker.simulation.terrain import Terrain
+from worker.tasks.adapting import Adapting
+from worker.tasks.binding import Bound
+from worker.tasks.checks import checked_interface
+from worker.tasks.compiler import Kernels, further
+from worker.tasks.contract import contract
+from worker.tasks.declaration import Choice, Declaration
+from worker.tasks.functions import reads_poses
+from worker.tasks.interface import Interface
+from worker.tasks.numbers import flat
+from worker.tasks.plan import Plan
+from worker.tasks.task import Task
+from worker.tasks.torch_terms import TorchTerms
+
+
+class DeclaredTask(Task):
+    """A task whose kernels are compiled from named terms.
+
+    A subclass names its configuration and gives its robot and its declaration::
+
+        class Reach(DeclaredTask):
+            config_type = ReachConfig
+
+            def robot(self, config): return Robot("arm.xml")
+            def declare(self, config): return Declaration(actions=…, observations=…, rewards=…)
+
+    A control step is, in this order:
+
+    1. ``actions``: from the policy's output to the actuators.
+    2. Physics: ``config.substeps`` steps; after it sensors measure.
+    3. ``terminations``, then ``rewards`` and ``metrics``, of worlds whose physics did not fail.
+    4. The end of the step: clock, sums, statistics; which worlds begin a new episode.
+    5. Of an episode that ended, the last observation, then ``curricula``.
+    6. In a world that goes on: ``commands`` whose time is over are drawn anew, ``events`` at intervals.
+    7. In a world that begins: memory and solver forget the old episode; ``events`` at a reset place it, then ``commands`` are drawn.
+    8. ``observations`` of every world, with noise, clip, scale, delay and history.
+
+    Attributes:
+        views: Joints, bodies, sites and geoms of each robot and object, by its name.
+        declaration: What :meth:`declare` gave.
+        plan: It, bound to the robots.
+        sensors: Those that were declared, by name.
+        randomizations: What the declaration makes differ from world to world.
+    """
+
+    solver_options: ClassVar[Mapping[str, Any]] = {}
+    randomizations: Randomizations | None = None
+    _adapting: Adapting | None = None
+
+    def robot(self, config: Any) -> Any:
+        """The robot: a :class:`worker.simulation.robot.Robot`."""
+        raise NotImplementedError
+
+    def objects(self, config: Any) -> Mapping[str, Any]:
+        """What else is in each world, by name: further robots, boxes, spheres, capsules."""
+        return {}
+
+    def terrain(self, config: Any) -> Any:
+        """What the worlds stand on, a :class:`worker.simulation.terrain.Terrain`; None: a plane where ``ground`` is true."""
+        return None
+
+    def declare(self, config: Any) -> Declaration:
+        """The terms. :attr:`views` has the robots already."""
+        raise NotImplementedError
+
+    def build(self, builder: newton.ModelBuilder) -> None:
+        """Add robots and objects, and bind the terms to them."""
+        config: Any = self.config
+        self.views: dict[str, RobotView] = {}
+        for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
+            dataclasses.replace(entity, name=name).add_to(builder)
+        for name in ("robot", *self.objects(config)):
+            self.views[name] = RobotView(builder, name)
+        self.declaration = self.declare(config)
+        self.ground_terrain = self.terrain(config)
+        try:
+            sensors = self.declaration.sensors
+            self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
+        except ValueError as error:
+            # what a job sets is named by its place in the job alone
+            where = "" if str(error).startswith("config.") else f"task {type(self).__name__}: "
+            raise ValueError(f"{where}{error}") from error
+        self._name()
+
+    def stands_on(self) -> bool | Terrain:
+        """The terrain that :meth:`terrain` gave, or whether there is a plane."""
+        return self.ground_terrain or self.ground
+
+    def _name(self) -> None:
+        """Everything that is called after the terms."""
+        plan = self.plan
+        self.observation_names, self.action_names = plan.names, plan.actions
+        self.discrete = isinstance(self.declaration.actions, Choice)
+        self.memory_size, self.lasting_size = plan.binder.memory, plan.binder.lasting
+        self.metric_names = tuple(f"metric_{name}" for name in self.declaration.metrics)
+        self.termination_names = tuple(f"termination_{name}" for name in (*self.declaration.terminations, "time_out"))
+
+    def interface(self) -> Interface:
+        """The policy's contract, which follows from the declaration."""
+        return contract(self.plan, self.worlds.solver.mj_model)
+
+    def _prepare(self) -> None:
+        """Everything on the device that the kernels take."""
+        plan, device, count = self.plan, self.device, self.world_count
+        self._numbers = wp.array(plan.numbers.values or [0.0], dtype=wp.float32, device=device)
+        self._past = wp.zeros((count, plan.past), dtype=wp.float32, device=device)
+        self._external = wp.zeros((count, plan.binder.external), dtype=wp.float32, device=device)
+        self._rows = {
+            group: tuple(
+                wp.zeros((count, sum(seen.size for seen in plan.groups[group])), dtype=wp.float32, device=device)
+                for _ in range(2)
+            )
+            for group in further(plan)
+        }
+        bodies = body_arrays(self.worlds)
+        robots = {name: view.arrays(self.worlds) for name, view in self.views.items()}
+        terrain = self.worlds.ground.arrays if self.worlds.ground else None
+        context = SensorContext(
+            self.worlds, self.views, robots, bodies, self._episodes, self.ground_terrain, self.config.control_hz
+        )
+        self.sensors = {
+            name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
+        }
+        self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
+        structs |= {f"robot_{name}": arrays for name, arrays in robots.items()}
+        structs |= {f"sensor_{name}": sensor.arrays for name, sensor in self.sensors.items()}
+        self.robots = robots
+        self._torch_terms = TorchTerms(self, plan, self._external)
+        self._needs = _Needs(plan, self.sensors, self._torch_terms)
+        self._kernels = Kernels(type(self).__name__, plan, self._needs.apart)
+        # selections that no range gives are collected while the text is made
+        self._indices = wp.array(plan.binder.indices or [0], dtype=wp.int32, device=device)
+        self._common = [self._numbers, self._indices, self._past, self._external, 1.0 / self.config.control_hz]
+        self._common += [self.worlds.arrays, self._episodes, *(structs[name] for name in self._kernels.structs)]
+
+    def _build_sensor(self, name: str, declared: Any, context: SensorContext) -> Any:
+        try:
+            return declared.build(dataclasses.replace(context, name=name))
+        except ValueError as error:
+            raise ValueError(f"task {type(self).__name__}: sensors.{name}: {error}") from error
+
+    def _begin(self) -> None:
+        """What happens once, when random streams are seeded: physics of each world, its patch of terrain, events at startup."""
+        if self.randomizations is None:
+            if self._cameras and not self._camera:
+                paint(self.worlds, self._episodes, self.config.randomize.colors)
+            self.randomizations = Randomizations(
+                self.declaration.randomize,
+                self.worlds,
+                self._episodes,
+                self.views,
+                self.robots,
+                self.config.control_hz,
+            )
+            for place, value in self.config.numbers.items():
+                if place.startswith("randomize."):
+                    view = self.numbers(place)
+                    view.copy_(torch.tensor(flat(f"config.numbers.{place}", value, view.numel())).view_as(view))
+            if self.plan.adaptive:
+                rules = self.plan.adaptive
+                self._adapting = Adapting(rules, self.numbers, self.world_count, self.device)
+        self.randomizations.restart()
+        if self.worlds.ground:
+            self.worlds.ground.deal(self._episodes)
+        for camera in self._cameras:
+            camera.begin(self.config.randomize)
+        if self._kernels.startup is not None:
+            wp.launch(self._kernels.startup, dim=self.world_count, inputs=self._common, device=self.device)
+
+    def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """The observation groups, and those before the reset; without a group of its own the critic sees what the policy sees."""
+        seen = {"policy": self.observations, "critic": self.states}
+        ended = {"policy": self.terminal_observations, "critic": self.terminal_observations}
+        for group, (rows, last) in self._rows.items():
+            seen[group], ended[group] = wp.to_torch(rows), wp.to_torch(last)
+        for group, name in self.plan.images.items():
+            seen[group] = self.sensors[name].images
+        if "policy" in self.plan.images:
+            self.observations = seen["policy"]
+            self.observation_shape = tuple(self.observations.shape[1:])
+        if len(self.observation_shape) > 1:
+            del ended["policy"]
+        return seen, ended
+
+    def numbers(self, place: str) -> torch.Tensor:
+        """A live view of the numbers of a place, such as ``events.push.speed``; writing to it changes the task from the next step on.
+
+        Raises:
+            ValueError: There is no such place.
+        """
+        if place.startswith("randomize."):
+            known = self.randomizations.numbers() if self.randomizations else {}
+            if (entry := place.removeprefix("randomize.")) not in known:
+                raise ValueError(f"task {type(self).__name__}: it has no number {place}; {nearest(entry, known)}")
+            return known[entry]
+        first, count = self.plan.numbers.find(place, f"task {type(self).__name__}")
+        view: torch.Tensor = wp.to_torch(self._numbers)[first : first + count]
+        return view
+
+    def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
+        """Set the adaptive numbers, then what ``config.curriculum`` names. See :meth:`Task.begin_iteration`."""
+        if self._adapting:
+            self._adapting.begin(iteration, reward, episode_length)
+        super().begin_iteration(iteration, reward, episode_length)
+
+    def _number(self, name: str) -> torch.Tensor:
+        return self.numbers(name) if "." in name else super()._number(name)
+
+    def _noise(self) -> list[float]:
+        """None by the randomizer: the kernels add what the configuration asks for."""
+        checked_interface(self)
+        return [0.0] * len(self.observation_names)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """As :meth:`Task.state_tensors`, with what delays, actions of the past and sensors keep."""
+        tensors = super().state_tensors()
+        tensors |= {"last_actions": self._last_actions, "earlier_actions": self._earlier_actions}
+        if self._adapting:
+            tensors["adaptive_numbers"] = self._adapting.state
+        if self.plan.past:
+            tensors["past"] = wp.to_torch(self._past)
+        if self.lasting_size:
+            tensors["lasting"] = self._lasting
+        for group, (rows, _) in self._rows.items():
+            tensors[f"group_{group}"] = wp.to_torch(rows)
+        for name, sensor in self.sensors.items():
+            tensors |= {f"sensor_{name}_{key}": tensor for key, tensor in sensor.state_tensors().items()}
+        for part in (self.worlds.ground, self.worlds.drives, self.randomizations):
+            tensors |= part.state_tensors() if part else {}
+        return tensors
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """As :meth:`Task.load_state_dict`; the physics of each world becomes what was drawn for it."""
+        super().load_state_dict(state)
+        if self._adapting:
+            self._adapting.read()
+        if self.randomizations:
+            with on_torch_stream(self.device):
+                self.randomizations.apply()
+
+    def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
+        """The control step in order, each part with whether it is to be captured; torch's terms are not, unless torch captures all."""
+        if not self._torch_terms.any:
+            return [(True, self._whole)]
+        parts: list[tuple[bool, Callable[[], None]]] = [(True, self._simulate), (False, self._torch_terms.judge)]
+        if not self._torch_terms.observe_any:
+            return [*parts, (True, lambda: self._judge(int(STEP)))]
+        return [
+            *parts,
+            (True, lambda: self._judge_alone(int(STEP))),
+            (False, self._torch_terms.observe),
+            (True, lambda: self._observe_alone(int(STEP))),
+        ]
+
+    def _whole(self) -> None:
+        self._simulate()
+        self._judge(int(STEP))
+
+    def _simulate(self) -> None:
+        """Actions, physics, sensors."""
+        self.randomizer.push()
+        wp.launch(self._kernels.act, dim=self.world_count, inputs=self._common, device=self.device)
+        self.randomizer.delay()
+        self.worlds.simulate()
+        self._measure()
+
+    def _measure(self) -> None:
+        """Bodies and sensors as they are after the physics."""
+        if self._needs.bodies:
+            self.worlds.update_bodies()
+        for sensor in self.sensors.values():
+            sensor.advance()
+
+    def _launch_observe(self, mode: int) -> None:
+        """Judge or reset, and observe, by launches alone."""
+        if mode == STEP:
+            self._measure()
+        if not self._torch_terms.any:
+            self._judge(mode)
+            return
+        self._torch_terms.judge()
+        self._judge_alone(mode)
+        if self._torch_terms.observe_any:
+            self._torch_terms.observe()
+        self._observe_alone(mode)
+
+    def _judge(self, mode: int) -> None:
+        self._judge_alone(mode)
+        self._observe_alone(mode)
+
+    def _judge_alone(self, mode: int) -> None:
+        """Rewards, ends, resets; then what has to follow in the worlds that begin: drives, bodies, sensors."""
+        rows = [array for group in further(self.plan) for array in self._rows[group]]
+        inputs = [mode, self.max_episode_length, *rows, *self._common]
+        wp.launch(self._kernels.judge, dim=self.world_count, inputs=inputs, device=self.device)
+        if self.randomizations:
+            self.randomizations.settle()
+        if self.worlds.drives:
+            self.worlds.drives.settle(self._episodes.ages)
+        if self._cameras or (self._needs.apart and self._needs.bodies):
+            self.worlds.update_bodies()
+        if self._cameras:
+            self.worlds.update_shapes()
+        for sensor in self.sensors.values():
+            sensor.settle()
+
+    def _observe_alone(self, mode: int) -> None:
+        rows = [array for group in further(self.plan) for array in self._rows[group]]
+        if self._kernels.observe is not None:
+            inputs = [mode, self.max_episode_length, *rows, *self._common]
+            wp.launch(self._kernels.observe, dim=self.world_count, inputs=inputs, device=self.device)
+        wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
+        for both in self._rows.values():
+            wp.launch(check_group, dim=self.world_count, inputs=[self._episodes.dones, *both], device=self.device)
+        if self._camera:
+            self._camera.render(mode)
+
+
+class _Needs:
+    """What a step has to bring up to date besides the joints.
+
+    Attributes:
+        bodies: Poses of bodies, after the physics.
+        apart: Whether observations have a kernel of their own: they read what is stale in a world that was just placed afresh.
+    """
+
+    def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
+        observed = [seen.bound for group in plan.groups.values() for seen in group]
+        judged = [*plan.rewards, *plan.metrics, *plan.terminations, *plan.curricula]
+        judged += [bound for told in plan.commands for bound in (told.bound, told.update) if bound is not None]
+        measured = any(sensor.needs_bodies for sensor in sensors.values())
+        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, (*observed, *judged)))
+        self.apart = torch_terms.observe_any or any(_reads_bodies(bound) or _reads_sensors(bound) for bound in observed)
+
+
+def _reads_bodies(bound: Bound) -> bool:
+    return "bodies" in bound.arguments.values() and reads_poses(bound.term.function)
+
+
+def _reads_sensors(bound: Bound) -> bool:
+    return any(variable.startswith("sensor_") for variable in bound.arguments.values())

@@ -1,0 +1,89 @@
+"""Observation groups that are images: which camera each shows, and what is said of them in manifests and tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from shared_store.wording import nearest
+from worker.simulation.robot_view import RobotView
+from worker.tasks.config import TaskConfig
+from worker.tasks.declaration import Declaration
+
+if TYPE_CHECKING:
+    from worker.tasks.plan import Plan
+    from worker.tasks.task import Task
+
+
+def cameras(
+    declaration: Declaration, config: TaskConfig, sensors: Mapping[str, Any], views: Mapping[str, RobotView]
+) -> dict[str, str]:
+    """The name of the camera that each observation group of images shows.
+
+    Args:
+        declaration: The task's terms.
+        config: Its configuration, which names the groups, too.
+        sensors: The sensors as declared, by name.
+        views: Its robots and objects by name.
+
+    Raises:
+        ValueError: There is no such camera, what the camera is on is not there, or the configuration has other groups of images.
+    """
+    _check_groups(config, declaration)
+    known = [name for name, sensor in sensors.items() if hasattr(sensor, "channels")]
+    for group, image in declaration.images.items():
+        if image.sensor not in known:
+            there = nearest(image.sensor, known) if known else "the task declares none; give it a CameraSensor"
+            no_camera = f"the sensor {image.sensor} is no camera"
+            what = no_camera if image.sensor in sensors else f"there is no camera {image.sensor!r}"
+            raise ValueError(f"observations.{group}: {what}; {there}")
+    for name in known:
+        try:
+            sensors[name].rows(views)
+        except ValueError as error:
+            raise ValueError(f"sensors.{name}: {error}") from error
+    return {group: image.sensor for group, image in declaration.images.items()}
+
+
+def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
+    """Refuse images that the configuration does not name as such: a job is checked against it when it is submitted."""
+    told, kind = config.observation_groups, type(config).__name__
+    there = [*declaration.groups, *declaration.images]
+    for group in declaration.images:
+        if not told.get(group, False):
+            raise ValueError(
+                f"observations.{group}: it is an image, and {kind} does not say so; give {kind} a "
+                f'further_groups: ClassVar = {{"{group}": True}}'
+            )
+    for group, is_image in config.further_groups.items():
+        if group not in there:
+            raise ValueError(
+                f"observations: {kind}.further_groups has {group}, and the task declares no such group; {nearest(group, there)}"
+            )
+        if is_image and group not in declaration.images:
+            raise ValueError(
+                f"observations.{group}: {kind}.further_groups says that it is an image, and the task gives terms; give "
+                "Image(camera)"
+            )
+
+
+def described(task: Task) -> dict[str, dict[str, Any]]:
+    """What the images of each observation group are, as plain values: the camera's settings, and the names of the channels."""
+    camera, plan = getattr(task.config, "camera", None), getattr(task, "plan", None)
+    found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
+    for group, name in plan.images.items() if plan else ():
+        sensor = plan.declaration.sensors[name]
+        found[group] = {"sensor": name, **dataclasses.asdict(sensor), "channels": sensor.rows(plan.views)}
+    return found
+
+
+def shown(plan: Plan, group: str) -> str:
+    """One line that says what an image of a group is."""
+    sensor = plan.declaration.sensors[plan.images[group]]
+    kind = sensor.kind
+    if kind == "segmentation":
+        kind += f" of {', '.join(sensor.channels(plan.views))}"
+    elif kind == "depth":
+        kind += f" from {sensor.near:g} to {sensor.far:g} m"
+    return f"{sensor.frames} x {kind} of {sensor.width} x {sensor.height} bytes, the present one first"

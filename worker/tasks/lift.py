@@ -1,0 +1,129 @@
+"""An arm that grips a cube and lifts it to a target, as mjlab 1.6 has it (``Mjlab-Lift-Cube-Yam``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from worker.simulation.objects import Box
+from worker.simulation.robot import Robot
+from worker.simulation.sensors.contact import ContactSensor
+from worker.simulation.sensors.frames import Frames
+from worker.tasks import terms
+from worker.tasks.configs.lift import LiftCubeConfig
+from worker.tasks.declaration import Action, Command, Declaration, Event, Metric, Observation, Reward, Termination
+from worker.tasks.declared import DeclaredTask
+from worker.tasks.randomize import Distribution, Randomize
+from worker.tasks.robots.yam import ACTION_SCALE, FINGERTIPS, GRASP, GRIPPER, yam
+
+EDGE = 0.04
+"""Length of the cube's edges [m]."""
+FINGERTIP_FRICTION: tuple[tuple[str, str, tuple[float, float], Distribution], ...] = (
+    ("slide", "slide", (0.3, 1.5), "uniform"),
+    ("spin", "torsion", (1.0e-4, 2.0e-2), "log_uniform"),
+    ("roll", "roll", (1.0e-5, 5.0e-3), "log_uniform"),
+)
+"""Sliding, torsional [m] and rolling [m] coefficients of each fingertip sphere, drawn once for each world."""
+
+
+class LiftCube(DeclaredTask):
+    """The YAM arm and a cube: 29 observations, 7 actions, 50 control steps a second, episodes of 20 s."""
+
+    config_type = LiftCubeConfig
+    ground = True
+    solver_options: ClassVar[dict[str, object]] = {
+        "integrator": "implicitfast",
+        "cone": "elliptic",
+        "impratio": 10.0,
+        "iterations": 10,
+        "ls_iterations": 20,
+        "tolerance": 1.0e-8,
+        "ls_tolerance": 0.01,
+        "nconmax": 55,
+        "njmax": 600,
+    }
+
+    def robot(self, config: LiftCubeConfig) -> Robot:
+        """The arm, its gripper half open."""
+        return yam()
+
+    def objects(self, config: LiftCubeConfig) -> Mapping[str, Any]:
+        """The cube; where it begins is up to the command."""
+        return {
+            "cube": Box("cube", size=(EDGE, EDGE, EDGE), mass=0.05, position=(0.3, 0.0, EDGE), color=(0.8, 0.2, 0.2))
+        }
+
+    def declare(self, config: LiftCubeConfig) -> Declaration:
+        """The terms, by mjlab's names; each reward is one per second."""
+
+        def rate(function: Any, **options: Any) -> Reward:
+            return Reward(function, per_second=True, **options)
+
+        return Declaration(
+            sensors={
+                "hand": Frames(sites=GRASP),
+                "ground": ContactSensor(bodies=GRIPPER, against="ground", fine=True, together=True),
+            },
+            actions={
+                "joint_pos": Action(
+                    terms.position_target,
+                    joints=tuple(ACTION_SCALE),
+                    scale=ACTION_SCALE,
+                    offset="default",
+                    clip=None,
+                    kind="position",
+                    unit="rad",
+                )
+            },
+            observations={
+                "joint_pos": Observation(terms.joint_position, offset="default", noise=0.01, unit="rad"),
+                "joint_vel": Observation(terms.joint_velocity, noise=1.5, unit="rad/s"),
+                "ee_to_cube": Observation(terms.hand_to_object, other="cube", hand="hand", noise=0.01, unit="m"),
+                "cube_to_goal": Observation(
+                    terms.object_to_target, other="cube", noise=0.01, unit="m", kind="measured"
+                ),
+                "actions": Observation(terms.last_action),
+            },
+            rewards={
+                "lift": rate(
+                    terms.reach_and_bring_object, robot="cube", hand="hand", reaching_std=0.2, bringing_std=0.3
+                ),
+                "lift_precise": rate(terms.bring_object, robot="cube", std=0.05),
+                "action_rate_l2": rate(terms.action_rate_squared),
+                "joint_pos_limits": rate(terms.joint_limit_excess, soft_factor=0.9),
+                "joint_vel_hinge": rate(terms.joint_velocity_excess_squared, limit=0.5),
+            },
+            metrics={
+                "object_height": Metric(terms.root_height, robot="cube"),
+                "position_error": Metric(terms.object_target_distance, robot="cube"),
+                "at_goal": Metric(terms.object_at_target, robot="cube", distance=0.05),
+                "episode_success": Metric(terms.object_was_at_target, robot="cube", memory=1, distance=0.05),
+            },
+            terminations={
+                "ee_ground_collision": Termination(terms.illegal_contact, contacts="ground", force=config.ground_force)
+            },
+            commands={
+                "lift_height": Command(
+                    terms.lift_command,
+                    robot="cube",
+                    names=("target_x", "target_y", "target_z"),
+                    units=("m", "m", "m"),
+                    ranges={"target_x": config.target_x, "target_y": config.target_y, "target_z": config.target_z},
+                    seconds=config.command_seconds,
+                    x=config.target_x,
+                    y=config.target_y,
+                    z=config.target_z,
+                    object_x=config.cube_x,
+                    object_y=config.cube_y,
+                    object_z=config.cube_z,
+                    object_yaw=config.cube_yaw,
+                )
+            },
+            events={"reset_robot": Event(terms.reset_to_default)},
+            randomize={
+                f"fingertip_friction_{name}": Randomize(
+                    "friction", geoms=FINGERTIPS, axes=(axis,), range=ends, operation="set", distribution=distribution
+                )
+                for name, axis, ends, distribution in FINGERTIP_FRICTION
+            },
+        )

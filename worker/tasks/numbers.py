@@ -1,0 +1,91 @@
+"""The numbers of a declaration: data with places, in one array that every kernel of the task reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import warp as wp
+
+from shared_store.wording import nearest, shown
+
+EXPRESSIONS: Mapping[Any, str] = {
+    float: "numbers[{0}]",
+    wp.float32: "numbers[{0}]",
+    int: "int(numbers[{0}])",
+    wp.int32: "int(numbers[{0}])",
+    bool: "(numbers[{0}] != 0.0)",
+    wp.vec2: "wp.vec2(numbers[{0}], numbers[{1}])",
+    wp.vec3: "wp.vec3(numbers[{0}], numbers[{1}], numbers[{2}])",
+    wp.vec4: "wp.vec4(numbers[{0}], numbers[{1}], numbers[{2}], numbers[{3}])",
+    wp.quat: "wp.quat(numbers[{0}], numbers[{1}], numbers[{2}], numbers[{3}])",
+    wp.transform: "wp.transform(wp.vec3(numbers[{0}], numbers[{1}], numbers[{2}]), "
+    "wp.quat(numbers[{3}], numbers[{4}], numbers[{5}], numbers[{6}]))",
+}
+"""How a kernel reads a value of each type from the array."""
+
+
+class Numbers:
+    """All numbers of a task, in the order in which they are added.
+
+    Attributes:
+        values: One after the other.
+        places: First index and count of each place, such as ``rewards.track_linear.std``.
+    """
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self.places: dict[str, tuple[int, int]] = {}
+
+    def add(self, place: str, value: Any, count: int) -> int:
+        """Add the ``count`` numbers of a place; returns the index of the first.
+
+        Raises:
+            ValueError: The value is not that many numbers.
+        """
+        first = len(self.values)
+        self.values += flat(place, value, count)
+        self.places[place] = (first, count)
+        return first
+
+    def set(self, place: str, value: Any, where: str) -> None:
+        """Change the numbers of a place, as ``config.numbers`` says under ``where``.
+
+        Raises:
+            ValueError: There is no such place, or the value is not as many numbers.
+        """
+        first, count = self.find(place, where)
+        self.values[first : first + count] = flat(f"{where}.{place}", value, count)
+
+    def find(self, place: str, where: str) -> tuple[int, int]:
+        """First index and count of a place.
+
+        Raises:
+            ValueError: There is no such place.
+        """
+        if place not in self.places:
+            raise ValueError(
+                f"{where}: the task has no number {shown(place)}; {nearest(place, sorted(self.places)) or 'it has none'}"
+            )
+        return self.places[place]
+
+
+def flat(place: str, value: Any, count: int) -> list[float]:
+    """A value of the declaration as ``count`` numbers.
+
+    Raises:
+        ValueError: It is not that many numbers, or one is NaN.
+    """
+    found = [value] if isinstance(value, int | float) else list(value) if _is_sequence(value) else None
+    if found is None or len(found) != count or not all(isinstance(each, int | float) for each in found):
+        wanted = "a number" if count == 1 else f"{count} numbers"
+        raise ValueError(f"{place}: expected {wanted}, found {shown(value)}")
+    numbers = [float(each) for each in found]
+    if any(math.isnan(each) for each in numbers):
+        raise ValueError(f"{place}: a number can't be NaN")
+    return numbers
+
+
+def _is_sequence(value: Any) -> bool:
+    return not isinstance(value, str) and (isinstance(value, Sequence) or hasattr(value, "__len__"))

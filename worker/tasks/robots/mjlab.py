@@ -1,0 +1,64 @@
+"""Files and servos of the robots in the Python package ``mjlab`` (Apache-2.0), of which nothing but files is read."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Mapping, Sequence
+
+from worker.simulation.actuators import PositionActuator
+
+VERSION = "1.6.0"
+"""The release whose numbers these robots and their tasks have."""
+NATURAL_FREQUENCY = 20.0 * math.pi
+"""Of the servos [rad/s]: 10 Hz, mjlab's choice for all robots here."""
+DAMPING_RATIO = 2.0
+"""Of the servos."""
+ACTION_SHARE = 0.25
+"""What an action of 1 asks for at rest, as a share of a servo's greatest torque."""
+
+
+def robot_file(inside: str) -> str:
+    """A file of the package, as :class:`worker.simulation.robot.Robot` takes it.
+
+    Args:
+        inside: Its path in the package.
+
+    Raises:
+        ValueError: The package is not installed.
+    """
+    if importlib.util.find_spec("mjlab") is None:
+        raise ValueError(
+            "the robot's file is in the Python package mjlab, which is not installed; "
+            f"install it without what it needs itself: pip install --no-deps mjlab=={VERSION}"
+        )
+    return f"package:mjlab/{inside}"
+
+
+def servo(joints: str | Sequence[str], rotor: float, effort: float) -> PositionActuator:
+    """A position servo whose gains follow from its rotor.
+
+    ``stiffness = rotor w^2`` and ``damping = 2 d rotor w``, with :data:`NATURAL_FREQUENCY` w and :data:`DAMPING_RATIO` d.
+
+    Args:
+        joints: Patterns of joints.
+        rotor: Inertia of the rotor, seen from the joint [kg m^2].
+        effort: Greatest torque [N m].
+    """
+    return PositionActuator(
+        joints,
+        rotor * NATURAL_FREQUENCY**2,
+        2.0 * DAMPING_RATIO * rotor * NATURAL_FREQUENCY,
+        effort_limit=effort,
+        armature=rotor,
+    )
+
+
+def action_scale(servos: Sequence[PositionActuator]) -> Mapping[str, float]:
+    """How far an action of 1 moves the target of each joint [rad], by the patterns of the servos' joints."""
+    scales: dict[str, float] = {}
+    for each in servos:
+        assert isinstance(each.effort_limit, float) and isinstance(each.stiffness, float)
+        for pattern in [each.joints] if isinstance(each.joints, str) else each.joints:
+            scales[pattern] = ACTION_SHARE * each.effort_limit / each.stiffness
+    return scales

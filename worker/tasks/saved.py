@@ -1,0 +1,38 @@
+"""Whether a saved state of worlds is one of this task's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+NEWER = ("broken", "last_actions", "earlier_actions")
+"""What states of older versions do not have, and which may begin at 0."""
+
+
+def check_state(what: str, tensors: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor]) -> None:
+    """Compare a saved state with the tensors that it is for.
+
+    Args:
+        what: The state, for the error.
+        tensors: Of the task.
+        state: As saved.
+
+    Raises:
+        ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn otherwise.
+    """
+    if missing := sorted(tensors.keys() - state.keys()):
+        raise ValueError(f"{what} lacks {', '.join(missing)}")
+    if unknown := sorted(state.keys() - tensors.keys()):
+        raise ValueError(f"{what} holds {', '.join(unknown)}, which the task does not have")
+    for name, tensor in tensors.items():
+        saved = state[name]
+        if saved.shape != tensor.shape or saved.dtype != tensor.dtype:
+            raise ValueError(
+                f"{what} does not fit: {name} is {tuple(saved.shape)} {saved.dtype}, "
+                f"expected {tuple(tensor.shape)} {tensor.dtype}"
+            )
+        if name == "world_factors" and not torch.equal(saved, tensor.cpu()):
+            raise ValueError(
+                f"{what} does not fit: its worlds have other physics; use the same seed, first world and randomize"
+            )

@@ -1,0 +1,230 @@
+"""Actions: what they do to the actuators, what a policy sees of them, what their changes cost.
+
+A function that acts is called for one joint with ``value``, offset + scale * action, and writes the input of that joint's actuator.
+It acts once a control step: the input holds for all its physics steps.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.worlds import WorldArrays
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def aim(worlds: WorldArrays, robot: RobotArrays, world: int, joint: int, target: float):
+    """Let the actuator bring a joint to where its encoder shows ``target`` [m, rad]."""
+    worlds.controls[world, robot.actuators[joint]] = target - robot.encoder_bias[world, joint]
+
+
+@wp.func
+def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A force or torque: the input of a <motor> is ``value`` [N, N m, times its gear].
+
+    mjlab: JointEffortAction. Isaac Lab: JointEffortAction.
+    """
+    worlds.controls[world, robot.actuators[joint]] = value
+
+
+@wp.func
+def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A share of the greatest force or torque of the actuator, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    greatest = robot.efforts[joint]
+    if not wp.isfinite(greatest):
+        greatest = 1.0
+    worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0)
+
+
+@wp.func
+def position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A position that the joint's encoder is to show: the actuator's target is ``value`` less the encoder's bias [m, rad].
+
+    mjlab: JointPositionAction. Isaac Lab: JointPositionAction (without a bias).
+    """
+    aim(worlds, robot, world, joint, value)
+
+
+@wp.func
+def limited_position_target(
+    world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, soft_factor: float = 1.0
+):
+    """A position target as :func:`position_target`, kept within ``soft_factor`` times the joint's range about its middle [m, rad].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    ends = robot.ranges[joint]
+    margin = 0.5 * (1.0 - soft_factor) * (ends[1] - ends[0])
+    if not wp.isfinite(margin):
+        margin = 0.0
+    aim(worlds, robot, world, joint, wp.clamp(value, ends[0] + margin, ends[1] - margin))
+
+
+@wp.func
+def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A step from where the joint is: the target is its position at the control step's start + ``value`` [m, rad].
+
+    mjlab: RelativeJointPositionAction (which adds to the position in every physics step). Isaac Lab: RelativeJointPositionAction (as
+    mjlab's).
+    """
+    worlds.controls[world, robot.actuators[joint]] = worlds.joint_q[world, robot.coordinates[joint]] + value
+
+
+@wp.func
+def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A position target between the joint's limits: ``value`` -1 is the lower, 1 the upper; clipped. The joint must have limits.
+
+    mjlab: -. Isaac Lab: JointPositionToLimitsAction.
+    """
+    ends = robot.ranges[joint]
+    share = wp.clamp(value, -1.0, 1.0)
+    aim(worlds, robot, world, joint, 0.5 * (ends[0] + ends[1]) + 0.5 * share * (ends[1] - ends[0]))
+
+
+@wp.func
+def smoothed_position_target(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    joint: int,
+    value: float,
+    memory: int,
+    share: float,
+):
+    """A position target that follows ``value`` slowly: t = share * value + (1 - share) * t of the step before [m, rad].
+
+    ``memory`` is twice the number of the robot's joints: a target and whether there is one. The first target of an episode is where
+    the joint is.
+
+    mjlab: -. Isaac Lab: EMAJointPositionToLimitsAction (without its scaling to the limits).
+    """
+    column = memory + 2 * joint
+    before = episodes.memory[world, column]
+    if episodes.memory[world, column + 1] == 0.0:
+        before = worlds.joint_q[world, robot.coordinates[joint]] + robot.encoder_bias[world, joint]
+    target = share * value + (1.0 - share) * before
+    episodes.memory[world, column] = target
+    episodes.memory[world, column + 1] = 1.0
+    aim(worlds, robot, world, joint, target)
+
+
+@wp.func
+def two_positions_target(
+    world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, closed: float, opened: float
+):
+    """One of two position targets, as of a gripper: ``closed`` where ``value`` is negative, else ``opened`` [m, rad].
+
+    mjlab: -. Isaac Lab: BinaryJointPositionAction.
+    """
+    aim(worlds, robot, world, joint, wp.where(value < 0.0, closed, opened))
+
+
+@wp.func
+def velocity_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
+    """A velocity: the target of a <velocity> actuator is ``value`` [m/s, rad/s].
+
+    mjlab: JointVelocityAction. Isaac Lab: JointVelocityAction.
+    """
+    worlds.controls[world, robot.actuators[joint]] = value
+
+
+@wp.func
+def two_velocities_target(
+    world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float, closing: float, opening: float
+):
+    """One of two velocity targets: ``closing`` where ``value`` is negative, else ``opening`` [m/s, rad/s].
+
+    mjlab: -. Isaac Lab: BinaryJointVelocityAction.
+    """
+    worlds.controls[world, robot.actuators[joint]] = wp.where(value < 0.0, closing, opening)
+
+
+@wp.func
+def last_action(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """The action that led to what is observed, as the policy asked for it; 0 after a reset.
+
+    mjlab: last_action. Isaac Lab: last_action.
+    """
+    return episodes.last_actions[world, action]
+
+
+@wp.func
+def clipped_last_action(world: int, episodes: EpisodeArrays, action: int, limit: float = 1.0) -> float:
+    """The action that led to what is observed, within ``limit`` of 0, beyond which the robot felt nothing of it; 0 after a reset.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return wp.clamp(episodes.last_actions[world, action], -limit, limit)
+
+
+@wp.func
+def action_squared(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """Square of an action.
+
+    mjlab: -. Isaac Lab: action_l2.
+    """
+    return episodes.actions[world, action] * episodes.actions[world, action]
+
+
+@wp.func
+def action_magnitude(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """Magnitude of an action.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return wp.abs(episodes.actions[world, action])
+
+
+@wp.func
+def action_excess(world: int, episodes: EpisodeArrays, action: int, limit: float = 1.0) -> float:
+    """How far an action is beyond ``limit`` on either side, where clipping hides what the policy asks for.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return wp.max(wp.abs(episodes.actions[world, action]) - limit, 0.0)
+
+
+@wp.func
+def action_rate_squared(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """Square of an action less the one of the step before, as the policy asked for them.
+
+    mjlab: action_rate_l2. Isaac Lab: action_rate_l2.
+    """
+    change = episodes.actions[world, action] - episodes.last_actions[world, action]
+    return change * change
+
+
+@wp.func
+def action_acceleration(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """a - 2 b + c of an action, the one of the step before and the one before that.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    before = episodes.last_actions[world, action]
+    return episodes.actions[world, action] - 2.0 * before + episodes.earlier_actions[world, action]
+
+
+@wp.func
+def action_acceleration_squared(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """Square of a - 2 b + c, an action, the one before and the one before that.
+
+    mjlab: action_acc_l2. Isaac Lab: -.
+    """
+    change = action_acceleration(world, episodes, action)
+    return change * change
+
+
+@wp.func
+def mean_action_acceleration(world: int, episodes: EpisodeArrays, action: int) -> float:
+    """|a - 2 b + c| over the number of actions: summed over all, the mean of how much each action jerks.
+
+    mjlab: mean_action_acc. Isaac Lab: -.
+    """
+    return wp.abs(action_acceleration(world, episodes, action)) / float(episodes.actions.shape[1])

@@ -1,0 +1,192 @@
+"""All terms with their parameters and meanings, as tables, and what mjlab and Isaac Lab call them: read from signatures and docstrings."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import warp as wp
+
+GROUPS = (
+    "joints",
+    "root",
+    "bodies",
+    "actions",
+    "commands",
+    "events",
+    "episode",
+    "locomotion",
+    "tolerances",
+    "contacts",
+    "sensing",
+    "ground",
+    "footing",
+    "manipulation",
+    "tracking",
+    "following",
+)
+"""Modules of terms, in the order of the page."""
+FILLED = ("world", "stream", "value", "terminated", "seconds")
+"""Parameters that a task fills by itself, which a declaration says nothing of."""
+SHARED = ("WorldArrays", "EpisodeArrays", "BodyArrays", "TerrainArrays")
+"""Structs of which a task has one."""
+_NAMES = re.compile(r"^ *mjlab: (.*?)\. Isaac Lab: (.*)\.$", re.DOTALL | re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A term as its docstring and signature tell it.
+
+    Attributes:
+        name: As in ``terms.NAME``.
+        group: Its module.
+        given: What a declaration gives it: parameters and their types, with the defaults.
+        returns: Type of its result, empty where there is none.
+        meaning: Formula, unit and what the numbers mean, in Markdown.
+        mjlab: What mjlab calls it, ``-`` if nothing there is the same.
+        isaac_lab: What Isaac Lab calls it.
+    """
+
+    name: str
+    group: str
+    given: str
+    returns: str
+    meaning: str
+    mjlab: str
+    isaac_lab: str
+
+
+def entries() -> Iterator[Entry]:
+    """All terms, module by module in the order of their source."""
+    for group in GROUPS:
+        module = importlib.import_module(f"worker.tasks.terms.{group}")
+        for name, function in vars(module).items():
+            if isinstance(function, wp.Function) and function.func.__module__ == module.__name__:
+                found = _entry(name, group, function)
+                if found is not None:
+                    yield found
+
+
+def _entry(name: str, group: str, function: Any) -> Entry | None:
+    text = inspect.getdoc(function.func) or ""
+    names = _NAMES.search(text)
+    if names is None:  # a function that terms share
+        return None
+    meaning = re.sub(r":func:`(\w+)`", r"``\1``", text[: names.start()].strip()).replace("``", "`")
+    mjlab, isaac_lab = (" ".join(each.split()) for each in names.groups())
+    parameters = inspect.signature(function.func).parameters.values()
+    given = ", ".join(filter(None, map(_shown, parameters)))
+    returns = inspect.signature(function.func).return_annotation
+    shown = "" if returns is inspect.Signature.empty else _kind(returns)
+    return Entry(name, group, given, shown, " ".join(meaning.split()), mjlab, isaac_lab)
+
+
+def _kind(annotation: Any) -> str:
+    return str(annotation).removeprefix("wp.")
+
+
+def _shown(parameter: inspect.Parameter) -> str:
+    """A parameter as the declaration gives it, empty where the task fills it."""
+    name, kind = parameter.name, _kind(parameter.annotation)
+    if name in FILLED or kind in SHARED:
+        return ""
+    if kind.endswith("Arrays"):
+        return "" if name == "robot" else f"`{name}`: {kind}"
+    if name in ("joint", "body", "site"):
+        return {"joint": "`joints`", "body": "`bodies`", "site": "`sites`"}[name]
+    if name == "index":
+        return "`size`"
+    if name in ("action", "memory", "command"):
+        return "" if name == "action" else f"`{name}`"
+    if parameter.default is inspect.Parameter.empty:
+        return f"`{name}`: {kind}"
+    return f"`{name}`: {kind} = {_default(parameter.default)}"
+
+
+def _default(value: Any) -> str:
+    if isinstance(value, bool | float | int):
+        return str(value)
+    return f"({', '.join(f'{each:g}' for each in value)})"
+
+
+REFERENCE = """\
+# Terms
+
+The functions of `worker.tasks.terms`, of which a declared task is made. A task names them, such as
+`Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) says which of mjlab's and Isaac Lab's
+terms each stands for. This page is written by `python -m worker.tasks.terms` from the functions' docstrings.
+
+- **Given** is what a declaration says: `joints`, `bodies`, `sites` are patterns, and the function is called for each that fits;
+  `size` is how often it is called, with `index` from 0; `command` names a command, `memory` is how many numbers of its
+  own the function keeps. A parameter with a type of `...Arrays` is given by the name of a sensor or, for `RobotArrays`, of a robot or
+  object; one that fits alone needs no name. All others are numbers in the unit that the meaning says; those with `=` have a default.
+- `robot=` names the robot or object that a function is about, `"robot"` by default.
+- A function that is called for several elements gives the sum over them as a reward or metric, one column after the other as
+  an observation, and ends an episode if it is true for any.
+- Quaternions are xyzw. All units are SI: a policy's scales are in the declaration, not here.
+"""
+
+PORTING = """\
+# Term names of mjlab and Isaac Lab
+
+What each term of mjlab 1.6 and Isaac Lab is called in `worker.tasks.terms`; [terms.md](terms.md) says what it means and what it is
+given, and [ports.md](ports.md) shows a whole task of each beside ours. This page is written by
+`python -m worker.tasks.terms porting` from the functions' docstrings. Three differences hold everywhere:
+
+- Quaternions are xyzw here, and wxyz there.
+- A function for one joint, body or foot gives one number, and rewards are summed over them: mjlab's `joint_vel_l2` is
+  `joint_velocity_squared` of all joints.
+- Isaac Lab takes velocities of the centre of mass where mjlab takes those of the frame's origin: the table names the term that is the same.
+"""
+
+
+def reference() -> str:
+    """The page of all terms."""
+    parts = [REFERENCE]
+    for group in GROUPS:
+        found = [entry for entry in entries() if entry.group == group]
+        head, _, rest = (_module(group).__doc__ or "").strip().partition("\n\n")
+        parts.append(f"## {head.rstrip('.').partition(':')[0]}\n\n{head}{_paragraph(rest)}\n")
+        rows = [f"| `{each.name}` | {each.given} | {each.returns} | {_cell(each.meaning)} |" for each in found]
+        parts.append("\n".join(["| term | given | returns | meaning |", "|---|---|---|---|", *rows]) + "\n")
+    return "\n".join(parts)
+
+
+def porting() -> str:
+    """The page of mjlab's and Isaac Lab's names, each sorted by theirs."""
+    parts = [PORTING]
+    for title, field in (("mjlab", "mjlab"), ("Isaac Lab", "isaac_lab")):
+        rows = []
+        for entry in entries():
+            for theirs in split(getattr(entry, field)):
+                name, _, note = theirs.partition(" ")
+                rows.append((name, f"| `{name}` | `{entry.name}` | {_cell(note.strip('()'))} |"))
+        rows.sort(key=lambda row: row[0].lower())
+        table = ["| theirs | ours | where they differ, whose it is |", "|---|---|---|", *(row for _, row in rows)]
+        parts.append(f"## {title}\n\n" + "\n".join(table) + "\n")
+    return "\n".join(parts)
+
+
+def split(names: str) -> list[str]:
+    """The names in a list such as ``a (b, c), d``; none of ``-``."""
+    if names == "-":
+        return []
+    return [each.strip() for each in re.split(r",(?![^(]*\))", names)]
+
+
+def _module(group: str) -> ModuleType:
+    return importlib.import_module(f"worker.tasks.terms.{group}")
+
+
+def _paragraph(text: str) -> str:
+    text = re.sub(r":func:`(\w+)`", r"``\1``", text).replace("``", "`")
+    return "\n\n" + " ".join(text.split()) if text else ""
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")

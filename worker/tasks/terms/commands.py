@@ -1,0 +1,351 @@
+"""Commands: what a policy is asked to do, how it is drawn, how it follows the robot, how the policy sees it.
+
+A function that draws a command is called when an episode begins and when the command's time is over, and writes its numbers into
+``episodes.memory`` from the column ``command`` on. One that steers is the command's ``update``, called in every step.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.kinematics import (
+    quaternion_from_angles,
+    root_position_of,
+    root_rotation_of,
+    set_root_pose,
+    set_root_velocity,
+    wrapped_angle,
+    yaw_of,
+)
+from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.terms.placing import between
+
+wp.set_module_options({"enable_backward": False})
+
+HEADING = wp.constant(3)
+FOLLOWS_HEADING = wp.constant(4)
+STANDS = wp.constant(5)
+IN_WORLD = wp.constant(6)
+WORLD_VELOCITY = wp.constant(7)
+"""Hidden columns of :func:`heading_velocity_command`, the last the first of two, counted from the command's first."""
+TARGET = wp.constant(3)
+"""First of three hidden columns of :func:`planar_pose_command`, counted from the command's first."""
+
+
+@wp.func
+def velocity_command(
+    world: int,
+    episodes: EpisodeArrays,
+    command: int,
+    stream: wp.uint32,
+    forward: wp.vec2,
+    left: wp.vec2,
+    turn: wp.vec2,
+    standing_share: float = 0.0,
+    turning_share: float = 0.0,
+    forward_share: float = 0.0,
+    least_forward: float = 0.3,
+    grows: bool = False,
+):
+    """Draw velocities forward, to the left [m/s] and turning left [rad/s], each evenly from its range; 3 numbers.
+
+    Of all commands ``standing_share`` are to stand still, of the others ``turning_share`` to turn on the spot, of the others
+    ``forward_share`` to go straight ahead, with ``least_forward`` [m/s] or more. ``grows``: all are multiplied by the task's level.
+
+    mjlab: UniformVelocityCommand (without headings). Isaac Lab: UniformVelocityCommand (without headings).
+    """
+    velocity = wp.vec3(
+        wp.randf(stream, forward[0], forward[1]), wp.randf(stream, left[0], left[1]), wp.randf(stream, turn[0], turn[1])
+    )
+    stands = wp.randf(stream) < standing_share
+    turns = wp.randf(stream) < turning_share
+    ahead = wp.randf(stream) < forward_share
+    if stands:
+        velocity = wp.vec3(0.0, 0.0, 0.0)
+    elif turns:
+        velocity = wp.vec3(0.0, 0.0, velocity[2])
+    elif ahead:
+        velocity = wp.vec3(wp.max(wp.abs(velocity[0]), least_forward), 0.0, 0.0)
+    if grows:
+        velocity = episodes.level[0] * velocity
+    for axis in range(3):
+        episodes.memory[world, command + axis] = velocity[axis]
+
+
+@wp.func
+def moving_velocity_command(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    bodies: BodyArrays,
+    command: int,
+    stream: wp.uint32,
+    forward: wp.vec2,
+    left: wp.vec2,
+    turn: wp.vec2,
+    moving_share: float,
+    standing_share: float = 0.0,
+):
+    """Draw velocities as :func:`velocity_command`, and let ``moving_share`` of all episodes begin with them; 3 numbers.
+
+    There the root's origin has the commanded velocity and the root the commanded turn, in its own frame.
+
+    mjlab: UniformVelocityCommand (init_velocity_prob). Isaac Lab: -.
+    """
+    velocity_command(world, episodes, command, stream, forward, left, turn, standing_share)
+    if episodes.ages[world] == 0 and between(stream, 0, wp.vec2(0.0, 1.0)) < moving_share:
+        rotation = root_rotation_of(worlds, robot, world)
+        linear = wp.vec3(episodes.memory[world, command], episodes.memory[world, command + 1], 0.0)
+        angular = wp.vec3(0.0, 0.0, episodes.memory[world, command + 2])
+        set_root_velocity(
+            worlds, robot, bodies, world, wp.quat_rotate(rotation, linear), wp.quat_rotate(rotation, angular)
+        )
+
+
+@wp.func
+def heading_velocity_command(
+    world: int,
+    episodes: EpisodeArrays,
+    command: int,
+    stream: wp.uint32,
+    forward: wp.vec2,
+    left: wp.vec2,
+    turn: wp.vec2,
+    heading: wp.vec2,
+    standing_share: float = 0.0,
+    heading_share: float = 1.0,
+    world_share: float = 0.0,
+    forward_share: float = 0.0,
+    least_forward: float = 0.3,
+):
+    """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and ``hidden=6``.
+
+    Give it ``update=Term(terms.steer_velocity_command, ...)``: for ``heading_share`` of all commands that turns the robot to its
+    heading, and for ``world_share`` it keeps the direction fixed in the world. Standing, these two and going straight ahead are drawn
+    independently of one another; ``standing_share`` comes before all.
+
+    mjlab: UniformVelocityCommand. Isaac Lab: UniformVelocityCommand.
+    """
+    velocity = wp.vec3(
+        wp.randf(stream, forward[0], forward[1]), wp.randf(stream, left[0], left[1]), wp.randf(stream, turn[0], turn[1])
+    )
+    episodes.memory[world, command + HEADING] = wp.randf(stream, heading[0], heading[1])
+    episodes.memory[world, command + FOLLOWS_HEADING] = wp.where(wp.randf(stream) < heading_share, 1.0, 0.0)
+    episodes.memory[world, command + IN_WORLD] = wp.where(wp.randf(stream) < world_share, 1.0, 0.0)
+    stands = wp.randf(stream) < standing_share
+    episodes.memory[world, command + STANDS] = wp.where(stands, 1.0, 0.0)
+    episodes.memory[world, command + WORLD_VELOCITY] = velocity[0]
+    episodes.memory[world, command + WORLD_VELOCITY + 1] = velocity[1]
+    if wp.randf(stream) < forward_share:
+        velocity = wp.vec3(wp.max(wp.abs(velocity[0]), least_forward), 0.0, 0.0)
+    if stands:
+        velocity = wp.vec3(0.0, 0.0, 0.0)
+    for axis in range(3):
+        episodes.memory[world, command + axis] = velocity[axis]
+
+
+@wp.func
+def steer_velocity_command(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    command: int,
+    turn: wp.vec2,
+    stiffness: float = 1.0,
+):
+    """Turn a robot to the heading of :func:`heading_velocity_command`: stiffness * (heading - yaw), clipped to ``turn`` [rad/s].
+
+    Commands of the world's frame are told in the robot's, as it is turned now; those that stand stay 0. ``stiffness`` is in 1/s.
+
+    mjlab: UniformVelocityCommand (heading_control_stiffness). Isaac Lab: UniformVelocityCommand (heading_control_stiffness).
+    """
+    if episodes.memory[world, command + STANDS] > 0.0:
+        for axis in range(3):
+            episodes.memory[world, command + axis] = 0.0
+        return
+    yaw = yaw_of(root_rotation_of(worlds, robot, world))
+    if episodes.memory[world, command + FOLLOWS_HEADING] > 0.0:
+        error = wrapped_angle(episodes.memory[world, command + HEADING] - yaw)
+        episodes.memory[world, command + 2] = wp.clamp(stiffness * error, turn[0], turn[1])
+    if episodes.memory[world, command + IN_WORLD] > 0.0:
+        along_x = episodes.memory[world, command + WORLD_VELOCITY]
+        along_y = episodes.memory[world, command + WORLD_VELOCITY + 1]
+        episodes.memory[world, command] = wp.cos(yaw) * along_x + wp.sin(yaw) * along_y
+        episodes.memory[world, command + 1] = wp.cos(yaw) * along_y - wp.sin(yaw) * along_x
+
+
+@wp.func
+def number_command(world: int, episodes: EpisodeArrays, command: int, stream: wp.uint32, bounds: wp.vec2):
+    """Draw one number evenly from ``bounds``, such as a height to stand at.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    episodes.memory[world, command] = wp.randf(stream, bounds[0], bounds[1])
+
+
+@wp.func
+def position_command(
+    world: int, episodes: EpisodeArrays, command: int, stream: wp.uint32, x: wp.vec2, y: wp.vec2, z: wp.vec2
+):
+    """Draw a point evenly from a box [m]; 3 numbers. Which frame it is in is up to the terms that read it.
+
+    mjlab: LiftingCommand (the target alone, in the world frame). Isaac Lab: UniformPoseCommand (the position alone).
+    """
+    episodes.memory[world, command] = wp.randf(stream, x[0], x[1])
+    episodes.memory[world, command + 1] = wp.randf(stream, y[0], y[1])
+    episodes.memory[world, command + 2] = wp.randf(stream, z[0], z[1])
+
+
+@wp.func
+def lift_command(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    command: int,
+    stream: wp.uint32,
+    x: wp.vec2,
+    y: wp.vec2,
+    z: wp.vec2,
+    object_x: wp.vec2,
+    object_y: wp.vec2,
+    object_z: wp.vec2,
+    object_yaw: wp.vec2,
+):
+    """Draw a target in the world frame [m], and put the object down at rest elsewhere [m, rad]; 3 numbers.
+
+    ``robot=`` names the object, whose root is free; its ranges are in the world frame.
+
+    mjlab: LiftingCommand. Isaac Lab: UniformPoseCommand (with reset_root_state_uniform of the object).
+    """
+    episodes.memory[world, command] = wp.randf(stream, x[0], x[1])
+    episodes.memory[world, command + 1] = wp.randf(stream, y[0], y[1])
+    episodes.memory[world, command + 2] = wp.randf(stream, z[0], z[1])
+    position = wp.vec3(
+        wp.randf(stream, object_x[0], object_x[1]),
+        wp.randf(stream, object_y[0], object_y[1]),
+        wp.randf(stream, object_z[0], object_z[1]),
+    )
+    rotation = quaternion_from_angles(0.0, 0.0, wp.randf(stream, object_yaw[0], object_yaw[1]))
+    set_root_pose(worlds, robot, world, wp.transform(position, rotation))
+    for axis in range(6):
+        worlds.joint_qd[world, robot.root_dof + axis] = 0.0
+
+
+@wp.func
+def pose_command(
+    world: int,
+    episodes: EpisodeArrays,
+    command: int,
+    stream: wp.uint32,
+    x: wp.vec2,
+    y: wp.vec2,
+    z: wp.vec2,
+    roll: wp.vec2,
+    pitch: wp.vec2,
+    yaw: wp.vec2,
+):
+    """Draw a pose in the root's frame: a point evenly from a box [m], roll, pitch and yaw [rad]; 7 numbers, position and quaternion xyzw.
+
+    mjlab: -. Isaac Lab: UniformPoseCommand.
+    """
+    episodes.memory[world, command] = wp.randf(stream, x[0], x[1])
+    episodes.memory[world, command + 1] = wp.randf(stream, y[0], y[1])
+    episodes.memory[world, command + 2] = wp.randf(stream, z[0], z[1])
+    about_x = wp.randf(stream, roll[0], roll[1])
+    about_y = wp.randf(stream, pitch[0], pitch[1])
+    about_z = wp.randf(stream, yaw[0], yaw[1])
+    rotation = quaternion_from_angles(about_x, about_y, about_z)
+    for axis in range(4):
+        episodes.memory[world, command + 3 + axis] = rotation[axis]
+
+
+@wp.func
+def planar_pose_command(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    command: int,
+    stream: wp.uint32,
+    x: wp.vec2,
+    y: wp.vec2,
+    heading: wp.vec2,
+):
+    """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and ``hidden=3``.
+
+    The numbers are forward and left to the place [m] and left to the heading [rad], as the robot stands now. Give it
+    ``update=Term(terms.steer_planar_pose_command)``, which calculates them again in every step.
+
+    mjlab: -. Isaac Lab: UniformPose2dCommand.
+    """
+    start = wp.transform_get_translation(robot.start)
+    episodes.memory[world, command + TARGET] = start[0] + wp.randf(stream, x[0], x[1])
+    episodes.memory[world, command + TARGET + 1] = start[1] + wp.randf(stream, y[0], y[1])
+    episodes.memory[world, command + TARGET + 2] = wp.randf(stream, heading[0], heading[1])
+    steer_planar_pose_command(world, worlds, episodes, robot, command)
+
+
+@wp.func
+def steer_planar_pose_command(
+    world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, command: int
+):
+    """Tell the place and heading of :func:`planar_pose_command` as the robot sees them now: forward, left [m], to turn left [rad].
+
+    mjlab: -. Isaac Lab: UniformPose2dCommand.
+    """
+    position = root_position_of(worlds, robot, world)
+    yaw = yaw_of(root_rotation_of(worlds, robot, world))
+    along_x = episodes.memory[world, command + TARGET] - position[0]
+    along_y = episodes.memory[world, command + TARGET + 1] - position[1]
+    episodes.memory[world, command] = wp.cos(yaw) * along_x + wp.sin(yaw) * along_y
+    episodes.memory[world, command + 1] = wp.cos(yaw) * along_y - wp.sin(yaw) * along_x
+    episodes.memory[world, command + 2] = wrapped_angle(episodes.memory[world, command + TARGET + 2] - yaw)
+
+
+@wp.func
+def command_number(world: int, episodes: EpisodeArrays, command: int, index: int) -> float:
+    """Number ``index`` of a command (``size=`` how many the policy is told) [unit of the command].
+
+    mjlab: generated_commands. Isaac Lab: generated_commands.
+    """
+    return episodes.memory[world, command + index]
+
+
+@wp.func
+def command_vector(world: int, episodes: EpisodeArrays, command: int) -> wp.vec3:
+    """The first three numbers of a command, such as velocities or a position [unit of the command].
+
+    mjlab: generated_commands. Isaac Lab: generated_commands.
+    """
+    return wp.vec3(
+        episodes.memory[world, command], episodes.memory[world, command + 1], episodes.memory[world, command + 2]
+    )
+
+
+@wp.func
+def command_rotation(world: int, episodes: EpisodeArrays, command: int) -> wp.quat:
+    """The rotation of a pose command, its numbers 3 to 6, a quaternion xyzw.
+
+    mjlab: -. Isaac Lab: generated_commands (its last four numbers, wxyz).
+    """
+    return wp.quat(
+        episodes.memory[world, command + 3],
+        episodes.memory[world, command + 4],
+        episodes.memory[world, command + 5],
+        episodes.memory[world, command + 6],
+    )
+
+
+@wp.func
+def command_speed(world: int, episodes: EpisodeArrays, command: int) -> float:
+    """How much a velocity command asks for: speed [m/s] + magnitude of the turning velocity [rad/s].
+
+    mjlab: total_command (inside of its rewards). Isaac Lab: -.
+    """
+    asked = command_vector(world, episodes, command)
+    return wp.length(wp.vec2(asked[0], asked[1])) + wp.abs(asked[2])

@@ -1,0 +1,171 @@
+"""A recorded motion that a robot is to follow: its file, and its numbers on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+
+if TYPE_CHECKING:
+    from worker.simulation.sensors.sensor import SensorContext
+
+wp.set_module_options({"enable_backward": False})
+
+_WIDTHS = {
+    "joint_pos": 0,
+    "joint_vel": 0,
+    "body_pos_w": 3,
+    "body_quat_w": 4,
+    "body_lin_vel_w": 3,
+    "body_ang_vel_w": 3,
+}
+"""Arrays of the file and the last dimension of those of bodies."""
+
+
+@wp.struct
+class MotionArrays:
+    """A recorded motion, one row a frame; one column a joint of the robot, or a body that is followed.
+
+    Attributes:
+        joint_positions: Of all joints of the robot [m, rad], shape ``(frames, joints)``.
+        joint_velocities: The same [m/s, rad/s].
+        positions: Of the bodies' origins, in the world frame [m], shape ``(frames, bodies)``.
+        rotations: Of the bodies [quaternion xyzw], shape ``(frames, bodies)``.
+        linear: Velocities of the bodies' origins, in the world frame [m/s], shape ``(frames, bodies)``.
+        angular: Angular velocities, in the world frame [rad/s], shape ``(frames, bodies)``.
+        roots: Pose of the root, shape ``(frames,)``.
+        root_linear: Velocity of the root's origin, in the world frame [m/s], shape ``(frames,)``.
+        root_angular: Angular velocity of the root, in the world frame [rad/s], shape ``(frames,)``.
+        bodies: Columns of ``BodyArrays`` of the bodies that are followed, shape ``(bodies,)``.
+        anchor: Which of these is the anchor, to which the others are seen.
+        rate: Frames of a control step.
+    """
+
+    joint_positions: wp.array2d(dtype=wp.float32)
+    joint_velocities: wp.array2d(dtype=wp.float32)
+    positions: wp.array2d(dtype=wp.vec3)
+    rotations: wp.array2d(dtype=wp.quat)
+    linear: wp.array2d(dtype=wp.vec3)
+    angular: wp.array2d(dtype=wp.vec3)
+    roots: wp.array(dtype=wp.transform)
+    root_linear: wp.array(dtype=wp.vec3)
+    root_angular: wp.array(dtype=wp.vec3)
+    bodies: wp.array(dtype=wp.int32)
+    anchor: int
+    rate: float
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A recorded motion, declared beside a task's sensors; a term that takes ``motion`` finds it there.
+
+    Attributes:
+        file: NumPy archive as mjlab writes it: ``fps``, ``joint_pos`` and ``joint_vel`` (frames, joints), ``body_pos_w``,
+            ``body_quat_w`` (wxyz), ``body_lin_vel_w`` (of the bodies' origins) and ``body_ang_vel_w`` (frames, bodies, ...), in the world
+            frame, of all joints and bodies of the robot in the model's order, the root first.
+        bodies: Pattern or patterns of the bodies that are followed.
+        anchor: The body to which the others are seen, one of ``bodies``.
+        robot: Who follows it.
+    """
+
+    arrays_type: ClassVar[Any] = MotionArrays
+    file: str | Path
+    bodies: str | Sequence[str]
+    anchor: str
+    robot: str = "robot"
+
+    def build(self, context: SensorContext) -> RecordedMotion:
+        """The motion on the device of these worlds.
+
+        Raises:
+            ValueError: The file can't be read, lacks an array, or is of another robot; or a pattern fits no body.
+        """
+        view = context.view(self.robot, "Motion.robot")
+        found = view.find_bodies(self.bodies)
+        names = [view.body_names[each] for each in found]
+        anchors = view.find_bodies(self.anchor)
+        if len(anchors) != 1 or anchors[0] not in found:
+            raise ValueError(
+                f"Motion.anchor: name one of the bodies that are followed, not {self.anchor!r}; {', '.join(names)}"
+            )
+        data = _read(Path(self.file), len(view.joint_names), len(view.body_names))
+        arrays = MotionArrays()
+        device = context.device
+        data["body_quat_w"] = data["body_quat_w"][..., [1, 2, 3, 0]]
+        for name, key in (("joint_positions", "joint_pos"), ("joint_velocities", "joint_vel")):
+            setattr(arrays, name, wp.array(data[key], dtype=wp.float32, device=device))
+        kinds = (
+            ("positions", "pos", wp.vec3),
+            ("rotations", "quat", wp.quat),
+            ("linear", "lin_vel", wp.vec3),
+            ("angular", "ang_vel", wp.vec3),
+        )
+        for name, key, kind in kinds:
+            setattr(arrays, name, wp.array(data[f"body_{key}_w"][:, found], dtype=kind, device=device))
+        roots = np.concatenate([data["body_pos_w"][:, 0], data["body_quat_w"][:, 0]], axis=-1)
+        arrays.roots = wp.array(roots, dtype=wp.transform, device=device)
+        arrays.root_linear = wp.array(data["body_lin_vel_w"][:, 0], dtype=wp.vec3, device=device)
+        arrays.root_angular = wp.array(data["body_ang_vel_w"][:, 0], dtype=wp.vec3, device=device)
+        arrays.bodies = wp.array([view.bodies[each] for each in found], dtype=wp.int32, device=device)
+        arrays.anchor = found.index(anchors[0])
+        arrays.rate = float(data["fps"]) / context.control_hz
+        return RecordedMotion(arrays, tuple(names))
+
+
+class RecordedMotion:
+    """A :class:`Motion` of some worlds; it never changes, so it has nothing to measure.
+
+    Args:
+        arrays: The motion.
+        names: Of the bodies that are followed.
+    """
+
+    needs_bodies = False
+
+    def __init__(self, arrays: MotionArrays, names: tuple[str, ...]) -> None:
+        self.arrays, self.names = arrays, names
+
+    def advance(self) -> None:
+        """Nothing changes in a step: where in the motion a world is, is in its command."""
+
+    def settle(self) -> None:
+        """Nothing changes at a reset."""
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Nothing outlasts a step."""
+        return {}
+
+
+def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:
+    """The arrays of a motion's file, float32, of the robot's shapes."""
+    try:
+        with np.load(file) as archive:
+            data = {
+                name: np.asarray(archive[name], dtype=np.float32) for name in archive.files if name in (*_WIDTHS, "fps")
+            }
+    except (OSError, ValueError, AttributeError) as error:
+        raise ValueError(f"Motion.file: {file} can't be read as a NumPy archive: {error}") from error
+    if lacking := [name for name in ("fps", *_WIDTHS) if name not in data]:
+        raise ValueError(
+            f"Motion.file: {file} has no array {lacking[0]}; it has {', '.join(data) or 'none of a motion'}"
+        )
+    frames = data["joint_pos"].shape[0]
+    for name, width in _WIDTHS.items():
+        wanted = (frames, bodies, width) if width else (frames, joints)
+        if data[name].shape != wanted or frames == 0:
+            raise ValueError(
+                f"Motion.file: {name} of {file} has the shape {data[name].shape}; the robot has {joints} joints and {bodies} bodies, so "
+                f"that it must be {wanted}, with one frame or more"
+            )
+        if not np.isfinite(data[name]).all():
+            raise ValueError(f"Motion.file: {name} of {file} has numbers that are not finite")
+    data["fps"] = data["fps"].reshape(-1)[:1]
+    if data["fps"].size != 1 or not data["fps"][0] > 0:
+        raise ValueError(f"Motion.file: fps of {file} must be one number above 0")
+    data["fps"] = data["fps"][0]
+    return data

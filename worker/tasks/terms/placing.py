@@ -1,0 +1,56 @@
+"""What terms that place robots share: numbers drawn from a stream, roots and joints put somewhere."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from worker.simulation.kinematics import set_root_pose, set_root_velocity
+from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.worlds import WorldArrays
+
+wp.set_module_options({"enable_backward": False})
+
+NONE = wp.constant(wp.vec2(0.0, 0.0))
+"""The range of what is not drawn."""
+
+
+@wp.func
+def between(stream: wp.uint32, number: int, bounds: wp.vec2) -> float:
+    """Number ``number`` that is drawn from a stream, evenly from ``bounds``; each has a stream of its own."""
+    own = wp.rand_init(int(stream), number)
+    return wp.randf(own, bounds[0], bounds[1])
+
+
+@wp.func
+def place_root(
+    world: int,
+    worlds: WorldArrays,
+    robot: RobotArrays,
+    bodies: BodyArrays,
+    origin: wp.vec3,
+    offset: wp.vec3,
+    turn: wp.quat,
+    linear: wp.vec3,
+    angular: wp.vec3,
+):
+    """Put the root at its start + ``origin`` + ``offset``, turned by ``turn`` in its own frame, with these velocities of the world frame."""
+    position = wp.transform_get_translation(robot.start) + origin + offset
+    set_root_pose(worlds, robot, world, wp.transform(position, wp.transform_get_rotation(robot.start) * turn))
+    set_root_velocity(worlds, robot, bodies, world, linear, angular)
+
+
+@wp.func
+def set_joint(worlds: WorldArrays, robot: RobotArrays, world: int, joint: int, position: float, velocity: float):
+    """Give a joint this position [m, rad] and velocity [m/s, rad/s]."""
+    worlds.joint_q[world, robot.coordinates[joint]] = position
+    worlds.joint_qd[world, robot.dofs[joint]] = velocity
+
+
+@wp.func
+def within_limits(robot: RobotArrays, joint: int, position: float, soft_factor: float) -> float:
+    """A position within ``soft_factor`` times a joint's range about its middle."""
+    ends = robot.ranges[joint]
+    margin = 0.5 * (1.0 - soft_factor) * (ends[1] - ends[0])
+    if not wp.isfinite(margin):
+        margin = 0.0
+    return wp.clamp(position, ends[0] + margin, ends[1] - margin)

@@ -1,0 +1,172 @@
+"""Posture: how far joints may be from their default positions, each within a tolerance of its own.
+
+The tolerances are declared beside a task's sensors, ``sensors={"tolerances": terms.Tolerances(standing={"*_hip": 0.05, "*": 0.1})}``,
+and a term that takes ``tolerances`` finds them there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.patterns import resolve
+from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.terms.commands import command_speed
+from worker.tasks.terms.joints import joint_offset
+
+if TYPE_CHECKING:
+    from worker.simulation.sensors.sensor import SensorContext
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class ToleranceArrays:
+    """How far each joint may be from its default position: standard deviations [m, rad], shape ``(joints,)`` of ``columns``.
+
+    Attributes:
+        columns: The joints that have one, indices into the arrays of ``RobotArrays``.
+        standing: While the robot is to stand.
+        walking: While it is to walk.
+        running: While it is to run.
+    """
+
+    columns: wp.array(dtype=wp.int32)
+    standing: wp.array(dtype=wp.float32)
+    walking: wp.array(dtype=wp.float32)
+    running: wp.array(dtype=wp.float32)
+
+
+@wp.func
+def posture_within(
+    worlds: WorldArrays,
+    robot: RobotArrays,
+    columns: wp.array(dtype=wp.int32),
+    deviations: wp.array(dtype=wp.float32),
+    world: int,
+) -> float:
+    """exp(-mean of e^2 / s^2) over joints, e the distance of each from its default and s its tolerance."""
+    total = float(0.0)
+    for number in range(columns.shape[0]):
+        error = joint_offset(world, worlds, robot, columns[number]) / deviations[number]
+        total += error * error
+    return wp.exp(-total / float(columns.shape[0]))
+
+
+@wp.func
+def tolerant_posture(world: int, worlds: WorldArrays, robot: RobotArrays, tolerances: ToleranceArrays) -> float:
+    """exp(-mean of e^2 / s^2) over the joints of ``tolerances``, e the distance of each from its default and s its ``standing`` [rad, m].
+
+    mjlab: posture. Isaac Lab: -.
+    """
+    return posture_within(worlds, robot, tolerances.columns, tolerances.standing, world)
+
+
+@wp.func
+def commanded_posture(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    tolerances: ToleranceArrays,
+    command: int,
+    walking: float = 0.5,
+    running: float = 1.5,
+) -> float:
+    """As :func:`tolerant_posture`, with the tolerances of what a velocity command asks for.
+
+    ``walking`` holds from that much on, ``running`` from that: speed [m/s] + turning velocity [rad/s].
+
+    mjlab: variable_posture. Isaac Lab: -.
+    """
+    asked = command_speed(world, episodes, command)
+    if asked < walking:
+        return posture_within(worlds, robot, tolerances.columns, tolerances.standing, world)
+    if asked < running:
+        return posture_within(worlds, robot, tolerances.columns, tolerances.walking, world)
+    return posture_within(worlds, robot, tolerances.columns, tolerances.running, world)
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far each joint may be from its default position, by patterns of joints; the first pattern that fits a joint counts.
+
+    Attributes:
+        standing: Standard deviation of each joint [m, rad], or one for all. Joints that no pattern fits don't count.
+        walking: The same while the robot is to walk, of the same joints; None: as ``standing``.
+        running: The same while it is to run; None: as ``walking``.
+        robot: Whose joints they are.
+    """
+
+    arrays_type: ClassVar[Any] = ToleranceArrays
+    standing: Mapping[str, float] | float
+    walking: Mapping[str, float] | float | None = None
+    running: Mapping[str, float] | float | None = None
+    robot: str = "robot"
+
+    def build(self, context: SensorContext) -> JointTolerances:
+        """The tolerances on the device of these worlds.
+
+        Raises:
+            ValueError: A pattern fits no joint, a joint of ``standing`` has no other tolerance, or a tolerance is not above 0.
+        """
+        names = list(context.view(self.robot, "Tolerances.robot").joint_names)
+        walking = self.standing if self.walking is None else self.walking
+        running = walking if self.running is None else self.running
+        found = {}
+        for speed, values in (("standing", self.standing), ("walking", walking), ("running", running)):
+            found[speed] = _by_joint(f"Tolerances.{speed}", values, names)
+            if lacking := [name for name in found["standing"] if name not in found[speed]]:
+                raise ValueError(f"Tolerances.{speed}: no pattern fits {lacking[0]}, which standing has; add one")
+        joints = [name for name in names if name in found["standing"]]
+        arrays = ToleranceArrays()
+        arrays.columns = wp.array([names.index(name) for name in joints], dtype=wp.int32, device=context.device)
+        for speed, values in found.items():
+            setattr(arrays, speed, wp.array([values[name] for name in joints], dtype=wp.float32, device=context.device))
+        return JointTolerances(arrays, tuple(joints))
+
+
+class JointTolerances:
+    """:class:`Tolerances` of some worlds; they never change, so it has nothing to measure.
+
+    Args:
+        arrays: The tolerances.
+        names: Of the joints, in the order of the arrays.
+    """
+
+    needs_bodies = False
+
+    def __init__(self, arrays: ToleranceArrays, names: tuple[str, ...]) -> None:
+        self.arrays, self.names = arrays, names
+
+    def advance(self) -> None:
+        """Nothing changes in a step."""
+
+    def settle(self) -> None:
+        """Nothing changes at a reset."""
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Nothing outlasts a step."""
+        return {}
+
+
+def _by_joint(place: str, values: Mapping[str, float] | float, names: list[str]) -> dict[str, float]:
+    """The value of each joint that a pattern fits."""
+    for pattern, value in values.items() if isinstance(values, Mapping) else (("*", values),):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (0.0 < value < math.inf):
+            raise ValueError(f"{place}.{pattern}: a tolerance is a number above 0, found {value!r}")
+    try:
+        found = resolve(names, values, "joint")
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+    result = {name: float(value) for name, value in zip(names, found, strict=True) if value is not None}
+    if not result:
+        raise ValueError(f"{place}: name at least one joint; there are {', '.join(names) or 'none'}")
+    return result
