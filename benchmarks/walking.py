@@ -139,7 +139,7 @@ def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
         "save_every": options.save_every,
         "seed": seed,
     }
-    loop = build_loop(asked, store, WalkingLoop, algorithm=options.algorithm)
+    loop = build_loop(asked, store, WalkingLoop, algorithm=options.algorithm, **options.train)
     assert isinstance(loop, WalkingLoop)
     own = type(loop.task)
     worlds = own(loop.config, options.judged, seed=held_out_seed(seed), device=loop.gang.device)
@@ -154,6 +154,7 @@ def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
     return {
         "task": options.task,
         "algorithm": options.algorithm,
+        "train": options.train,
         "worlds": options.worlds,
         "seed": seed,
         "limits": options.limits,
@@ -249,6 +250,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--angular", type=float, default=ANGULAR, help="greatest error [rad/s]")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    parser.add_argument(
+        "--train",
+        type=json.loads,
+        default={},
+        help='more of the job\'s train section, as JSON: \'{"sac": {"updates": 32}}\'',
+    )
     add_option(parser)
     options = parser.parse_args(arguments)
     try:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import ipaddress
 import json
 import logging
 import os
@@ -160,9 +161,11 @@ class DockerEngine:
         """Address of this machine on Docker's default bridge, which containers of every network reach; None if it has none."""
         try:
             [config] = self._client.networks.get("bridge").attrs["IPAM"]["Config"]
+            # an engine that found the bridge already there leaves the gateway out: then it is the subnet's first address
+            address = config.get("Gateway") or str(next(ipaddress.ip_network(config["Subnet"]).hosts()))
             with socket.socket() as probe:
-                probe.bind((config["Gateway"], 0))
-            return str(config["Gateway"])
+                probe.bind((address, 0))
+            return str(address)
         except (DockerException, KeyError, ValueError, OSError):  # an engine on another machine, or without a bridge
             return None
 

@@ -67,6 +67,35 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
     assert not set(json.loads(other)["addresses"]) & set(addresses)
 
 
+@pytest.mark.parametrize("told", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
+def test_containers_reach_this_machine_at_the_address_that_the_engine_found(
+    bench: DockerBench, monkeypatch: pytest.MonkeyPatch, told: bool
+) -> None:
+    networks = type(bench.client.networks)
+    asked = networks.get
+
+    def get(self: Any, name: str) -> Any:
+        network = asked(self, name)
+        [config] = network.attrs["IPAM"]["Config"]
+        config.setdefault("Gateway", config["Subnet"].rpartition(".")[0] + ".1") if told else config.pop(
+            "Gateway", None
+        )
+        return network
+
+    monkeypatch.setattr(networks, "get", get)
+    address = bench.new_engine().address
+    assert address
+    with socket.create_server((address, 0)) as server:
+        server.settimeout(30)
+        port = server.getsockname()[1]
+        say = f'import socket; socket.create_connection(("{address}", {port})).sendall(b"here")'
+        handle = bench.launch(bench.gang(f"exec python3 -c '{say}'", 1))
+        connection, _ = server.accept()
+        with connection:
+            assert connection.recv(4) == b"here"
+    assert [node.exit_code for node in bench.ended(handle)] == [0]
+
+
 def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: DockerBench) -> None:
     (bench.home / "data").mkdir()
     (bench.home / "data" / "file").write_text("found")

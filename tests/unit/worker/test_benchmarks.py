@@ -54,7 +54,11 @@ def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> 
     assert line == "Cartpole with 64 worlds by Muster: 153,600 steps took 9.2 s, its rate says 2.4 s"
 
 
-def test_compile_times_are_read_from_what_warp_says(capfd: pytest.CaptureFixture[str]) -> None:
+def test_compile_times_are_read_from_what_warp_says(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)  # a training in this process may have silenced it
+
     @wp.kernel(module="unique")
     def fill(values: wp.array(dtype=wp.float32)):
         values[wp.tid()] = 2.0
