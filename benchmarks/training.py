@@ -49,7 +49,8 @@ SWEEP = [2048, 8192, 32768, 65536]
 def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9, **train: Any) -> Loop:
     """The real training loop, on a store of its own; it saves every so many iterations, by default never."""
     placement = Placement.from_env(os.environ)
-    run = Store(store).open().run(f"bench-{task}-{worlds}-{seed}".lower())
+    name = task.rpartition(":")[2]  # of a task by its path
+    run = Store(store).open().run(f"bench-{name}-{worlds}-{seed}".lower())
     if placement.rank == 0:
         run.create({"run": run.name})
         raise_epoch(run, 1)

@@ -39,7 +39,7 @@ ALGORITHMS = ("sac", "ppo")
 LENGTH = 0.987
 """Share of the longest episode: 987 of 1,000 steps, as the public records of G1 have it."""
 LINEAR, ANGULAR = 0.3, 0.4
-"""Tracking errors of a robot that walks where it is told [m/s, rad/s]: commands reach 1 m/s and 0.5 rad/s, and pushes of up to 0.5 m/s
+"""Tracking errors of a robot that follows its commands [m/s, rad/s]: commands reach 1 m/s and 0.5 rad/s, and pushes of up to 0.5 m/s
 come every 1 to 3 s."""
 
 
@@ -218,7 +218,7 @@ def check(options: argparse.Namespace) -> None:
     """Raises ValueError for options that make no sense."""
     tasks = [case.task for case in CASES.values() if "mjlab" in case.peers]
     if options.task not in tasks:
-        raise ValueError(f"--task {options.task}: it does not walk where it is told; {nearest(options.task, tasks)}")
+        raise ValueError(f"--task {options.task}: it follows no velocity commands; {nearest(options.task, tasks)}")
     if options.algorithm not in ALGORITHMS:
         raise ValueError(f"--algorithm {options.algorithm}: there are {' and '.join(ALGORITHMS)}")
     if options.limits not in ("theirs", "ours"):

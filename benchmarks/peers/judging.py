@@ -1,4 +1,4 @@
-"""One judgement of velocity-following policies, whoever trained them: tracking errors and how long episodes are, on the same worlds."""
+"""One judgement of velocity-following policies of any system: tracking errors and how long episodes are, on the same worlds."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def _row(setting: tuple[Any, ...], name: str, group: Sequence[Record], ours: flo
 
 def _judgements(judged: Sequence[Record]) -> list[str]:
     lines = [
-        "Mean actions in the same worlds of Muster's task, whoever trained them, with noise, pushes and randomisation. Linear: distance "
+        "Mean actions of all systems in the same worlds of Muster's task, with noise, pushes and randomisation. Linear: distance "
         "from the commanded velocity in the plane; angular: from the commanded turning velocity. As good as: training time after which "
         "both errors of a training by Muster with the same case were no greater, and its episodes no shorter, than those of the peer's "
         "last policy, and how many times longer the peer took to its own.",

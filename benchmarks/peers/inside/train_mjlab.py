@@ -35,7 +35,7 @@ def contract(environment: Any) -> dict[str, Any]:
 
 
 def probe(runner: Any, least: int = 8) -> dict[str, Any]:
-    """What mjlab's own policy makes of some observations, after the last iteration: whoever converts its weights can compare."""
+    """What mjlab's own policy makes of some observations, after the last iteration, to compare with converted weights."""
     import torch
 
     seen = runner.env.get_observations().to(runner.device)[:least]

@@ -250,7 +250,7 @@ def test_what_the_commands_refuse(words: str, said: str, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--task Ant", "--task Ant: it does not walk where it is told; there are Go1Flat, G1Flat"),
+        ("--task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
         ("--task G1Flatt", "did you mean G1Flat?"),
         ("--algorithm td3", "--algorithm td3: there are sac and ppo"),
         ("--every 0", "--every 0.0: it is more than 0"),

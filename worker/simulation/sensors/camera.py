@@ -173,8 +173,8 @@ class CameraSensor:
         kind: ``"color"``, ``"grey"``, ``"depth"`` or ``"segmentation"``.
         frames: Images of one observation: the present one and those of the control steps before.
         samples: Rays of each pixel, of colour and grey.
-        near: Least depth that is told [m].
-        far: Greatest depth that is told [m].
+        near: Least depth in an image [m].
+        far: Greatest depth in an image [m].
         of: What a segmentation tells apart: names of robots and objects, and ``"ground"``; None: all of these.
         position_range: Each camera is mounted up to this far from its place, along each axis of its body or the world [m]; a number, or
             three.

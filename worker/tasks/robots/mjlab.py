@@ -1,4 +1,4 @@
-"""Files and servos of the robots in the Python package ``mjlab`` (Apache-2.0), of which nothing but files is read."""
+"""Files and servos of the robots in the Python package ``mjlab`` (Apache-2.0). Only its files are read; none of its code runs."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _default(value: Any) -> str:
 REFERENCE = """\
 # Terms
 
-The functions of `worker.tasks.terms`, of which a declared task is made. A task names them, such as
+The functions of `worker.tasks.terms`. A declared task names them, such as
 `Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) says which of mjlab's and Isaac Lab's
 terms each stands for. This page is written by `python -m worker.tasks.terms` from the functions' docstrings.
 

@@ -60,6 +60,31 @@ def swung_foot_clearance(
 
 
 @wp.func
+def swing_error(
+    world: int,
+    episodes: EpisodeArrays,
+    contacts: ContactArrays,
+    index: int,
+    command: int,
+    memory: int,
+    clearance: float,
+    height: float,
+    threshold: float,
+) -> float:
+    """At touchdown (p / height - 1)^2, p the greatest ``clearance`` of the foot in its swing [m], else 0; it remembers p."""
+    peak = episodes.memory[world, memory + index]
+    if not touches(contacts, world, index):
+        peak = wp.max(peak, clearance)
+    error = float(0.0)
+    if first_contact(contacts, world, index):
+        if command_speed(world, episodes, command) > threshold:
+            error = (peak / height - 1.0) * (peak / height - 1.0)
+        peak = 0.0
+    episodes.memory[world, memory + index] = peak
+    return error
+
+
+@wp.func
 def swung_foot_height_error(
     world: int,
     episodes: EpisodeArrays,
@@ -78,16 +103,8 @@ def swung_foot_height_error(
 
     mjlab: feet_swing_height. Isaac Lab: -.
     """
-    peak = episodes.memory[world, memory + index]
-    if not touches(contacts, world, index):
-        peak = wp.max(peak, frame_clearance(world, scan, index, points))
-    error = float(0.0)
-    if first_contact(contacts, world, index):
-        if command_speed(world, episodes, command) > threshold:
-            error = (peak / height - 1.0) * (peak / height - 1.0)
-        peak = 0.0
-    episodes.memory[world, memory + index] = peak
-    return error
+    clearance = frame_clearance(world, scan, index, points)
+    return swing_error(world, episodes, contacts, index, command, memory, clearance, height, threshold)
 
 
 @wp.func

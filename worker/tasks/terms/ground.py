@@ -12,14 +12,15 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.kinematics import quaternion_from_angles, root_position_of, root_rotation_of
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
-from worker.simulation.sensors.contact import ContactArrays, first_contact
+from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.simulation.terrain_arrays import TerrainArrays, ground_height, on_terrain, terrain_origin
 from worker.simulation.terrain_levels import walked_levels
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.terms.commands import command_speed
-from worker.tasks.terms.contacts import planar_speed, touches
+from worker.tasks.terms.contacts import planar_speed
+from worker.tasks.terms.footing import swing_error
 from worker.tasks.terms.placing import NONE, between, place_root
 
 wp.set_module_options({"enable_backward": False})
@@ -168,16 +169,8 @@ def swing_height_error_above_ground(
 
     mjlab: feet_swing_height. Isaac Lab: -.
     """
-    peak = episodes.memory[world, memory + index]
-    if not touches(contacts, world, index):
-        peak = wp.max(peak, above_ground(terrain, frames.positions[world, index]))
-    error = float(0.0)
-    if first_contact(contacts, world, index):
-        if command_speed(world, episodes, command) > threshold:
-            error = (peak / height - 1.0) * (peak / height - 1.0)
-        peak = 0.0
-    episodes.memory[world, memory + index] = peak
-    return error
+    clearance = above_ground(terrain, frames.positions[world, index])
+    return swing_error(world, episodes, contacts, index, command, memory, clearance, height, threshold)
 
 
 @wp.func
