@@ -26,6 +26,7 @@ from orchestrator.disk import DEFAULT, Disk, MinFree
 from orchestrator.engines.several import Several
 from orchestrator.gangs import Gangs, StoreUnavailable
 from orchestrator.jobs import WAITING, Ending, Status
+from orchestrator.monitoring import Monitoring
 from orchestrator.peers import Peers
 from orchestrator.roster import Roster
 from orchestrator.scheduling import Board, Cancel, Decisions, Leading, Preempt, Start, decide
@@ -76,7 +77,8 @@ class Controller:
         self._short = False
         self.roster = Roster()
         self.clock = clock or Clock()
-        self.gangs = Gangs(engine, store, bus, peers, self.clock, self.wake)
+        self.monitoring = Monitoring()
+        self.gangs = Gangs(engine, store, bus, peers, self.clock, self.monitoring, self.wake)
         self.writing = threading.Lock()
         """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
         self.submissions = Together(database, self.writing)
@@ -309,7 +311,9 @@ class Controller:
             )
         decisions = decide(snapshot)
         self._board, self._leading = decisions.board, decisions.leading
-        self._passed = (version, started, time.monotonic() - started)
+        took = time.monotonic() - started
+        self._passed = (version, started, took)
+        self.monitoring.pass_took(took)
         self._carry_out(decisions)
 
     def _carry_out(self, decisions: Decisions) -> None:

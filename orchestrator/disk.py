@@ -68,6 +68,11 @@ class Disk:
         for volume in self._volumes:
             volume.short = self._look(volume)
 
+    @property
+    def names(self) -> list[str]:
+        """What the volumes are for."""
+        return [volume.name for volume in self._volumes]
+
     def start(self) -> None:
         """Look at each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
         for volume in self._volumes:

@@ -26,6 +26,7 @@ from orchestrator.definition import GangNeeds, gang_needs
 from orchestrator.engines.base import EngineError, EngineFault, Gang, GangStatus, NotYet, Plan, engine_of
 from orchestrator.engines.several import Several
 from orchestrator.jobs import AWS_EXITED, Ending, NodeEnd, Status, Verdict, judge, judge_as_aws
+from orchestrator.monitoring import Monitoring
 from orchestrator.ownership import first_description, record_owner
 from orchestrator.peers import Peers
 from orchestrator.pools import engine_options
@@ -66,10 +67,17 @@ class Gangs:
     """Drives attempts; ``changed`` is called (from any thread) when one of them should be looked at."""
 
     def __init__(
-        self, engine: Several, store: Store, bus: Bus, peers: Peers, clock: Clock, changed: Callable[[], None]
+        self,
+        engine: Several,
+        store: Store,
+        bus: Bus,
+        peers: Peers,
+        clock: Clock,
+        monitoring: Monitoring,
+        changed: Callable[[], None],
     ) -> None:
         self.engine, self.store, self.bus = engine, store, bus
-        self.peers, self.clock, self.changed = peers, clock, changed
+        self.peers, self.clock, self.monitoring, self.changed = peers, clock, monitoring, changed
         self._stops: dict[tuple[str, int], Future[GangStatus]] = {}
         self._finished: dict[tuple[str, int], float] = {}
         self._denied = Backoff(log, _STOP_AGAIN, _STOP_RARELY)
@@ -105,6 +113,8 @@ class Gangs:
         attempt = Attempt(job_id=job.id, number=number, epoch=epoch, pool=start.pool, nodes=nodes, created_at=now())
         attempt.held_since = self.clock.now()
         job.attempts.append(attempt)
+        waited = attempt.held_since - (job.queued_since or attempt.held_since)
+        self.monitoring.begun(session, job, attempt, waited / 1000)
         job.move(Status.STARTING, f"starting {_size(job, len(nodes))}")
         session.commit()
         self._launch(session, job, attempt)
@@ -349,6 +359,7 @@ class Gangs:
         left = ending == Ending.REQUEUE and ran >= _SHORTEST_REQUEUE
         attempt.spent = not (left or ending == Ending.PREEMPTED)
         charge(attempt, self.store.run(job.run), moment)
+        self.monitoring.ended(session, job, attempt)
         self._charge_share(session, job, attempt, moment)
         spent = sum(1 for each in job.attempts if each.spent)
         tries_left = spent < job.attempts_allowed

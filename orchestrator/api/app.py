@@ -8,12 +8,13 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from orchestrator.api import batch, docs_page, logs, native
+from orchestrator import monitoring
+from orchestrator.api import batch, docs_page, logs, native, permissions
 from orchestrator.api.auth import Access, Guard, error_response, kind_of
 from orchestrator.api.context import IDEMPOTENCY_HEADER
 from orchestrator.api.errors import ClientError
@@ -57,6 +58,12 @@ def create_app(controller: Controller, access: Access | None = None, limit: Rate
         if trouble is not None:
             return JSONResponse({"status": "unavailable", "message": trouble, "version": __version__}, 503)
         return JSONResponse({"status": "ok", "version": __version__})
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    def metrics() -> Response:
+        """What a Prometheus server reads: jobs, waits, restarts, GPU-seconds used and lost, steps a second, hosts; for keys with all queues."""
+        permissions.check_all_queues(permissions.Operation.READ_MONITORING)
+        return Response(monitoring.exposition(controller), media_type=monitoring.CONTENT_TYPE)
 
     @app.post("/v1/{operation}", include_in_schema=False)
     async def aws_batch(operation: str, request: Request) -> JSONResponse:

@@ -97,6 +97,7 @@ class Operation(StrEnum):
     READ_HEALTH = "GET /healthz"
     READ_FRONT_PAGE = "GET /"
     READ_DOCUMENTATION = "GET /api/docs"
+    READ_MONITORING = "GET /metrics"
     READ_CAPACITY = "GET /api/capacity"
     PLAN = "POST /api/plan"
     FIT = "POST /api/fit"
@@ -149,6 +150,17 @@ def check(operation: Operation, *objects: Object) -> None:
                 "AccessDeniedException",
                 f"{identity.name} may use job queue {queues} only: {operation} is refused, since {_whose(each)}",
             )
+
+
+def check_all_queues(operation: Operation) -> None:
+    """Raise Refusal where the caller may not see what all queues have in one answer."""
+    identity = current_identity.get()
+    if identity.queues is not None:
+        queues = ", ".join(sorted(identity.queues)) or "none"
+        raise Refusal(
+            "AccessDeniedException",
+            f"{identity.name} may use job queue {queues} only: {operation} is refused, since it tells of all queues",
+        )
 
 
 def is_visible(thing: Object) -> bool:

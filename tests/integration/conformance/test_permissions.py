@@ -27,6 +27,8 @@ OWN_LIST = "+ + + o h h o"
 """It is listed: ``o`` is an answer without it."""
 SHARED_WRITE = "+ + - - - - -"
 SHARED_READ = "+ + + + + + +"
+ALL_READ = "+ + - - + - -"
+"""It tells of all queues at once."""
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
@@ -66,6 +68,7 @@ TABLE = {
     Operation.READ_HEALTH: SHARED_READ,
     Operation.READ_FRONT_PAGE: SHARED_READ,
     Operation.READ_DOCUMENTATION: SHARED_READ,
+    Operation.READ_MONITORING: ALL_READ,
     Operation.READ_CAPACITY: SHARED_READ,
     Operation.PLAN: OWN_WRITE,
     Operation.FIT: OWN_WRITE,
@@ -157,6 +160,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.READ_HEALTH),
         of_ours(of.READ_FRONT_PAGE),
         of_ours(of.READ_DOCUMENTATION),
+        of_ours(of.READ_MONITORING),
         of_ours(of.READ_CAPACITY),
         of_ours(of.PLAN, {"definition": definition("x"), "queue": "robots"}),
         of_ours(of.FIT, {"definition": definition("x"), "queue": "robots"}),
