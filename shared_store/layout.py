@@ -40,6 +40,10 @@ class Run:
         return self.path / "checkpoints"
 
     @property
+    def contract(self) -> Path:
+        return self.path / "contract.json"
+
+    @property
     def metrics(self) -> Path:
         return self.path / "metrics"
 

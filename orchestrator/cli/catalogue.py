@@ -63,7 +63,9 @@ ENTRIES = (
         _HERE,
         "List the tasks that are installed here; of one, all its terms and numbers.",
     ),
-    Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors."),
+    Entry(
+        "schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors; or that of the policy contract."
+    ),
     Entry(
         "doctor",
         "doctor",
