@@ -359,6 +359,7 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, tuple | list) and isinstance(other, tuple | list):
         return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, float | int) and isinstance(other, float | int):
+        one, other = (min(max(each, -LARGEST), LARGEST) for each in (one, other))
         return math.isclose(one, other, rel_tol=CLOSE, abs_tol=CLOSE * 1e-3)
     return bool(one == other)
 
