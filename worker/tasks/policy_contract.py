@@ -64,7 +64,11 @@ def _image(task: Task, group: str) -> Image | None:
     camera: dict[str, Any] = dict(images_of(task).get(group, {}))
     if not camera:
         return None
-    return Image(tuple(camera.pop("channels", CHANNELS)), int(camera.pop("frames", 1)), _texts(camera))
+    frames, channels = int(camera.pop("frames", 1)), camera.pop("channels", CHANNELS)
+    shown = tuple(
+        channels if channels is CHANNELS else channels[: len(channels) // frames]
+    )  # a sensor names those of all frames
+    return Image(shown, frames, _texts(camera))
 
 
 def _texts(value: Any) -> Any:
