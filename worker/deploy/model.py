@@ -131,7 +131,9 @@ class ScriptPolicy(OnnxPolicy):
     """The same of a TorchScript file."""
 
     def __init__(self, model: bytes, contract: Contract) -> None:
-        self._module = torch.jit.load(io.BytesIO(model))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch would rather have its own new format, which few runners read
+            self._module = torch.jit.load(io.BytesIO(model))
         self._contract = contract
         self._states = {}
 
