@@ -1,12 +1,14 @@
 """Policy bundles: directories that appear whole, with a manifest that has the digest of every file.
 
-``manifest.json`` lists all other files, by their path in the bundle, with size and SHA-256; nothing else lies beside them.
+``manifest.json`` lists all other files, by their path in the bundle, with size and SHA-256; nothing else lies beside them. Its own
+``digest`` is the SHA-256 of the rest of it.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -42,7 +44,8 @@ def seal(bundle: Path, facts: Mapping[str, Any]) -> None:
     for path in _files(bundle):
         sync_file(bundle / path)
         files[path] = {"size": (bundle / path).stat().st_size, "sha256": _digest(bundle / path)}
-    write_json(bundle / MANIFEST, {**facts, "format": FORMAT, "files": files})
+    manifest = json.loads(json.dumps({**facts, "format": FORMAT, "files": files}))
+    write_json(bundle / MANIFEST, {**manifest, "digest": _manifest_digest(manifest)})
     for folder, _, _ in os.walk(bundle, topdown=False):
         sync_directory(Path(folder))
 
@@ -71,6 +74,8 @@ def read_manifest(bundle: Path) -> dict[str, Any]:
             isinstance(entry.get("size"), int) and isinstance(entry.get("sha256"), str)
         ):
             raise DamagedBundle(f"bundle {bundle}: {MANIFEST} has no size and digest of {path}")
+    if manifest.get("digest") != _manifest_digest(manifest):
+        raise DamagedBundle(f"bundle {bundle}: the content of {MANIFEST} was altered (SHA-256 differs)")
     return manifest
 
 
@@ -79,6 +84,8 @@ def verify(bundle: Path) -> dict[str, Any]:
     manifest = read_manifest(bundle)
     listed: dict[str, Any] = manifest["files"]
     try:
+        if (bundle / MANIFEST).read_bytes() != _written(manifest):  # what JSON does not tell apart, such as spaces
+            raise DamagedBundle(f"bundle {bundle}: the content of {MANIFEST} was altered")
         there = set(_files(bundle)) - {MANIFEST}
         for path in sorted(listed.keys() - there):
             raise DamagedBundle(f"bundle {bundle}: {path} is missing")
@@ -153,6 +160,15 @@ def publish(hidden: Path, target: Path) -> None:
             raise FileExistsError(errno.EEXIST, "exists already", str(target)) from None
         raise
     sync_directory(target.parent)
+
+
+def _manifest_digest(manifest: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_written({name: each for name, each in manifest.items() if name != "digest"})).hexdigest()
+
+
+def _written(manifest: Mapping[str, Any]) -> bytes:
+    """As :func:`shared_store.files.write_json` writes it."""
+    return (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode()
 
 
 def _files(bundle: Path) -> list[str]:

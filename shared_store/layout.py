@@ -155,6 +155,10 @@ class Store:
             raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
         return Run(self.path / "runs" / name)
 
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
+
     def runs(self, after: str = "", most: int | None = None) -> list[Run]:
         """The runs that exist, by name: those behind ``after``, at most so many."""
         try:

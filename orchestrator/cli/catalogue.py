@@ -42,6 +42,12 @@ ENTRIES = (
         _RUNS,
         "Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.",
     ),
+    Entry(
+        "models",
+        "models",
+        _RUNS,
+        "Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+    ),
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
     Entry(

@@ -14,6 +14,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import io
 import platform
 import shutil
@@ -184,6 +186,7 @@ def _publish(
                 "parent": (run.description() or {}).get("parent"),
                 "robot": robot,
                 "opset": OPSET,
+                "code": _code(type(task)),
                 "versions": _versions(),
                 "created": time.time(),
             },
@@ -194,6 +197,13 @@ def _publish(
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
     return target
+
+
+def _code(task: type) -> dict[str, str]:
+    """The module of the task, and the SHA-256 of its source as it was when the bundle was made."""
+    source = inspect.getsourcefile(task)
+    digest = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+    return {"module": task.__module__, "sha256": digest}
 
 
 def _versions() -> dict[str, str]:
