@@ -78,7 +78,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent", "teachers"):
+        for name in ("checkpoints", "metrics", "evaluations", "exports", "logs", "outcomes", "parent", "teachers"):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:

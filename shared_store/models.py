@@ -137,6 +137,7 @@ def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: M
     """
     bundle = run.exports / checkpoint.name
     check_name(name)
+    refuse_links(bundle, 2)
     if not bundle.is_dir():
         reference = f"{run.name}@{checkpoint.iteration}"
         raise ModelError(

@@ -171,3 +171,12 @@ def test_a_link_in_the_place_of_a_model_is_not_followed(store: Store, tmp_path: 
     with pytest.raises(DamagedFile, match="a link"):
         register(store)
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_link_in_the_place_of_a_bundle_is_not_followed(store: Store, tmp_path: Path) -> None:
+    run, checkpoint = exported(store)
+    os.rename(run.exports / checkpoint.name, tmp_path / "elsewhere")
+    os.symlink(tmp_path / "elsewhere", run.exports / checkpoint.name)
+    with pytest.raises(DamagedFile, match="a link"):
+        register(store)
+    assert models.model_names(store) == []
