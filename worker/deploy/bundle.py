@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import io
@@ -191,12 +192,14 @@ def _publish(
                 "created": time.time(),
             },
         )
-        if target.exists():
-            remove_tree(target)
-        publish(hidden, target)
+        while True:  # until nobody else has just published the same checkpoint's
+            with contextlib.suppress(FileNotFoundError):
+                remove_tree(target)
+            with contextlib.suppress(FileExistsError):
+                publish(hidden, target)
+                return target
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
-    return target
 
 
 def _code(task: type) -> dict[str, str]:
