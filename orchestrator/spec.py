@@ -139,10 +139,12 @@ class Evaluate(_Section):
 
 
 class Export(_Section):
-    """Export the policy of a checkpoint as ONNX."""
+    """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
     run: RunName
     checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    episodes: int = Field(default=16, ge=0, description="on which bundle and policy are compared, at least; 0: none")
+    worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
 class CheckpointPolicy(_Section):

@@ -1,4 +1,4 @@
-"""The job YAML as JSON Schema, for editors."""
+"""The job YAML as JSON Schema, for editors; and the policy contract."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pydantic import PydanticUserError, TypeAdapter
 from orchestrator.settings import task_config
 from orchestrator.spec import ALGORITHMS, Spec
 from orchestrator.spec_values import known_tasks
+from shared_store.policy_contract import Contract
+
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def schema() -> dict[str, Any]:
@@ -24,9 +27,15 @@ def schema() -> dict[str, Any]:
     document["properties"]["stall_timeout"] = {**text, "default": "5m", "description": "of one training iteration"}
     document["properties"]["timeout"] = {**text, "description": "of each attempt, such as 2h"}
     _add_tasks(definitions)
-    document["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    document["$schema"] = _DRAFT
     document["title"] = "Muster job"
     return document
+
+
+def contract_schema() -> dict[str, Any]:
+    """JSON Schema of a policy contract, as ``contract.json`` holds it."""
+    document = TypeAdapter(Contract).json_schema()
+    return {"$schema": _DRAFT, **document, "title": "Muster policy contract"}
 
 
 def _add_tasks(definitions: dict[str, Any]) -> None:

@@ -40,6 +40,10 @@ class Run:
         return self.path / "checkpoints"
 
     @property
+    def contract(self) -> Path:
+        return self.path / "contract.json"
+
+    @property
     def metrics(self) -> Path:
         return self.path / "metrics"
 
@@ -74,7 +78,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent", "teachers"):
+        for name in ("checkpoints", "metrics", "evaluations", "exports", "logs", "outcomes", "parent", "teachers"):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:
@@ -150,6 +154,10 @@ class Store:
         if not NAME.fullmatch(name):
             raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
         return Run(self.path / "runs" / name)
+
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
 
     def runs(self, after: str = "", most: int | None = None) -> list[Run]:
         """The runs that exist, by name: those behind ``after``, at most so many."""

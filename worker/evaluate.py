@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-from worker.errors import UserError
 from worker.learning.job import Job, configure, end_startup, run_command, user_errors
 
 
@@ -23,7 +22,7 @@ def main() -> int:
     from worker.learning.algorithm import Share
     from worker.learning.evaluation import evaluate
     from worker.learning.randomness import held_out_seed, seed_generators
-    from worker.learning.setup import build_task, spaces_from, spaces_of
+    from worker.learning.setup import build_task, check_contract
     from worker.learning.trained import choose_checkpoint, load_policy
     from worker.tasks import find_task
 
@@ -38,10 +37,7 @@ def main() -> int:
     task = build_task(task_type, config, share, gang, seed)
     task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
     policy = load_policy(checkpoint, gang.device)
-    if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
-        raise UserError(
-            f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: it had {then}, it has {now}"
-        )
+    check_contract(checkpoint, task)
     end_startup()
     result = evaluate(task, policy, gang, checkpoint=checkpoint.name, episodes=episodes * share.total)
     if gang.is_main:

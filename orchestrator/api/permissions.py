@@ -1,7 +1,7 @@
 """Who may do what to what: every operation of the API is decided here, for every kind of key and every object.
 
 A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
-(a job; a run, to the queue of the job that created it), to the key that registered it (a job definition), or to all queues (a
+(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that registered it (a job definition), or to all queues (a
 queue itself, a compute environment, a scheduling policy).
 
 ================================  ===========================  ============================================================
@@ -111,6 +111,9 @@ class Operation(StrEnum):
     READ_METRICS = "GET /api/runs/{name}/metrics"
     RESUME_RUN = "POST /api/runs/{name}/resume"
     CLONE_RUN = "POST /api/runs/{name}/clone"
+    REGISTER_MODEL = "POST /api/runs/{name}/models"
+    LIST_MODELS = "GET /api/models"
+    READ_MODEL = "GET /api/models/{name}"
 
     @property
     def reads(self) -> bool:

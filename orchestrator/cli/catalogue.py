@@ -36,6 +36,18 @@ ENTRIES = (
     Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
     Entry("resume", "runs", _RUNS, "Go on with a run from its newest checkpoint, at the next iteration."),
     Entry("clone", "clones", _RUNS, "Start a new run with the weights of a checkpoint, and with nothing else of it."),
+    Entry(
+        "export",
+        "export",
+        _RUNS,
+        "Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.",
+    ),
+    Entry(
+        "models",
+        "models",
+        _RUNS,
+        "Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+    ),
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
     Entry(
@@ -63,7 +75,9 @@ ENTRIES = (
         _HERE,
         "List the tasks that are installed here; of one, all its terms and numbers.",
     ),
-    Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors."),
+    Entry(
+        "schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors; or that of the policy contract."
+    ),
     Entry(
         "doctor",
         "doctor",

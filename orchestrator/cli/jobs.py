@@ -22,7 +22,7 @@ from orchestrator.engines import ENGINES
 from orchestrator.engines.base import engine_of
 from orchestrator.errors import SpecError
 from orchestrator.spec import Spec
-from orchestrator.spec_schema import schema
+from orchestrator.spec_schema import contract_schema, schema
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 SetOption = Annotated[
@@ -48,7 +48,9 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster stop ant   then   muster resume RUN")(stop)
     app.command(epilog="Example:  muster checkpoint ant")(checkpoint)
     app.command(epilog="Example:  muster stacks ant > stacks.txt")(stacks)
-    app.command("schema", epilog="Example:  muster schema > muster.schema.json")(print_schema)
+    app.command("schema", epilog="Example:  muster schema > muster.schema.json     or:  muster schema --contract")(
+        print_schema
+    )
 
 
 def submit_spec(
@@ -357,9 +359,13 @@ def stacks(job: JobArgument) -> None:
             echo(f"== node {node['node']}\n{node['stacks']}")
 
 
-def print_schema() -> None:
-    """Print the JSON Schema of the job YAML, for editors."""
-    echo_json(schema(), indent=2)
+def print_schema(
+    contract: Annotated[
+        bool, typer.Option("--contract", help="Of a policy contract (contract.json) instead of a job.")
+    ] = False,
+) -> None:
+    """Print the JSON Schema of the job YAML, for editors; or that of the policy contract."""
+    echo_json(contract_schema() if contract else schema(), indent=2)
 
 
 def _when(milliseconds: int | None) -> str:

@@ -11,12 +11,14 @@ import torch
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.files import DamagedFile
 from shared_store.parent import parent_checkpoint
+from shared_store.policy_contract import brief, differences
 from shared_store.settings import first_difference, fixed_settings, innermost
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm
 from worker.learning.algorithms import section_of
 from worker.learning.job import Job
+from worker.learning.setup import contract_from
 from worker.learning.shards import read_file
 
 
@@ -60,11 +62,9 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
         raise UserError(
             f"the weights of checkpoint {name} do not fit this job: {why}{_others(checkpoint.manifest, here)}"
         ) from error
-    if gang.is_main and (other := _renamed(checkpoint.manifest, here)):
-        print(
-            f"warning: the weights were learnt from other observations or actions, of the same sizes: {other}",
-            flush=True,
-        )
+    then, now = (contract_from(facts, checkpoint.name) for facts in (checkpoint.manifest, here))
+    if gang.is_main and then and now and (lines := differences(then, now, ranges=True)):
+        print(f"warning: the weights were learnt with another policy contract: {brief(lines)}", flush=True)
     return checkpoint
 
 
@@ -97,16 +97,6 @@ def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         groups = ", ".join(f"{name} {shape}" for name, shape in sorted((policy.get("groups") or {}).items()))
         told.append(f"observations {groups} and {policy.get('action_size')} actions (task {facts.get('task')})")
     return "" if told[0].partition(" (")[0] == told[1].partition(" (")[0] else f"; there {told[0]}, here {told[1]}"
-
-
-def _renamed(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The first observation or action that has another name than in the source; nothing where all are called alike."""
-    for kind in ("observation_names", "action_names"):
-        old, new = ((facts.get("policy") or {}).get(kind) or [] for facts in (there, here))
-        for before, now in zip(old, new, strict=False):
-            if before != now:
-                return f"{before} there is {now} here"
-    return ""
 
 
 def _difference(own: Any, saved: Any) -> str:

@@ -26,7 +26,16 @@ from worker.learning.job import StopRequest, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
 from worker.learning.report import Report, Stopwatch
 from worker.learning.reporter import Fence, Gate, Reporter
-from worker.learning.setup import build_algorithm, build_task, describe, observed, total_worlds, transition
+from worker.learning.setup import (
+    build_algorithm,
+    build_task,
+    describe,
+    described_policy,
+    observed,
+    total_worlds,
+    transition,
+    write_contract,
+)
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
@@ -63,12 +72,14 @@ class Loop:
         self._step = transition(self.task, self._observations)
         self.incident = Incident(self.task, self.share, self.algorithm.steps, job.section, training.seed)
         seed_generators(training.seed, gang.rank)
-        facts = describe(training, self.task)
+        facts = describe(training, self.task, described_policy(training, self.task))
         self.gate = Gate()
         self.state = TrainingState(job, gang, self.share, self.task, self.algorithm, facts, training.keep, self.gate)
         self.resumed = self.state.restore()
         self.adopted = None if self.resumed else self._begin_run(facts)
         """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
+        if gang.is_main:
+            write_contract(job, facts["contract"])
         self.task.clear_statistics()
         self.iterated = 0
         """Iterations that this process has done."""

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 import warp
 from tensordict import TensorDict
 
+from shared_store.checkpoints import Checkpoint
+from shared_store.documents import DocumentError
+from shared_store.epoch import check_epoch
+from shared_store.files import read_json, write_json
+from shared_store.policy_contract import Contract, brief, differences, read
 from worker.distributed import Gang, warm_marker
 from worker.errors import UserError
-from worker.learning.algorithm import Algorithm, Setting, Share, Spaces, Transition
+from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
-from worker.tasks.images import described
+from worker.tasks.policy_contract import policy_contract, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -101,31 +107,81 @@ def transition(task: Task, observations: TensorDict) -> Transition:
     return Transition(observations, ended, task.rewards, task.dones, task.time_outs)
 
 
-def describe(training: Training, task: Task) -> dict[str, Any]:
-    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job."""
-    config = training.config
-    names: dict[str, Any] = {"action_names": list(task.action_names), "observation_names": list(task.observation_names)}
-    if interface := task.interface():
-        names |= dataclasses.asdict(interface)
-    if images := described(task):
-        names["images"] = images
-    if len(task.observation_shape) > 1:
-        names["camera"] = images["policy"]
-        for key in ("observation_names", "observations"):  # of what the simulation knows; the policy sees the image
-            names.pop(key, None)
+def described_policy(training: Training, task: Task) -> ExportedPolicy | None:
+    """The policy of this training as it will be exported, with new weights; None, with a warning, where its algorithm fails to make one.
+
+    torch's generator is left as it was: weights are drawn from it.
+    """
+    with torch.random.fork_rng(devices=[]):
+        try:
+            return training.algorithm_type.build_policy(training.settings, spaces_of(task), "cpu").module()
+        except Exception as error:  # of a user's own class: training goes on, and the export will say it again
+            what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            print(f"warning: algorithm {training.algorithm} gives no policy that could be exported: {what}", flush=True)
+            return None
+
+
+def describe(training: Training, task: Task, exported: ExportedPolicy | None = None) -> dict[str, Any]:
+    """What a checkpoint's manifest says about its policy, so that it can be evaluated and exported without the job.
+
+    Args:
+        training: What is trained.
+        task: Its worlds.
+        exported: See :func:`worker.tasks.policy_contract.policy_contract`.
+    """
+    spaces, name = spaces_of(task), training.job.section["task"]
     return {
-        "task": training.job.section["task"],
+        "task": name,
         "train": training.job.section,
         "algorithm": training.algorithm,
         "settings": dataclasses.asdict(training.settings),
         "policy": {
-            "observation_shape": list(task.observation_shape),
-            **({"observation_size": task.observation_shape[0]} if len(task.observation_shape) == 1 else {}),
             "action_size": task.action_size,
-            "groups": {name: list(shape) for name, shape in spaces_of(task).observations.items()},
-            "control_hz": config.control_hz,
-            **({"discrete": True} if spaces_of(task).discrete else {}),
-            **names,
+            "groups": {name: list(shape) for name, shape in spaces.observations.items()},
+            **({"discrete": True} if spaces.discrete else {}),
         },
+        "contract": policy_contract(task, name, exported).document(),
         "torch": torch.__version__,
     }
+
+
+def write_contract(job: Job, document: dict[str, Any]) -> None:
+    """Write the run's ``contract.json``, where it is not there yet or says something else. Main rank only.
+
+    A volume that is full does not end training: the contract is in every checkpoint, too. Raises StaleEpoch.
+    """
+    check_epoch(job.run, job.epoch)
+    try:
+        if read_json(job.run.contract) != document:
+            write_json(job.run.contract, document)
+    except (OSError, ValueError) as error:
+        print(f"warning: the policy contract could not be written ({error}); checkpoints have it", flush=True)
+
+
+def contract_from(facts: Mapping[str, Any], checkpoint: str) -> Contract | None:
+    """The policy contract in a checkpoint's manifest; None where an older version wrote it. Raises UserError for one that can't be read."""
+    if "contract" not in facts:
+        return None
+    try:
+        return read(facts["contract"], f"checkpoint {checkpoint}: contract")
+    except DocumentError as error:
+        raise UserError(str(error)) from None
+
+
+def check_contract(checkpoint: Checkpoint, task: Task) -> None:
+    """Raise UserError where the task's observations, actions or commands mean something else than when the checkpoint's policy learnt.
+
+    Of a checkpoint without a contract only sizes are compared.
+    """
+    facts = checkpoint.manifest
+    name = facts["task"]
+    if then := contract_from(facts, checkpoint.name):
+        now = same_policy(policy_contract(task, name), then)
+        if lines := differences(then, now):
+            raise UserError(
+                f"checkpoint {checkpoint.name} does not fit task {name} as it is now: {brief(lines)}; use the task's code of that time"
+            )
+    elif (had := spaces_from(facts["policy"])) != (has := spaces_of(task)):
+        raise UserError(
+            f"checkpoint {checkpoint.name} does not fit task {name} as it is now: it had {had}, it has {has}"
+        )

@@ -25,6 +25,7 @@ from shared_store.checkpoints import (
     sweep,
 )
 from shared_store.epoch import check_epoch
+from shared_store.policy_contract import brief, differences
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
 from worker.distributed import Gang
 from worker.errors import UserError
@@ -33,6 +34,7 @@ from worker.learning.algorithms import section_of
 from worker.learning.job import Job
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
+from worker.learning.setup import contract_from
 from worker.learning.shards import Shards, read_file
 
 if TYPE_CHECKING:
@@ -314,6 +316,9 @@ class TrainingState:
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
                 "here; start a new run for that (`muster clone` begins one with its weights)"
             )
+        then, now = (contract_from(facts, checkpoint.name) for facts in (there, here))
+        if self.gang.is_main and then and now and (lines := differences(then, now, ranges=True)):
+            print(f"warning: the task changed since checkpoint {checkpoint.name}: {brief(lines)}", flush=True)
 
     def _load_worlds(self, checkpoint: Checkpoint) -> None:
         total, bounds = checkpoint.manifest["worlds"], checkpoint.manifest["shards"]

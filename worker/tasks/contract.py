@@ -74,11 +74,12 @@ def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], lis
     command: Command = plan.declaration.commands[name]
     if len(command.names) != len(seen.names):
         return units, [None] * len(seen.names)
-    ranges = [_range(plan, name, command, column) for column in command.names]
+    ranges = [range_of(plan, name, command, column) for column in command.names]
     return (list(command.units) if seen.term.unit == "1" else units), ranges
 
 
-def _range(plan: Plan, name: str, command: Command, column: str) -> tuple[float, float] | None:
+def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[float, float] | None:
+    """Least and greatest value of a column of a command in training; None where that is not known."""
     if column in command.ranges:
         return command.ranges[column]
     first, count = plan.numbers.places.get(f"commands.{name}.{column}", (0, 0))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal
 
+from shared_store.policy_contract import Action
 from shared_store.wording import nearest
-from worker.simulation.episodes import ACTION_LIMIT
 
 
 @dataclass(frozen=True)
@@ -30,33 +30,6 @@ class Observation:
     """Limits of ``quantity - offset`` before the scale [unit]; None: not limited."""
     back: int = 0
     """How many control steps ago it was: history that the policy sees. Before an episode's first step, its first value."""
-
-
-@dataclass(frozen=True)
-class Action:
-    """One number that a policy asks for: the actuator's input is ``offset + scale * action``, the action clipped to ``clip`` before."""
-
-    name: str
-    """Name of the joint; of a choice, its own."""
-    kind: Literal["effort", "position", "velocity", "choice"]
-    """Whether the input is a force or torque, or the target of a position or velocity controller in the actuator; a choice is one of
-    several actions, of which the policy names one."""
-    unit: str
-    """Unit of the input: N, N m, m, rad, m/s or rad/s."""
-    scale: float
-    """Input that an action of 1 adds [unit]."""
-    default_position: float
-    """Position of the joint at the start of an episode, before it is varied [m, rad]."""
-    offset: float = 0.0
-    """Input at an action of 0 [unit]."""
-    clip: tuple[float, float] | None = (-float(ACTION_LIMIT), float(ACTION_LIMIT))
-    """Limits of the action; None: not limited."""
-    stiffness: float = 0.0
-    """Gain on the error of the position [N/m, N m/rad]."""
-    damping: float = 0.0
-    """Gain on the velocity, which the actuator works against [N s/m, N m s/rad]."""
-    effort_limit: float | None = None
-    """Greatest force or torque of the actuator [N, N m]; None: not limited."""
 
 
 @dataclass(frozen=True)

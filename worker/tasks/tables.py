@@ -51,11 +51,11 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
         for name, rule in plan.adaptive.items()
     ]
     found["sensors"] = [
-        {"name": name, "kind": type(sensor).__name__, "of": _settings(sensor)}
+        {"name": name, "kind": type(sensor).__name__, "of": settings(sensor)}
         for name, sensor in plan.declaration.sensors.items()
     ]
     found["randomize"] = [
-        {"name": name, "kind": type(each).__name__, "of": _settings(each)}
+        {"name": name, "kind": type(each).__name__, "of": settings(each)}
         for name, each in plan.declaration.randomize.items()
     ]
     return {section: rows for section, rows in found.items() if rows}
@@ -165,7 +165,7 @@ def _when(bound: Bound) -> str:
     return bound.term.when if isinstance(bound.term, Event) else ""
 
 
-def _settings(declared: Any) -> str:
+def settings(declared: Any) -> str:
     """The settings of a sensor or of a randomisation that are not their defaults."""
     settings = {
         name: value

@@ -82,6 +82,9 @@ TABLE = {
     Operation.READ_METRICS: OWN_READ,
     Operation.RESUME_RUN: OWN_WRITE,
     Operation.CLONE_RUN: OWN_WRITE,
+    Operation.REGISTER_MODEL: OWN_WRITE,
+    Operation.LIST_MODELS: OWN_LIST,
+    Operation.READ_MODEL: OWN_READ,
 }
 ARN = "arn:aws:batch:us-east-1:000000000000:"
 
@@ -174,6 +177,9 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.READ_METRICS),
         of_ours(of.RESUME_RUN, {}),
         of_ours(of.CLONE_RUN, {"name": "x"}),
+        of_ours(of.REGISTER_MODEL, {"name": "x"}),
+        of_ours(of.LIST_MODELS),
+        of_ours(of.READ_MODEL),
     ]
     return dict(zip(Operation, found, strict=True))
 

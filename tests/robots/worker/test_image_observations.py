@@ -133,11 +133,15 @@ def test_rsl_rl_learns_from_both_resumes_with_the_same_bits_and_exports(tmp_path
     run(tmp_path, "stopped", 3, epoch=2)
     assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
     store = Store(tmp_path).run("straight")
-    target = export(store, list_checkpoints(store)[-1])  # compares the file with the policy itself
-    told = json.loads((target / "policy.json").read_text())
-    assert told["groups"] == {"policy": [1], "critic": [1], "camera": [6, 12, 16]}
-    assert told["images"]["camera"]["channels"] == ["red", "green", "blue", "red_1", "green_1", "blue_1"]
-    assert told["images"]["camera"]["body"] == "cart" and told["observation_names"] == ["rail_velocity"]
+    target = export(store, list_checkpoints(store)[-1], straight.task)  # compares the files with the policy itself
+    told = json.loads((target / "contract.json").read_text())
+    numbers, camera = told["groups"]
+    assert [(each["name"], each["input"], each["shape"]) for each in told["groups"]] == [
+        ("policy", "obs", [1]),
+        ("camera", "camera", [6, 12, 16]),
+    ]
+    assert (camera["image"]["channels"], camera["image"]["frames"]) == (["red", "green", "blue"], 2)
+    assert camera["image"]["camera"]["body"] == "cart" and numbers["terms"][0]["names"] == ["rail_velocity"]
     import onnx
 
     graph = onnx.load(str(target / "policy.onnx")).graph

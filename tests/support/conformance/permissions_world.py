@@ -14,6 +14,10 @@ from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.keys import KeyStore
 from orchestrator.spec import validate
+from shared_store import models
+from shared_store.bundles import seal
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Store
 from tests.conftest import Serving
 
 TOKEN = "a-token-for-tests-alone"
@@ -48,6 +52,18 @@ class World:
         self.job, self.run = self.native("robots", "robots")
         self.server.wait(self.job)
         self.stream = f"theirs/{self.job}/1/node-0"
+        self.register_model()
+
+    def register_model(self) -> None:
+        """A model of the run's name; its spec has the secret, as a run's has."""
+        store = Store(self.server.home / "store")
+        run = store.run(self.run)
+        bundle = run.exports / "00000001-e1"
+        bundle.mkdir(parents=True)
+        (bundle / "policy.onnx").write_bytes(b"weights")
+        seal(bundle, {})
+        checkpoint = Checkpoint(run.checkpoints / bundle.name, 1, 1)
+        models.register(store, self.run, run, checkpoint, {"queue": "robots"})
 
     def native(self, key: str, queue: str, **changes: Any) -> tuple[str, str]:
         """Submit a job from YAML; its id and its run."""

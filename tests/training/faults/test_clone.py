@@ -100,7 +100,7 @@ def test_another_configuration_seed_and_length_apply_and_are_in_the_manifest(sto
     )
     manifest = list_checkpoints(Store(store).run("clone"))[-1].manifest
     assert manifest["train"]["config"] == {"limit": 2.0, "control_hz": 20.0} and manifest["train"]["seed"] == 9
-    assert manifest["policy"]["control_hz"] == 20.0 and manifest["iteration"] == 1
+    assert manifest["contract"]["control_hz"] == 20.0 and manifest["iteration"] == 1
     assert manifest["env_steps"] == 8 * 4
 
 
@@ -210,8 +210,8 @@ def test_other_observations_are_named_with_the_tensor(store: Path) -> None:
 def test_observations_of_other_names_are_warned_of(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make_clone(store, "clone", "ppo")
     begin(store, Renamed)
-    assert "warning: the weights were learnt from other observations or actions" in (said := capsys.readouterr().out)
-    assert "of the same sizes: velocity there is speed here" in said
+    assert "warning: the weights were learnt with another policy contract: " in (said := capsys.readouterr().out)
+    assert "observation 1: velocity is gone; observation 1: speed is new" in said
 
 
 @dataclasses.dataclass

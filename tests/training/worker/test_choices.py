@@ -63,8 +63,8 @@ def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Pa
     done = run_muster("run", "export.yaml", home=home, cwd=directory, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     (exported,) = run.exports.iterdir()
-    facts = json.loads((exported / "policy.json").read_text())
-    assert facts["action_names"] == ["left", "nothing", "right"]
+    facts = json.loads((exported / "contract.json").read_text())
+    assert facts["discrete"] and facts["action_names"] == ["left", "nothing", "right"]
     leaning = np.array([[0.0, -0.1, 0.0, -0.5], [0.0, 0.1, 0.0, 0.5]], dtype=np.float32)
     (chosen,) = ReferenceEvaluator(onnx.load(exported / "policy.onnx")).run(None, {"obs": leaning})
     assert sorted(chosen[:, 0]) == [0.0, 2.0], "the cart goes under the pole"

@@ -80,8 +80,9 @@ def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_pat
         done = run_muster("run", str(spec), home=home, timeout=300)
         assert done.returncode == 0, done.stdout + done.stderr
     (exported,) = run.exports.iterdir()
-    facts = json.loads((exported / "policy.json").read_text())
-    assert facts["observation_names"] and facts["max_difference"] <= 1e-5
+    assert json.loads((exported / "contract.json").read_text())["groups"][0]["terms"]
+    report = json.loads((exported / "report.json").read_text())
+    assert report["parity"]["greatest_difference"]["onnx"] <= 1e-5 and report["judged"]["episodes"] == 16
     assert [path.name for path in run.evaluations.iterdir()] == [f"{exported.name}.json"]
 
 

@@ -142,7 +142,7 @@ def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_pat
     run(tmp_path, "stopped", 3, epoch=2)
     assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
     store = Store(tmp_path).run("straight")
-    target = export(store, list_checkpoints(store)[-1])  # compares the file with the policy itself
+    target = export(store, list_checkpoints(store)[-1], straight.task)  # compares the files with the policy itself
     import onnx
 
     graph = onnx.load(str(target / "policy.onnx")).graph

@@ -342,34 +342,35 @@ def break_down() -> int:
 
 def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import numpy as np
-    import onnx
-    from onnx.reference import ReferenceEvaluator
+    import onnxruntime
 
-    from worker import export
+    from worker.deploy import bundle
+    from worker.export import export
 
     started = train(training(tmp_path, iterations=2))
     run = Store(tmp_path).run("run")
     (checkpoint,) = list_checkpoints(run)
-    target = export.export(run, checkpoint)
-    assert sorted(path.name for path in target.iterdir()) == ["policy.json", "policy.onnx"]
-    facts = json.loads((target / "policy.json").read_text())
-    assert facts["observation_names"] == ["place", "velocity"] and facts["control_hz"] == 10.0
-    observations = np.array(facts["self_test"]["obs"], dtype=np.float32)
-    model = onnx.load(target / "policy.onnx")
-    (actions,) = ReferenceEvaluator(model).run(None, {"obs": observations})
-    np.testing.assert_allclose(actions, facts["self_test"]["actions"], atol=1e-5)
-    ours = started.algorithm.policy().act({"policy": torch.from_numpy(observations)}).numpy()  # type: ignore[arg-type]
+    target = export(run, checkpoint, started.task)
+    contract = json.loads((target / "contract.json").read_text())
+    assert contract == json.loads(run.contract.read_text()) == checkpoint.manifest["contract"]
+    assert contract["groups"][0]["terms"][1]["names"] == ["velocity"] and contract["control_hz"] == 10.0
+    told = np.load(target / "parity.npz")
+    session = onnxruntime.InferenceSession(target / "policy.onnx", providers=["CPUExecutionProvider"])
+    (actions,) = session.run(None, {"obs": told["obs"][0]})
+    np.testing.assert_allclose(actions, told["actions"][0], atol=1e-5)
+    ours = started.algorithm.policy().act({"policy": torch.from_numpy(told["obs"][0])}).numpy()  # type: ignore[arg-type]
     np.testing.assert_allclose(actions, ours, atol=1e-5)
-    assert json.loads({p.key: p.value for p in model.metadata_props}["muster"])["checkpoint"] == checkpoint.name
-    original = export.to_onnx
+    facts = json.loads((target / "manifest.json").read_text())
+    assert (facts["checkpoint"], facts["iteration"]) == (checkpoint.name, 2)
+    original = bundle.to_onnx
 
     def altered(policy: Any, metadata: dict[str, Any]) -> bytes:
         with torch.no_grad():
             policy.network.mlp[0].weight.mul_(1.01)
         return original(policy, metadata)
 
-    monkeypatch.setattr(export, "to_onnx", altered)
+    monkeypatch.setattr(bundle, "to_onnx", altered)
     with pytest.raises(TrainingError, match="differs from the trained one"):
-        export.export(run, checkpoint)
-    assert json.loads((target / "policy.json").read_text()) == facts, "what was published stays"
+        export(run, checkpoint, started.task)
+    assert json.loads((target / "manifest.json").read_text()) == facts, "what was published stays"
     assert [path.name for path in run.exports.iterdir()] == [checkpoint.name]

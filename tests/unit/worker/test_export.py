@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
+import io
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
+from shared_store.bundles import verify
 from shared_store.layout import Run
+from shared_store.policy_contract import Action, Command, Contract, Group, State, Term
+from tests.support.worker.rsl_loop import GroupedPoint, build, train
 from tests.support.worker.sac import make, point
+from worker.deploy import bundle
+from worker.deploy.bundle import Files, bundle_files
+from worker.deploy.model import OnnxPolicy, metadata_of
+from worker.deploy.parity import Recording
 from worker.errors import TrainingError, UserError
-from worker.export import export
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
+from worker.tasks.policy_contract import policy_contract
 
 torch.set_num_threads(1)
 FACTS = {"task": "Point", "algorithm": "mine:Mine", "policy": {"groups": {"policy": [2]}, "action_size": 2}}
+GRU = {
+    "class_name": "RNNModel",
+    "rnn_type": "gru",
+    "rnn_hidden_dim": 8,
+    "hidden_dims": [8],
+    "obs_normalization": True,
+    "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0},
+}
 
 
 class Sum(nn.Module):
@@ -46,7 +65,7 @@ class Summing:
         return self.total
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        self.total = torch.zeros(1)
+        self.total = torch.zeros(1) if worlds is None else torch.where(worlds[:, None], 0.0, self.total)
 
     def module(self) -> ExportedPolicy:
         sample = TensorDict({"policy": torch.randn(16, 2)}, batch_size=[16])
@@ -55,36 +74,139 @@ class Summing:
         return ExportedPolicy(Sum(self.tells, self.offset), {"obs": sample["policy"][:1], **state}, outputs, sample)
 
 
-def exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: Any) -> Path:
-    checkpoint: Any = SimpleNamespace(name="00000004-e1", iteration=4, manifest=FACTS)
-    monkeypatch.setattr("worker.learning.trained.load_policy", lambda checkpoint: policy)
-    run = Run(tmp_path)
-    try:
-        return export(run, checkpoint)
-    except (TrainingError, UserError):
-        assert not list(run.exports.glob("**/*")), "nothing is published"
-        raise
+def files_of(policy: Any) -> Files:
+    """The files of a policy of two observations, compared with it on a made-up roll-out in which episodes begin anew."""
+    exported = policy.module()
+    states = tuple(State(name, f"{name}_out", tuple(exported.inputs[name].shape[1:])) for name in exported.states)
+    group = Group("policy", "obs", (2,), "float32")
+    contract = Contract("Point", "0.1.0", 10.0, (group,), (), ("x", "y"), states=states)
+    numbers = np.random.default_rng(0).standard_normal((6, 3, 2), dtype=np.float32)
+    begins = np.zeros((6, 3), dtype=bool)
+    begins[0], begins[4, 1] = True, True
+    return bundle_files(policy, exported, contract, "mine:Mine", {"rollout": Recording({"obs": numbers}, begins)})
 
 
-def test_a_memory_that_the_export_does_not_have_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_memory_that_the_export_does_not_have_is_refused() -> None:
     """In the first step the two are alike."""
     there = (
         r"^the policy of algorithm mine:Mine remembers what it saw before, but its module\(\) has no recurrent state"
     )
     with pytest.raises(UserError, match=there):
-        exported(tmp_path, monkeypatch, Summing(tells=False))
+        files_of(Summing(tells=False))
 
 
-def test_a_memory_that_the_export_has_is_compared_over_several_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_memory_that_the_export_has_is_compared_over_steps_and_resets() -> None:
+    files = files_of(Summing(tells=True))
+    told = np.load(io.BytesIO(files.parity))
+    # by hand: the second world's sum begins anew in step 4
+    wanted = told["obs"].cumsum(0)
+    wanted[4:, 1] = told["obs"][4:, 1].cumsum(0)
+    np.testing.assert_allclose(told["actions"], wanted, atol=1e-5)
+    assert files.report["resets"] == 1 and files.report["observations"] == {"rollout": 18, "made_up": 48}
+    with pytest.raises(TrainingError, match=r"^the exported policy \(onnx\) differs from the trained one by 0\.1"):
+        files_of(Summing(tells=True, offset=0.1))
+
+
+def exported(run: Run, policy: Any, task: Any, rounds: int = 1) -> Path:
+    run.path.mkdir(parents=True, exist_ok=True)
+    manifest = {**FACTS, "iteration": 4, "train": {"task": "Point"}, "settings": {}, "files": {}, "reward": 1.5}
+    checkpoint: Any = SimpleNamespace(name="00000004-e1", iteration=4, manifest=manifest)
+    contract = policy_contract(task, "Point", policy.module())
+    return bundle.export(run, checkpoint, task, (policy, policy), contract, rounds)
+
+
+@pytest.fixture(scope="module")
+def recurrent() -> Any:
+    """A GRU that has learnt a little, so that its normaliser has seen something."""
+    algorithm = build(GroupedPoint(), {"actor": GRU, "critic": GRU, "num_steps_per_env": 8})
+    train(algorithm, GroupedPoint(), 3)
+    return algorithm.policy()
+
+
+def test_a_stranger_repeats_a_recurrent_policy_from_the_bundle_alone(tmp_path: Path, recurrent: Any) -> None:
+    """With numpy, onnxruntime and the contract, as on a robot."""
+    target = exported(Run(tmp_path / "run"), recurrent, GroupedPoint())
+    contract = json.loads((target / "contract.json").read_text())
+    assert contract["states"] == [{"name": "h", "output": "h_out", "shape": [1, 8]}]
+    told = np.load(target / "parity.npz")
+    steps, worlds = told["begins"].shape
+    assert steps * worlds >= 1000 and told["begins"][0].all() and told["begins"][1:].sum() > worlds
+    session = onnxruntime.InferenceSession(target / "policy.onnx", providers=["CPUExecutionProvider"])
+    state = np.zeros((worlds, 1, 8), dtype=np.float32)
+    for step in range(steps):
+        state[told["begins"][step]] = 0.0
+        actions, state = session.run(["actions", "h_out"], {"obs": told["obs"][step], "h": state})
+        np.testing.assert_allclose(actions, told["actions"][step], atol=1e-5)
+    one, zeros = told["extreme_obs"], np.zeros((len(told["extreme_obs"]), 1, 8), dtype=np.float32)
+    (found,) = session.run(["actions"], {"obs": one, "h": zeros})
+    np.testing.assert_allclose(found, told["extreme_actions"], atol=1e-5)
+    assert one.shape[1] == 2 and 2 <= len(one) <= 4
+    script = torch.jit.load(target / "policy.pt")
+    np.testing.assert_allclose(script(torch.from_numpy(one), torch.from_numpy(zeros))[0].numpy(), found, atol=1e-5)
+
+
+def test_a_bundle_is_judged_on_the_same_worlds_as_the_policy(tmp_path: Path, recurrent: Any) -> None:
+    task = GroupedPoint()
+    target = exported(Run(tmp_path / "run"), recurrent, task, rounds=2)
+    judged = json.loads((target / "report.json").read_text())["judged"]
+    assert judged["episodes"] == 2 * task.world_count
+    assert judged["bundle"]["mean_return"] == pytest.approx(judged["trained"]["mean_return"], abs=1e-3)
+    assert judged["bundle"]["mean_length"] == judged["trained"]["mean_length"]
+    assert judged["trained"]["std_return"] > 0.0, "and it is worth comparing"
+
+
+def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
+    tmp_path: Path, recurrent: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert (exported(tmp_path, monkeypatch, Summing(tells=True)) / "policy.onnx").exists()
-    with pytest.raises(TrainingError, match=r"differs from the trained one by 0\.1"):
-        exported(tmp_path / "other", monkeypatch, Summing(tells=True, offset=0.1))
+    """As where the episodes' ends are not told to the exported policy: all its actions alone were right."""
+    run = Run(tmp_path / "run")
+    before = exported(run, recurrent, GroupedPoint())
+    stands = {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()}
+
+    class Still(OnnxPolicy):
+        def act(self, observations: TensorDict) -> torch.Tensor:
+            return torch.ones_like(super().act(observations))
+
+    monkeypatch.setattr(bundle, "OnnxPolicy", Still)
+    with pytest.raises(
+        TrainingError, match=r"^the bundle does not do what the trained policy does: its mean return over 8"
+    ):
+        exported(run, recurrent, GroupedPoint())
+    assert {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()} == stands
+    assert [path.name for path in run.exports.iterdir()] == ["00000004-e1"]
 
 
-def test_a_policy_without_a_memory_is_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (exported(tmp_path, monkeypatch, make(point()).policy()) / "policy.json").exists()
+def test_a_second_export_replaces_the_first_as_a_whole(tmp_path: Path) -> None:
+    run, policy = Run(tmp_path / "run"), make(point()).policy()
+    first = verify(exported(run, policy, point()))
+    assert first["run"] == "run" and first["reward"] == 1.5 and first["versions"]["muster"]
+    assert set(first["files"]) == {
+        *("README.md", "contract.json", "parity.npz", "policy.onnx", "policy.pt", "report.json"),
+    }
+    second = verify(exported(run, policy, point(), rounds=0))
+    assert second["created"] > first["created"]
+    assert json.loads((run.exports / "00000004-e1" / "report.json").read_text())["judged"] is None
+
+
+def test_the_metadata_has_what_ros_2_runners_read_with_all_digits() -> None:
+    knee = Action("knee", "position", "rad", 0.1 + 0.2, 1 / 3, stiffness=20.123456, damping=0.5)
+    hip = Action("hip", "position", "rad", 0.25, -0.5, stiffness=30.0, damping=1.0)
+    term = Term("joint_pos", "measured", 0, ("knee", "hip"), ("rad", "rad"), (1.0, 1.0), (0.0, 0.0))
+    command = Command("velocity", ("x",), ("m/s",), (None,), (5.0, 5.0))
+    group = Group("policy", "obs", (2,), "float32", (term,))
+    contract = Contract("Walk", "0.1.0", 50.0, (group,), (knee, hip), ("knee", "hip"), (command,))
+    told = metadata_of(contract, "walk/00000004-e1")
+    assert told.pop("muster") == json.dumps(contract.document())
+    assert told == {
+        "run_path": "walk/00000004-e1",
+        "joint_names": "knee,hip",
+        "joint_stiffness": "20.123456,30.0",
+        "joint_damping": "0.5,1.0",
+        "default_joint_pos": "0.3333333333333333,-0.5",
+        "action_scale": "0.30000000000000004,0.25",
+        "command_names": "velocity",
+        "observation_names": "joint_pos",
+    }
 
 
 @pytest.mark.parametrize(

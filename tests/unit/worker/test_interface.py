@@ -132,15 +132,18 @@ def described(task: Task) -> dict[str, Any]:
 
 
 def test_a_checkpoint_holds_what_a_robot_needs(task: Task) -> None:
-    policy = json.loads(json.dumps(described(task)))["policy"]
-    assert policy["control_hz"] == task.config.control_hz
-    assert [seen["name"] for seen in policy["observations"]] == policy["observation_names"]
+    contract = json.loads(json.dumps(described(task)))["contract"]
+    assert contract["control_hz"] == task.config.control_hz
+    terms = contract["groups"][0]["terms"]
+    assert [name for term in terms for name in term["names"]] == list(task.observation_names)
+    assert contract["action_names"] == list(task.action_names)
     if isinstance(task.config, QuadrupedConfig):
-        knee = policy["actions"][policy["action_names"].index("front_left_knee")]
+        knee = contract["actions"][contract["action_names"].index("front_left_knee")]
         assert (knee["kind"], knee["unit"], knee["scale"], knee["offset"]) == ("position", "rad", 0.4, -1.5)
         assert (knee["stiffness"], knee["damping"], knee["effort_limit"]) == (60.0, 1.5, 33.0)
-        turn = policy["observations"][policy["observation_names"].index("command_turn")]
-        assert (turn["kind"], turn["unit"], turn["range"]) == ("command", "rad/s", [-1.0, 1.0])
+        (term,) = [term for term in terms if "command_turn" in term["names"]]
+        turn = term["names"].index("command_turn")
+        assert (term["kind"], term["units"][turn], term["ranges"][turn]) == ("command", "rad/s", [-1.0, 1.0])
 
 
 def test_every_built_in_task_declares_its_interface_and_images_stand_for_themselves() -> None:
@@ -149,9 +152,10 @@ def test_every_built_in_task_declares_its_interface_and_images_stand_for_themsel
     assert all(issubclass(find_task(name), DeclaredTask) for name in BUILT_IN)
     kind = find_task("CartpolePixels")
     task = kind(kind.config_type(), 1)
-    policy = described(task)["policy"]
-    assert "camera" in policy and "observations" not in policy
-    assert [action["name"] for action in policy["actions"]] == ["slider"]
+    contract = described(task)["contract"]
+    assert contract["groups"][0]["image"]["camera"]["width"] == 64 and not contract["groups"][0]["terms"]
+    assert contract["groups"][0]["image"]["channels"] == ["red", "green", "blue"]
+    assert [action["name"] for action in contract["actions"]] == ["slider"]
 
 
 def test_an_interface_of_other_numbers_than_the_task_s_is_refused() -> None:

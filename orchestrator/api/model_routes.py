@@ -1,0 +1,119 @@
+"""The native API of the model registry: what is registered, and to register a policy that was exported."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
+
+from orchestrator.api import permissions
+from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.continuing import CONFLICT, choose
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.controller import Controller
+from orchestrator.ownership import owner_of
+from orchestrator.tables import RunRecord
+from shared_store import models
+from shared_store.bundles import DamagedBundle
+from shared_store.files import DamagedFile
+from shared_store.models import Model, ModelError, UnknownModel
+
+router = APIRouter()
+
+
+class RegisterRequest(BaseModel):
+    """Which policy of the run becomes the next version of which model."""
+
+    name: str = Field(max_length=128, description="of the model")
+    checkpoint: int | Literal["best"] | None = Field(
+        default=None, description="iteration; best: the one with the greatest score; the newest where absent"
+    )
+
+
+@router.get("/models")
+def list_models(request: Request) -> Any:
+    """The newest version of each model that the caller may see, by name."""
+    store = controller_of(request).store
+    newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
+    return permissions.shown([_described(model) for model in newest if permissions.is_visible(_owner(model))])
+
+
+@router.get("/models/{name}")
+def read_model(
+    request: Request,
+    name: str,
+    version: int | None = Query(default=None, ge=1, description="the newest where absent"),
+    verify: bool = Query(default=False, description="read every file and check its digest"),
+) -> Any:
+    """A version of a model, with its policy contract and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
+    controller = controller_of(request)
+    model = _find(controller, name, version)
+    permissions.check(Operation.READ_MODEL, _owner(model))
+    found = _described(model, verify)
+    try:
+        found["contract"] = model.contract().document()
+    except DamagedBundle as error:
+        found["problem"] = found.get("problem") or str(error)
+    return permissions.shown({**found, "versions": [each.version for each in models.versions(controller.store, name)]})
+
+
+@router.post("/runs/{name}/models")
+def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
+    """Keep the exported bundle of a checkpoint as the next version of a model, for ever."""
+    controller = controller_of(request)
+    run = permitted_run(controller, name, Operation.REGISTER_MODEL)
+    controller.check_writable(adds=True)
+    if shortage := controller.disk.shortage("store"):
+        raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
+    checkpoint = choose(run, body.checkpoint)
+    if checkpoint is None:
+        raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
+    with controller.database.session() as session:
+        record = owner_of(session, run)
+        queue, owner = (record.queue, record.owner) if record else ("", None)
+    try:
+        there = models.versions(controller.store, body.name)
+        if there:
+            permissions.check(Operation.REGISTER_MODEL, _owner(there[-1]))
+        facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
+        model = models.register(controller.store, body.name, run, checkpoint, facts)
+    except ModelError as error:
+        raise ClientError(str(error)) from None
+    except (DamagedBundle, DamagedFile) as error:
+        raise ClientError(str(error), CONFLICT) from None
+    except OSError as error:
+        raise ClientError(f"model {body.name} can't be written ({error.strerror or error})", 503) from None
+    return permissions.shown(_described(model))
+
+
+def _find(controller: Controller, name: str, version: int | None) -> Model:
+    """Raises ClientError."""
+    try:
+        return models.find(controller.store, name, version)
+    except UnknownModel as error:
+        raise ClientError(str(error), 404) from None
+    except (ModelError, DamagedFile) as error:
+        raise ClientError(str(error)) from None
+
+
+def _owner(model: Model) -> RunRecord:
+    """Whose a model is: of the queue of the run that it comes from; of one that is damaged, nobody's but of keys with all queues."""
+    try:
+        queue = model.facts().get("queue")
+    except DamagedBundle:
+        queue = ""
+    return RunRecord(name=model.reference, queue=queue if isinstance(queue, str) else "")
+
+
+def _described(model: Model, verify: bool = False) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": model.name, "version": model.version, "path": str(model.path)}
+    try:
+        found = {**model.facts(), **found}
+        if verify:
+            model.verify()
+            found["verified"] = True
+    except DamagedBundle as error:
+        found["problem"] = str(error)
+    return found

@@ -1,0 +1,120 @@
+"""``muster export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.cli.clones import split_reference
+from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.serving import StoreOption, controller, see_through
+from orchestrator.cli.terminal import echo
+from orchestrator.client import Client, named
+from orchestrator.errors import ServerError, UsageError
+from orchestrator.spec import override, validate
+from shared_store import bundles
+from shared_store.files import read_json
+from shared_store.layout import Store
+
+_EXAMPLES = """Examples:  muster export ant-1f2e3d4c -o ant-policy
+muster export ant-1f2e3d4c@300 --episodes 64 --set resources.gpus=1"""
+
+CheckpointArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="RUN[@ITERATION|@best]",
+        help="Whose policy: of its newest checkpoint, of that of an iteration, or of the one with the best score.",
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog=_EXAMPLES)(export)
+
+
+def export(
+    source: CheckpointArgument,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Copy the bundle to this directory, which must not exist.")
+    ] = None,
+    episodes: Annotated[
+        int, typer.Option(min=0, help="Judge the bundle on at least so many episodes; 0: compare its actions alone.")
+    ] = 16,
+    worlds: Annotated[int, typer.Option(min=1, help="Simulated worlds of the comparison.")] = 16,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the job: resources.gpus=1. Repeatable.")
+    ] = None,
+    store: StoreOption = None,
+) -> None:
+    """Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.
+
+    A job writes it to exports/ of the run, with a controller of its own where none is running. The bundle appears only where its
+    policy acts as the trained one on recorded observations (1e-5), and does as well on the same simulated worlds.
+    """
+    if output is not None and output.exists():
+        raise UsageError(f"-o {output}: exists already; name a directory that does not")
+    run, wanted = split_reference(source)
+    with controller(store, None) as connect:
+        client = connect()
+        checkpoint = chosen(client, run, wanted)
+        section = {"run": run, "checkpoint": checkpoint["iteration"], "episodes": episodes, "worlds": worlds}
+        document = {"name": f"export-{run}"[:128], "resources": {"cpus": 1, "memory": "2GiB"}, "export": section}
+        spec = validate(override(document, set_ or []), "muster export")
+        code = see_through(client, submit_spec(client, spec, "muster export")["jobId"])
+        if code == 0:
+            place = Store(client.get("/api/capacity")["store"]).run(run).exports / checkpoint["name"]
+            _tell(place, output)
+    raise typer.Exit(code)
+
+
+def chosen(client: Client, run: str, wanted: int | str | None) -> dict[str, Any]:
+    """The checkpoint that a reference means, as the API describes it. Raises UsageError naming the nearest one."""
+    found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
+    if not found:
+        raise UsageError(f"run {run} has no checkpoint yet; train it first")
+    if wanted is None:
+        return found[-1]
+    if wanted == "best":
+        scored = [each for each in found if each.get("score") is not None]
+        if not scored:
+            raise UsageError(f"run {run} has no checkpoint with a score yet; name an iteration")
+        return max(scored, key=lambda each: each["score"])
+    there = [each for each in found if each["iteration"] == wanted]
+    if not there:
+        iterations = [str(each["iteration"]) for each in found]
+        near = min(found, key=lambda each: abs(each["iteration"] - int(wanted)))["iteration"]
+        raise UsageError(
+            f"run {run} has no checkpoint of iteration {wanted}; the nearest is {near}; it has: {', '.join(iterations)}"
+        )
+    return there[-1]
+
+
+def _tell(place: Path, output: Path | None) -> None:
+    """Say what the bundle is worth, and copy it. Raises ServerError where the store is on another machine."""
+    if not place.is_dir():
+        where = f"the bundle is in the controller's store, {place}, which is not on this machine"
+        if output is not None:
+            raise ServerError(f"-o {output}: {where}; copy it from there")
+        echo(where)
+        return
+    try:
+        report = read_json(place / bundles.REPORT) or {}
+        manifest = bundles.verify(place)
+        if output is not None:
+            bundles.copy(place, output)
+    except (OSError, ValueError, bundles.DamagedBundle) as error:
+        raise ServerError(str(error)) from None
+    size = sum(entry["size"] for entry in manifest["files"].values())
+    parity, judged = report.get("parity") or {}, report.get("judged")
+    if differences := parity.get("greatest_difference"):
+        count = sum((parity.get("observations") or {}).values())
+        told = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
+        echo(f"  parity:      {told} at most, over {count:,} observations")
+    if judged:
+        a, b = judged["trained"]["mean_return"], judged["bundle"]["mean_return"]
+        echo(
+            f"  judged:      return {b:.2f} of the bundle, {a:.2f} of the trained policy, {judged['episodes']} episodes"
+        )
+    echo(f"  bundle:      {output or place} ({len(manifest['files']) + 1} files, {size / 1024:.0f} KiB)")

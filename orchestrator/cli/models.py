@@ -1,0 +1,174 @@
+"""``muster models``: the policies that were chosen to be kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from orchestrator.cli.clones import split_reference
+from orchestrator.cli.export import CheckpointArgument
+from orchestrator.cli.jobs import JsonOption, scored
+from orchestrator.cli.progress import evaluated
+from orchestrator.cli.serving import StoreOption, controller
+from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.client import named
+from orchestrator.errors import UsageError
+from shared_store.documents import DocumentError
+from shared_store.policy_contract import differences, read
+
+ModelArgument = Annotated[
+    str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version where none is named.")
+]
+
+_EXAMPLES = """Examples:  muster export ant-1f2e3d4c@best   then   muster models register ant-1f2e3d4c@best --name ant
+muster models verify ant@1"""
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(
+        no_args_is_help=True,
+        rich_markup_mode="rich",
+        epilog=_EXAMPLES,
+        help="Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+    )
+    group.command("register", epilog="Example:  muster models register ant-1f2e3d4c@best --name ant")(register_model)
+    group.command("list", epilog="Example:  muster models list --json")(list_models)
+    group.command("show", epilog="Example:  muster models show ant@2")(show)
+    group.command("diff", epilog="Example:  muster models diff ant@1 ant@2")(diff)
+    group.command("verify", epilog="Example:  muster models verify ant")(verify)
+    app.add_typer(group, name="models")
+
+
+def register_model(
+    source: CheckpointArgument,
+    name: Annotated[str, typer.Option(help="Of the model; its versions count up from 1.")],
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Keep the bundle of a checkpoint, which `muster export` made, as the next version of a model."""
+    run, checkpoint = split_reference(source)
+    with controller(store, None) as connect:
+        body = {"name": name, "checkpoint": checkpoint}
+        found = connect().post(f"/api/runs/{named(run)}/models", body, seconds=300)
+    if as_json:
+        echo_json(found, indent=1)
+    else:
+        echo(f"registered {found['run']}@{found['iteration']} as {found['name']}@{found['version']}: {found['path']}")
+
+
+def list_models(store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """List the newest version of each model."""
+    with controller(store, None) as connect:
+        found = connect().get("/api/models")
+    if as_json:
+        echo_json(found, indent=1)
+        return
+    if not found:
+        echo("no model is registered yet; muster models register RUN --name NAME")
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("MODEL", "VERSION", "TASK", "RUN", "ITERATION", "SCORE", "REGISTERED"):
+        table.add_column(column, no_wrap=True)
+    for each in found:
+        table.add_row(
+            *(each["name"], str(each["version"]), str(each.get("task", "-")), str(each.get("run", "-"))),
+            *(str(each.get("iteration", "-")), scored(each.get("score"), None), _when(each.get("registered"))),
+        )
+    print_cut(table)
+
+
+def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """Show where a model comes from, how it was evaluated, and where its bundle is."""
+    found = _read(model, store)
+    if as_json:
+        echo_json(found, indent=1)
+        return
+    parent = found.get("parent")
+    echo(f"{found['name']}@{found['version']}, of versions {', '.join(map(str, found['versions']))}")
+    echo(f"  task:        {found.get('task')}, algorithm {found.get('algorithm')}")
+    echo(f"  from:        run {found.get('run')}, checkpoint {found.get('checkpoint')}")
+    if parent:
+        echo(f"  parent:      run {parent.get('run')}, checkpoint {parent.get('checkpoint')}")
+    for evaluation in found.get("evaluations") or []:
+        echo(f"  evaluation:  {evaluated(evaluation)}")
+    if judged := found.get("judged"):
+        echo(
+            f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {judged['episodes']} episodes"
+        )
+    versions = ", ".join(f"{name} {version}" for name, version in (found.get("made_with") or {}).items())
+    echo(f"  made with:   {versions or 'not known'}")
+    echo(f"  registered:  {_when(found.get('registered'))} by {found.get('registered_by')}")
+    echo(f"  bundle:      {found['path']}/bundle")
+    if found.get("problem"):
+        echo(f"  problem:     {found['problem']}")
+
+
+def diff(
+    model: ModelArgument,
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME[@VERSION]", help="Compare with this one; by default the version before."),
+    ] = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what differs between two versions: contract, settings, versions. A line each; exit 1 where anything differs."""
+    now = _read(model, store)
+    if other is None:
+        earlier = [version for version in now["versions"] if version < now["version"]]
+        if not earlier:
+            raise UsageError(
+                f"{now['name']}@{now['version']} is the first version; name another model to compare it with"
+            )
+        before = _read(f"{now['name']}@{earlier[-1]}", store)
+    else:
+        before, now = now, _read(other, store)
+    try:
+        lines = differences(read(before.get("contract")), read(now.get("contract")), ranges=True)
+    except DocumentError as error:
+        raise UsageError(str(error)) from None
+    for section in ("task", "algorithm", "train", "settings", "made_with", "code"):
+        lines += _changed(section, before.get(section), now.get(section))
+    if as_json:
+        echo_json(lines, indent=1)
+    else:
+        names = [f"{each['name']}@{each['version']}" for each in (before, now)]
+        for line in lines or [f"{names[0]} and {names[1]} have the same contract, settings and versions"]:
+            echo(line)
+    if lines:
+        raise typer.Exit(1)
+
+
+def verify(model: ModelArgument, store: StoreOption = None) -> None:
+    """Read every file of a model and check its digest; exit 1 where one is altered, missing or was added."""
+    found = _read(model, store, verify=True)
+    if found.get("problem"):
+        echo(f"{found['name']}@{found['version']}: damaged: {found['problem']}")
+        raise typer.Exit(1)
+    echo(f"{found['name']}@{found['version']}: every file is as it was registered")
+
+
+def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
+    """A model by ``NAME[@VERSION]``. Raises UsageError."""
+    name, sign, version = reference.partition("@")
+    if sign and not (version.isascii() and version.isdecimal() and 0 < len(version) < 10 and int(version) > 0):
+        raise UsageError(f"{reference}: after @ stands a version, such as {name}@1")
+    with controller(store, None) as connect:
+        wanted = {"version": int(version)} if sign else {}
+        found: dict[str, Any] = connect().get(f"/api/models/{named(name)}", seconds=300, **wanted, **options)
+    return found
+
+
+def _changed(place: str, before: Any, now: Any) -> list[str]:
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        keys = sorted({*before, *now})
+        return [line for key in keys for line in _changed(f"{place}.{key}", before.get(key), now.get(key))]
+    return [] if before == now else [f"{place} {before} became {now}"]
+
+
+def _when(seconds: float | None) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds)) if seconds else "-"

@@ -1,0 +1,70 @@
+"""Documents of the store as dataclasses: read without any library, and refused in one line with the place of what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from collections.abc import Mapping
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from shared_store.wording import kind_of, nearest, shown
+
+
+class DocumentError(ValueError):
+    """A document is not what it should be; one line with the place in it."""
+
+
+def parse(kind: Any, value: Any, where: str) -> Any:
+    """A value of a JSON document as the type that a field has.
+
+    Args:
+        kind: A dataclass, or what its fields may be annotated with: dataclasses, numbers, texts, literals, tuples, mappings, ``X | None``.
+        value: Plain values.
+        where: What the document is called; then the keys to the value.
+
+    Raises:
+        DocumentError: It is none of that; one line with the keys to it, and the nearest name for an unknown one.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return _parse_fields(kind, value, where)
+    if kind is Any:
+        return value
+    if origin is Literal:
+        if value not in arguments:
+            raise DocumentError(f"{where}: expected one of {', '.join(map(repr, arguments))}, found {shown(value)}")
+        return value
+    if origin in (Union, types.UnionType):
+        return None if value is None else parse(arguments[0], value, where)
+    if origin is tuple:
+        lengths = (len(value),) if isinstance(value, list) and arguments[-1] is Ellipsis else (len(arguments),)
+        if not isinstance(value, list) or len(value) not in lengths:
+            raise DocumentError(f"{where}: expected a list of {lengths[0]}, found {shown(value)}")
+        kinds = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(value)
+        return tuple(parse(each, item, f"{where}.{i}") for i, (each, item) in enumerate(zip(kinds, value, strict=True)))
+    if origin is not None and issubclass(origin, Mapping):
+        if not isinstance(value, Mapping):
+            raise DocumentError(f"{where}: expected a mapping, found {kind_of(value)}")
+        return {str(name): parse(arguments[1], each, f"{where}.{name}") for name, each in value.items()}
+    allowed = (int, float) if kind is float else kind
+    if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
+        names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+        raise DocumentError(f"{where}: expected {names[kind]}, found {shown(value)}")
+    return float(value) if kind is float else value
+
+
+def _parse_fields(kind: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise DocumentError(f"{where}: expected a mapping, found {kind_of(value)}")
+    hints = get_type_hints(kind)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for name in value:
+        if name not in fields:
+            raise DocumentError(f"{where}: unknown key {shown(name)}; {nearest(name, fields)}")
+    given = {}
+    for name, field in fields.items():
+        if name in value:
+            given[name] = parse(hints[name], value[name], f"{where}.{name}" if ": " in where else f"{where}: {name}")
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise DocumentError(f"{where}: {name} is missing")
+    return kind(**given)

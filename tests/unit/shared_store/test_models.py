@@ -1,0 +1,182 @@
+"""The model registry: versions count up, are never changed, and show any damage."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store import models
+from shared_store.bundles import DamagedBundle, publish, seal
+from shared_store.checkpoints import Checkpoint
+from shared_store.files import DamagedFile
+from shared_store.layout import Run, Store
+from shared_store.models import Model, ModelError
+
+PARENT = {"run": "base", "checkpoint": "00000002-e1", "iteration": 2}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store").open()
+
+
+def exported(store: Store, iteration: int = 4) -> tuple[Run, Checkpoint]:
+    """A run with a bundle of a checkpoint."""
+    run = store.run("ant")
+    name = f"{iteration:08d}-e1"
+    run.create({"spec": {"name": "ant"}, "parent": PARENT, "created": 1.0})
+    bundle = run.exports / name
+    bundle.mkdir(parents=True)
+    (bundle / "policy.onnx").write_bytes(b"weights")
+    (bundle / "report.json").write_text(json.dumps({"judged": {"episodes": 16}}))
+    seal(bundle, {"task": "Ant", "score": 812.3, "versions": {"muster": "0.1.0"}, "code": {"module": "ant"}})
+    run.evaluations.mkdir(exist_ok=True)
+    (run.evaluations / f"{name}.json").write_text(json.dumps({"mean_return": 800.0}))
+    return run, Checkpoint(run.checkpoints / name, iteration, 1)
+
+
+def register(store: Store, name: str = "ant", **facts: Any) -> Model:
+    run = store.run("ant")
+    bundle = next(iter(sorted(run.exports.iterdir())))
+    return models.register(store, name, run, Checkpoint(run.checkpoints / bundle.name, 4, 1), facts)
+
+
+def test_a_model_holds_its_bundle_and_where_it_comes_from(store: Store) -> None:
+    exported(store)
+    model = register(store, queue="robots")
+    assert (model.reference, model.path) == ("ant@1", store.path / "models" / "ant" / "1")
+    model.verify()
+    facts = model.facts()
+    assert (facts["run"], facts["checkpoint"], facts["parent"]) == ("ant", "00000004-e1", PARENT)
+    assert (facts["spec"], facts["task"], facts["queue"]) == ({"name": "ant"}, "Ant", "robots")
+    assert (facts["made_with"], facts["code"]) == ({"muster": "0.1.0"}, {"module": "ant"})
+    assert (facts["evaluations"], facts["judged"]) == ([{"mean_return": 800.0}], {"episodes": 16})
+    assert (model.bundle / "policy.onnx").read_bytes() == b"weights"
+
+
+def test_versions_count_up_and_what_is_there_stays(store: Store) -> None:
+    exported(store)
+    first = register(store)
+    before = {path: path.read_bytes() for path in first.path.rglob("*") if path.is_file()}
+    assert [register(store).version for _ in range(3)] == [2, 3, 4]
+    assert {path: path.read_bytes() for path in first.path.rglob("*") if path.is_file()} == before
+    assert [model.version for model in models.versions(store, "ant")] == [1, 2, 3, 4]
+    assert models.find(store, "ant").version == 4 and models.find(store, "ant", 2).version == 2
+    assert models.model_names(store) == ["ant"]
+    assert all(os.stat(path).st_mode & 0o222 == 0 for path in before), "nothing of it may be written"
+
+
+REGISTER = """
+import sys
+from shared_store import models
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Store
+store = Store(sys.argv[1])
+run = store.run("ant")
+print("ready", flush=True)
+sys.stdin.readline()
+for _ in range(5):
+    checkpoint = Checkpoint(run.checkpoints / "00000004-e1", 4, 1)
+    print(models.register(store, "ant", run, checkpoint, {"registered_by": sys.argv[2]}).version, flush=True)
+"""
+
+
+def test_processes_that_register_at_once_get_a_version_each(store: Store) -> None:
+    exported(store)
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", REGISTER, str(store.path), str(number)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(4)
+    ]
+    for process in processes:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    outputs = [process.stdin.write("go\n") or process.stdin.flush() for process in processes if process.stdin]
+    outputs = [process.communicate(timeout=60)[0] for process in processes]
+    given = {int(line): str(number) for number, output in enumerate(outputs) for line in output.split()}
+    assert sorted(given) == list(range(1, 21)), "twenty versions, none of them twice"
+    for model in models.versions(store, "ant"):
+        model.verify()
+        assert model.facts()["registered_by"] == given[model.version]
+    assert sorted(os.listdir(store.models / "ant"), key=int) == [str(number) for number in range(1, 21)]
+
+
+def test_a_version_is_never_published_over_another(store: Store, tmp_path: Path) -> None:
+    exported(store)
+    model = register(store)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "policy.onnx").write_bytes(b"worse")
+    with pytest.raises(FileExistsError):
+        publish(tmp_path / "other", model.path)
+    model.verify()
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../ant", "a/b", ".hidden", "-x", "a b", "a@1", "ä", "x" * 129, "a\n"])
+def test_a_name_that_can_not_be_a_directory_is_refused(store: Store, name: str) -> None:
+    exported(store)
+    with pytest.raises(ModelError, match=r"^model name .*: use letters, digits"):
+        register(store, name)
+    with pytest.raises(ModelError):
+        models.find(store, name)
+    assert not store.models.exists()
+
+
+def test_damage_of_a_model_is_found(store: Store) -> None:
+    exported(store)
+    model = register(store)
+    for path in ("bundle/policy.onnx", "bundle/manifest.json", "model.json", "manifest.json"):
+        content = (model.path / path).read_bytes()
+        os.chmod(model.path / path, 0o644)
+        (model.path / path).write_bytes(content[:-2] + bytes([content[-2] ^ 1]) + content[-1:])
+        with pytest.raises(DamagedBundle):
+            model.verify()
+        (model.path / path).write_bytes(content)
+        model.verify()
+    (model.bundle / "notes.txt").write_text("added")
+    with pytest.raises(DamagedBundle, match=r"bundle/notes\.txt was added"):
+        model.verify()
+    (model.bundle / "notes.txt").unlink()
+    (model.path / "model.json").unlink()
+    with pytest.raises(DamagedBundle, match=r"model\.json is missing"):
+        model.verify()
+
+
+def test_what_can_not_be_registered_is_refused_and_nothing_is_left(store: Store) -> None:
+    run, checkpoint = exported(store)
+    other = Checkpoint(run.checkpoints / "00000008-e1", 8, 1)
+    with pytest.raises(ModelError, match=r"is not exported; export it first: muster export ant@8$"):
+        models.register(store, "ant", run, other, {})
+    (run.exports / checkpoint.name / "policy.onnx").write_bytes(b"weightz")
+    with pytest.raises(DamagedBundle, match=r"the content of policy\.onnx was altered"):
+        models.register(store, "ant", run, checkpoint, {})
+    assert models.model_names(store) == [] and os.listdir(store.models / "ant") == []
+    with pytest.raises(ModelError, match=r"^model ant does not exist; no model is registered yet$"):
+        models.find(store, "ant")
+
+
+def test_a_link_in_the_place_of_a_model_is_not_followed(store: Store, tmp_path: Path) -> None:
+    exported(store)
+    store.models.mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    os.symlink(tmp_path / "elsewhere", store.models / "ant")
+    with pytest.raises(DamagedFile, match="a link"):
+        register(store)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_link_in_the_place_of_a_bundle_is_not_followed(store: Store, tmp_path: Path) -> None:
+    run, checkpoint = exported(store)
+    os.rename(run.exports / checkpoint.name, tmp_path / "elsewhere")
+    os.symlink(tmp_path / "elsewhere", run.exports / checkpoint.name)
+    with pytest.raises(DamagedFile, match="a link"):
+        register(store)
+    assert models.model_names(store) == []

@@ -1,0 +1,182 @@
+"""The policy contract as a document: what can be read, and in what two of them differ."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jsonschema
+import pytest
+
+from orchestrator.spec_schema import contract_schema
+from shared_store.documents import DocumentError
+from shared_store.policy_contract import (
+    Action,
+    Command,
+    Contract,
+    Group,
+    Image,
+    State,
+    Term,
+    brief,
+    differences,
+    read,
+)
+
+ANGLES = Term(
+    name="joint_pos",
+    kind="measured",
+    first=0,
+    names=("left_knee", "right_knee"),
+    units=("rad", "rad"),
+    scale=(1.0, 1.0),
+    offset=(0.5, -0.5),
+    clip=(-3.0, math.inf),
+    history=2,
+    quantity="joint_position",
+    parameters={"gain": (2.0,)},
+    robot="robot",
+    element="joint",
+    elements=("left_knee", "right_knee"),
+    sensors={"imu": "ImuSensor, site imu"},
+)
+SPEED = Term("speed", "command", 4, ("speed",), ("m/s",), (2.0,), (0.0,), ranges=((-1.0, 1.0),), command="velocity")
+CONTRACT = Contract(
+    task="Walker",
+    muster="0.1.0",
+    control_hz=50.0,
+    groups=(
+        Group("policy", "obs", (5,), "float32", (ANGLES, SPEED)),
+        Group("front", "front", (6, 8, 8), "uint8", image=Image(("red", "green", "blue"), 2, {"fov": 0.9})),
+    ),
+    actions=(
+        Action("left_knee", "position", "rad", 0.25, 0.5, offset=0.5, stiffness=20.0, damping=0.5, effort_limit=30.0),
+        Action("right_knee", "position", "rad", 0.25, -0.5, offset=-0.5, clip=None),
+    ),
+    action_names=("left_knee", "right_knee"),
+    commands=(Command("velocity", ("speed",), ("m/s",), ((-1.0, 1.0),), (5.0, 10.0)),),
+    states=(State("h", "h_out", (1, 64)),),
+)
+
+
+def document(change: Callable[[dict[str, Any]], Any] = lambda document: None) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(json.dumps(CONTRACT.document()))
+    change(found)
+    return found
+
+
+def after(change: Callable[[dict[str, Any]], Any]) -> list[str]:
+    return differences(CONTRACT, read(document(change)))
+
+
+def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schema() -> None:
+    jsonschema.validate(document(), contract_schema())
+    again = read(document())
+    assert again.document() == document() and differences(CONTRACT, again, ranges=True) == []
+    angles = again.groups[0].terms[0]
+    assert angles.clip == (-3.0, pytest.approx(3.4e38, rel=0.01)), "JSON has no infinity"
+    assert dataclasses.replace(angles, clip=ANGLES.clip) == ANGLES
+    assert (again.actions, again.commands, again.states) == (CONTRACT.actions, CONTRACT.commands, CONTRACT.states)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document(lambda found: found["actions"][0].pop("unit")), contract_schema())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda found: found.update(format=2),
+            "contract.json: has format 2, this Muster reads up to 1; upgrade Muster",
+        ),
+        (lambda found: found.pop("task"), "contract.json: task is missing"),
+        (
+            lambda found: found["actions"][1].update(scal=1.0),
+            "contract.json: actions.1: unknown key 'scal'; did you mean scale?",
+        ),
+        (
+            lambda found: found["actions"][0].update(kind="postion"),
+            "contract.json: actions.0.kind: expected one of 'effort', 'position', 'velocity', 'choice', found 'postion'",
+        ),
+        (
+            lambda found: found["actions"][0].update(clip=[1.0]),
+            "contract.json: actions.0.clip: expected a list of 2, found [1.0]",
+        ),
+        (lambda found: found.update(control_hz="50"), "contract.json: control_hz: expected a number, found '50'"),
+        (lambda found: found.update(discrete=1), "contract.json: discrete: expected true or false, found 1"),
+        (
+            lambda found: found["groups"][0]["terms"][1].update(first=3),
+            "contract.json: groups.policy.speed: begins at 3, and the terms before it end at 4",
+        ),
+        (
+            lambda found: found["groups"][0].update(shape=[6]),
+            "contract.json: groups.policy: its terms have 5 numbers, its shape is [6]",
+        ),
+        (
+            lambda found: found["groups"][0]["terms"][0].update(scale=[1.0]),
+            "contract.json: groups.policy.joint_pos: names, units, scale, offset and ranges have different lengths",
+        ),
+        (
+            lambda found: found.update(action_names=["right_knee", "left_knee"]),
+            "contract.json: action_names are not the names of actions, in order",
+        ),
+    ],
+)
+def test_what_is_no_contract_is_refused_in_one_line(change: Callable[[dict[str, Any]], Any], said: str) -> None:
+    with pytest.raises(DocumentError) as caught:
+        read(document(change))
+    assert str(caught.value) == said
+
+
+def test_each_change_of_meaning_is_a_line() -> None:
+    def terms(found: dict[str, Any]) -> list[dict[str, Any]]:
+        there: list[dict[str, Any]] = found["groups"][0]["terms"]
+        return there
+
+    assert after(lambda found: terms(found)[0].update(scale=[0.5, 1.0])) == [
+        "observation 0: joint_pos/left_knee (1 steps ago) scale 1.0 became 0.5",
+        "observation 2: joint_pos/left_knee scale 1.0 became 0.5",
+    ]
+    assert after(lambda found: terms(found)[1].update(units=["km/h"])) == ["observation 4: speed unit m/s became km/h"]
+    assert after(lambda found: terms(found)[0]["sensors"].update(imu="ImuSensor, site head"))[0] == (
+        "observation 0: joint_pos/left_knee (1 steps ago) sensor imu ImuSensor, site imu became ImuSensor, site head"
+    )
+    assert after(lambda found: found["actions"][0].update(stiffness=40.0, effort_limit=None)) == [
+        "action 0: left_knee stiffness 20.0 became 40.0",
+        "action 0: left_knee effort_limit 30.0 became none",
+    ]
+    assert after(lambda found: found.update(control_hz=60.0)) == ["the control rate 50 Hz became 60 Hz"]
+    assert after(lambda found: found["groups"].pop()) == ["the observation group front is gone"]
+    assert after(lambda found: found["groups"][1]["image"]["camera"].update(fov=1.1)) == [
+        "image of front: fov 0.9 became 1.1"
+    ]
+    assert after(lambda found: found["states"][0].update(shape=[1, 32])) == [
+        "the recurrent state h [1, 64] became h [1, 32]"
+    ]
+    assert after(lambda found: found["commands"].clear()) == ["the command velocity is gone"]
+
+
+def test_names_that_come_go_and_move_are_told_by_name() -> None:
+    swapped = dataclasses.replace(CONTRACT, actions=CONTRACT.actions[::-1], action_names=("right_knee", "left_knee"))
+    assert differences(CONTRACT, swapped) == [
+        "action 0: left_knee became action 1",
+        "action 1: right_knee became action 0",
+    ]
+    renamed = after(lambda found: found["groups"][0]["terms"][1].update(names=["pace"]))
+    assert renamed == ["observation 4: speed is gone", "observation 4: speed/pace is new"]
+
+
+def test_numbers_that_a_compiler_rounded_and_what_only_training_is_about_are_no_change() -> None:
+    assert after(lambda found: found["actions"][0].update(stiffness=20.0000005)) == []
+    wider: Callable[[dict[str, Any]], Any] = lambda found: found["commands"][0].update(ranges=[[-2.0, 2.0]])  # noqa: E731
+    assert after(wider) == []
+    assert differences(CONTRACT, read(document(wider)), ranges=True) == [
+        "command velocity: ranges [[-1.0, 1.0]] became [[-2.0, 2.0]]"
+    ]
+
+
+def test_of_many_differences_the_first_are_told_and_how_many_there_are() -> None:
+    assert brief(["a", "b"]) == "a; b"
+    assert brief([str(index) for index in range(8)]) == "0; 1; 2; 3; 4; and 3 more"

@@ -1,0 +1,160 @@
+"""The policy contract of a task: a stranger rebuilds the policy's observations and actions from the document alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+
+from shared_store.policy_contract import Contract, differences, read
+from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
+from tests.support.worker.kernels.cartpole import Cartpole as CartpoleOfKernels
+from worker.errors import UserError
+from worker.learning.algorithm import ExportedPolicy
+from worker.learning.setup import check_contract
+from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.policy_contract import policy_contract
+
+WORLDS, STEPS = 4, 12
+
+
+@pytest.fixture(scope="module")
+def sliders() -> Sliders:
+    return Sliders(SlidersConfig(), WORLDS, seed=1)
+
+
+def published(task: Any, exported: ExportedPolicy | None = None) -> Contract:
+    return read(json.loads(json.dumps(policy_contract(task, type(task).__name__, exported).document())))
+
+
+def seen_by(
+    quantities: dict[str, list[torch.Tensor]], group: dict[str, Any], step: int, skip: set[str]
+) -> torch.Tensor:
+    """A stranger's observation of a step, from the document and what was measured until then (shape (worlds, columns) a step)."""
+    numbers = torch.full((WORLDS, group["shape"][0]), torch.nan)
+    for term in group["terms"]:
+        width = len(term["names"])
+        for place, back in enumerate(range(term["history"] - 1, -1, -1)):
+            if term["name"] in skip:
+                continue
+            value = quantities[term["name"]][max(0, step - back)] - torch.tensor(term["offset"])
+            if term["clip"]:
+                value = value.clamp(*term["clip"])
+            first = term["first"] + place * width
+            numbers[:, first : first + width] = value * torch.tensor(term["scale"])
+    return numbers
+
+
+def test_observations_are_rebuilt_from_the_document_alone(sliders: Sliders) -> None:
+    group = published(sliders).document()["groups"][0]
+    assert [term["name"] for term in group["terms"]] == ["place", "late", "noisy", "target", "last"]
+    sliders.reset()
+    measured: dict[str, list[torch.Tensor]] = {name: [] for name in ("place", "late", "target", "last")}
+    actions = torch.zeros(WORLDS, 2)
+    generator = torch.Generator().manual_seed(0)
+    compared = 0
+    begun = torch.zeros(WORLDS, dtype=torch.bool)
+    for step in range(STEPS):
+        measured["place"].append(wp.to_torch(sliders.worlds.arrays.joint_q).clone())
+        measured["late"].append(wp.to_torch(sliders.worlds.arrays.joint_qd)[:, :1].clone())
+        measured["target"].append(sliders.groups["policy"][:, 6:7].clone())  # the operator's own word
+        measured["last"].append(actions.clamp(-2.0, 2.0))
+        expected = seen_by(
+            measured, group, step, skip={"late", "noisy"}
+        )  # those that are late and noisy are another matter
+        known = ~expected.isnan()
+        found = torch.where(known, sliders.observations, expected)[~begun]
+        torch.testing.assert_close(found, expected[~begun], equal_nan=True)
+        compared += int(known[~begun].sum())
+        actions = torch.rand(WORLDS, 2, generator=generator) * 2.0 - 1.0
+        sliders.step(actions)
+        begun |= sliders.dones
+    assert compared > WORLDS * 4 * 5
+
+
+def test_what_a_term_is_made_of_is_told(sliders: Sliders) -> None:
+    contract = published(sliders)
+    terms = {term.name: term for term in contract.groups[0].terms}
+    place, late, target = terms["place"], terms["late"], terms["target"]
+    assert (place.quantity, place.element, place.elements) == ("joint_position", "joint", ("first", "second"))
+    assert (place.scale, place.offset) == ((2.0, 1.0), (0.5, 0.0)) and place.clip == pytest.approx((-0.8, 0.8))
+    assert (late.first, late.size, late.history, late.delay) == (2, 3, 3, (0, 2))
+    assert (target.kind, target.command, target.ranges, target.units) == ("command", "target", ((-1.0, 1.0),), ("m",))
+    (command,) = contract.commands
+    assert (command.name, command.names, command.ranges) == ("target", ("place",), ((-1.0, 1.0),))
+    assert command.seconds == pytest.approx((0.3, 0.5))
+    assert contract.normalizer == "unknown" and [group.name for group in contract.groups] == ["policy", "critic"]
+    assert [term.quantity for term in contract.groups[1].terms] == ["joint_position", "counted"]
+
+
+def test_a_recurrent_policy_s_inputs_and_state_are_told(sliders: Sliders) -> None:
+    exported: Any = SimpleNamespace(
+        sample={"critic": None}, inputs={"obs": torch.zeros(1, 3), "h": torch.zeros(1, 1, 8)}, states=["h"]
+    )
+    contract = published(sliders, exported)
+    assert [(group.name, group.input, group.shape) for group in contract.groups] == [("critic", "obs", (3,))]
+    assert [(state.name, state.output, state.shape) for state in contract.states] == [("h", "h_out", (1, 8))]
+    assert contract.normalizer == "inside"
+
+
+def test_terms_in_torch_and_kernels_by_hand_have_the_same_document_with_less() -> None:
+    both = published(TorchSliders(SlidersConfig(), 1)).groups[0].terms[0]
+    assert (both.names, both.quantity, both.element) == (("both_0", "both_1"), "both", "")
+    cart = published(CartpoleOfKernels(CartpoleConfig(), 1))
+    assert [(term.names, term.units, term.quantity) for term in cart.groups[0].terms[:2]] == [
+        (("slider_position",), ("m",), ""),
+        (("hinge_position",), ("rad",), ""),
+    ]
+    assert cart.action_names == ("slider",) and cart.actions[0].scale == pytest.approx(cart.actions[0].effort_limit)
+
+
+class Other(Sliders):
+    """The same sizes, with another meaning."""
+
+    def sections(self) -> dict[str, Any]:
+        sections = super().sections()
+        sections["observations"]["policy"]["place"].scale = (1.0, 1.0)
+        sections["actions"]["force"].clip = (-1.0, 1.0)
+        return sections
+
+
+def checkpoint(task: Any, **facts: Any) -> Any:
+    sizes = {name: list(group.shape[1:]) for name, group in task.groups.items()}
+    manifest = {"task": "Sliders", "policy": {"groups": sizes, "action_size": 2}, **facts}
+    return SimpleNamespace(name="00000004-e1", path=Path("nowhere"), manifest=manifest)
+
+
+def test_a_checkpoint_whose_task_means_something_else_by_now_is_refused_with_what_changed(sliders: Sliders) -> None:
+    then = checkpoint(sliders, contract=published(sliders).document())
+    check_contract(then, sliders)
+    with pytest.raises(UserError) as caught:
+        check_contract(then, Other(SlidersConfig(), 1))
+    said = str(caught.value)
+    assert said.startswith(
+        "checkpoint 00000004-e1 does not fit task Sliders as it is now: observation 0: place/first_place scale 2.0 became 1.0; "
+    )
+    assert "action 0: first clip [-2.0, 2.0] became [-1.0, 1.0]" in said and "\n" not in said
+
+
+def test_of_a_checkpoint_without_a_contract_sizes_are_compared(sliders: Sliders) -> None:
+    check_contract(checkpoint(sliders), Other(SlidersConfig(), 1))
+    wider = checkpoint(sliders)
+    wider.manifest["policy"]["groups"]["policy"] = [10]
+    with pytest.raises(UserError, match=r"does not fit task Sliders as it is now: it had .*\(10,\).*, it has .*\(9,\)"):
+        check_contract(wider, sliders)
+
+
+def test_a_damaged_contract_in_a_checkpoint_is_one_line(sliders: Sliders) -> None:
+    document = published(sliders).document()
+    del document["control_hz"]
+    with pytest.raises(UserError, match=r"^checkpoint 00000004-e1: contract: control_hz is missing$"):
+        check_contract(checkpoint(sliders, contract=document), sliders)
+
+
+def test_the_contract_of_a_task_is_the_same_each_time(sliders: Sliders) -> None:
+    assert differences(published(sliders), published(Sliders(SlidersConfig(), 2, seed=5)), ranges=True) == []

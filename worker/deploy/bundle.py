@@ -1,0 +1,242 @@
+"""A checkpoint's policy as a bundle: files that run it on a robot, compared with it before they appear.
+
+==================  ==========================================================================================================
+``policy.onnx``     the mean action, the normaliser inside, batch size free; recurrent state as inputs and outputs
+``policy.pt``       the same as TorchScript
+``contract.json``   what goes in and what comes out (:mod:`shared_store.policy_contract`)
+``parity.npz``      observations of roll-outs, and what the trained policy did: a self-test for who runs the bundle
+``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
+``robot/``          the robot's model, where its licence allows a copy
+``README.md``       what is what, and licences
+``manifest.json``   where the policy comes from, versions, and the SHA-256 of every other file
+==================  ==========================================================================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import inspect
+import io
+import platform
+import shutil
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from shared_store import __version__
+from shared_store.bundles import CONTRACT, REPORT, publish, seal
+from shared_store.checkpoints import Checkpoint
+from shared_store.files import remove_tree, write_json
+from shared_store.layout import Run
+from shared_store.policy_contract import Contract
+from worker.deploy import parity, rollouts
+from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
+from worker.deploy.robots import add_robot
+
+if TYPE_CHECKING:
+    from worker.learning.algorithm import ExportedPolicy, Policy
+    from worker.tasks.task import Task
+
+COPIED = ("iteration", "reward", "score", "score_error", "score_episodes", "env_steps", "algorithm")
+"""What a bundle's manifest repeats of its checkpoint's."""
+
+
+@dataclass(frozen=True)
+class Files:
+    """A policy's files in memory, compared with the policy."""
+
+    onnx: bytes
+    torchscript: bytes
+    parity: bytes
+    """``parity.npz``."""
+    report: dict[str, Any]
+    """How they were compared."""
+
+
+def bundle_files(
+    policy: Policy,
+    exported: ExportedPolicy,
+    contract: Contract,
+    algorithm: str,
+    recordings: Mapping[str, parity.Recording],
+    run_path: str = "",
+) -> Files:
+    """Write a policy to files and compare them with it on the recordings, and on the policy's own sample.
+
+    Args:
+        policy: As it was trained, on the CPU.
+        exported: What its ``module()`` gave.
+        contract: Its inputs, outputs and states.
+        algorithm: Its name, for errors.
+        recordings: By name; those that are called ``rollout`` and ``extremes`` go into ``parity.npz``.
+        run_path: Run and checkpoint, for the metadata.
+
+    Raises:
+        TrainingError: A file computes something else than the policy.
+        UserError: The policy has a memory that its ``module()`` does not have.
+    """
+    groups = {group.input: group.name for group in contract.groups}
+    compared = {**recordings, "made_up": parity.made_up(exported)}
+    for recording in compared.values():
+        if len(recording.begins) > 1:
+            first = parity.Recording(
+                {name: each[: parity.STEPS] for name, each in recording.inputs.items()},
+                recording.begins[: parity.STEPS],
+            )
+            parity.refuse_hidden_memory(policy, exported, algorithm, first, groups)
+    onnx, torchscript = to_onnx(exported, metadata_of(contract, run_path)), to_torchscript(exported)
+    models: dict[str, parity.Runnable] = {
+        "onnx": OnnxPolicy(onnx, contract),
+        "torchscript": ScriptPolicy(torchscript, contract),
+    }
+    found: dict[str, float] = dict.fromkeys(models, 0.0)
+    arrays: dict[str, np.ndarray] = {}
+    for name, recording in compared.items():
+        wanted = parity.trained_actions(policy, recording, groups)
+        for kind, model in models.items():
+            found[kind] = max(found[kind], parity.compare(kind, model, recording, wanted))
+        if name == "rollout":
+            arrays |= {**recording.inputs, "begins": recording.begins, "actions": wanted}
+        elif name == "extremes":
+            arrays |= {f"extreme_{key}": each[0] for key, each in recording.inputs.items()}
+            arrays["extreme_actions"] = wanted[0]
+    counts = {name: recording.count for name, recording in compared.items()}
+    resets = {name: recording.resets for name, recording in compared.items() if name == "rollout"}
+    report = {
+        "tolerance": parity.TOLERANCE,
+        "greatest_difference": found,
+        "observations": counts,
+        "resets": resets.get("rollout", 0),
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return Files(onnx, torchscript, buffer.getvalue(), report)
+
+
+def export(
+    run: Run, checkpoint: Checkpoint, task: Task, policies: tuple[Policy, Policy], contract: Contract, rounds: int = 1
+) -> Path:
+    """Write the bundle of a checkpoint to ``exports/<its name>/``, as a whole or not at all; returns that directory.
+
+    Args:
+        run: Of the checkpoint.
+        checkpoint: Whose policy.
+        task: Worlds of its task, which are played with.
+        policies: Its policy on the CPU, and on the task's device.
+        contract: Its contract, with the policy's inputs and states.
+        rounds: Episodes of each world on which the bundle is judged; 0: it is not.
+
+    Raises:
+        TrainingError: A file computes something else than the policy, or does worse on the task's worlds; nothing is published then.
+        UserError: The policy has a memory that its ``module()`` does not have.
+    """
+    policy, acting = policies
+    exported = policy.module()
+    groups = {group.input: group.name for group in contract.groups}
+    begin = task.state_dict()
+    extremes = rollouts.Extremes(groups) if all(len(group.shape) == 1 for group in contract.groups) else None
+    trained = rollouts.play(task, acting, rounds, extremes) if rounds else None
+    recordings = {"rollout": rollouts.record(task, acting, groups)}
+    if extremes and rounds:
+        recordings["extremes"] = parity.single(extremes.inputs())
+    run_path = f"{run.name}/{checkpoint.name}"
+    files = bundle_files(policy, exported, contract, checkpoint.manifest["algorithm"], recordings, run_path)
+    report: dict[str, Any] = {"parity": files.report, "judged": None}
+    if trained:
+        task.load_state_dict(begin)  # the same worlds, and the same random numbers from there on
+        played = rollouts.play(task, OnnxPolicy(files.onnx, contract), rounds)
+        report["judged"] = {
+            "runtime": f"onnxruntime {metadata.version('onnxruntime')}",
+            **rollouts.judge(trained, played),
+        }
+    return _publish(run, checkpoint, task, contract, files, report)
+
+
+def _publish(
+    run: Run, checkpoint: Checkpoint, task: Task, contract: Contract, files: Files, report: Mapping[str, Any]
+) -> Path:
+    target = run.exports / checkpoint.name
+    hidden = run.exports / f".{checkpoint.name}.{uuid.uuid4().hex[:8]}.tmp"
+    facts = checkpoint.manifest
+    try:
+        hidden.mkdir(parents=True)
+        (hidden / "policy.onnx").write_bytes(files.onnx)
+        (hidden / "policy.pt").write_bytes(files.torchscript)
+        (hidden / "parity.npz").write_bytes(files.parity)
+        write_json(hidden / CONTRACT, contract.document())
+        write_json(hidden / REPORT, report)
+        robot = add_robot(task, hidden)
+        (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot))
+        seal(
+            hidden,
+            {
+                "run": run.name,
+                "checkpoint": checkpoint.name,
+                "checkpoint_files": facts["files"],
+                "task": contract.task,
+                **{name: facts[name] for name in COPIED if name in facts},
+                "train": facts["train"],
+                "settings": facts["settings"],
+                "parent": (run.description() or {}).get("parent"),
+                "robot": robot,
+                "opset": OPSET,
+                "code": _code(type(task)),
+                "versions": _versions(),
+                "created": time.time(),
+            },
+        )
+        while True:  # until nobody else has just published the same checkpoint's
+            with contextlib.suppress(FileNotFoundError):
+                remove_tree(target)
+            with contextlib.suppress(FileExistsError):
+                publish(hidden, target)
+                return target
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _code(task: type) -> dict[str, str]:
+    """The module of the task, and the SHA-256 of its source as it was when the bundle was made."""
+    source = inspect.getsourcefile(task)
+    digest = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+    return {"module": task.__module__, "sha256": digest}
+
+
+def _versions() -> dict[str, str]:
+    packages = ("torch", "onnx", "onnxruntime", "newton", "warp-lang", "rsl-rl-lib")
+    return {"muster": __version__, "python": platform.python_version()} | {
+        name: metadata.version(name) for name in packages
+    }
+
+
+def _readme(run: Run, checkpoint: Checkpoint, contract: Contract, robot: Mapping[str, Any] | None) -> str:
+    """For a person who finds the bundle."""
+    if robot is None:
+        about = "The task does not say which file its robot comes from."
+    elif robot["file"]:
+        about = f"`{robot['file']}` is the robot's model ({robot['source']}); its licence: {robot['licence']}."
+    else:
+        package = f", of {robot['package']}" if "package" in robot else ""
+        about = f"The robot's model is not in the bundle. Its source: `{robot['source']}`{package}; licence: {robot['licence']}."
+    return f"""# Policy of task {contract.task}
+
+From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iteration}. Made by Muster {__version__}.
+
+- `contract.json`: how observations are made and actions are applied, at {contract.control_hz:g} Hz. Its JSON Schema: `muster schema --contract`.
+- `policy.onnx`: inputs {", ".join(f"`{group.input}`" for group in contract.groups)}; the normaliser is inside. `policy.pt`: the same as TorchScript.
+- `parity.npz`: observations of roll-outs (steps, worlds, ...), where episodes `begins`, and the `actions` of the trained policy. Whoever
+  runs the policy should repeat them to within {parity.TOLERANCE:g}.
+- `report.json`: how the files were compared with the trained policy, and how both did on the same simulated worlds.
+- `manifest.json`: where the policy comes from, versions, and the SHA-256 of every file.
+
+## Licences
+
+The policy, the contract and the recordings belong to whoever trained the policy; Muster claims no rights in them. {about}
+"""
