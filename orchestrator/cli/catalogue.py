@@ -36,6 +36,18 @@ ENTRIES = (
     Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
     Entry("resume", "runs", _RUNS, "Go on with a run from its newest checkpoint, at the next iteration."),
     Entry("clone", "clones", _RUNS, "Start a new run with the weights of a checkpoint, and with nothing else of it."),
+    Entry(
+        "evaluate",
+        "evaluations",
+        _RUNS,
+        "Evaluate a checkpoint: whole episodes on worlds that its training has not seen.",
+    ),
+    Entry(
+        "compare",
+        "comparing",
+        _RUNS,
+        "Compare runs, or groups of runs that differ in their seed alone; draw their curves.",
+    ),
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
     Entry(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints, newest_checkpoint
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, newest_checkpoint
 from shared_store.layout import Run
 from worker.errors import UserError
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:
-    """The checkpoint that a user means: an iteration, a name, or None for the newest good one. All ranks call it.
+    """The checkpoint that a user means: an iteration, a name, ``best``, or ``latest`` or None for the newest good one. All ranks call it.
 
     Raises UserError where there is no such checkpoint, or it is damaged; the message says which there are.
     """
@@ -33,7 +33,11 @@ def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpo
 def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
     """See :func:`choose_checkpoint`; for one process. Of two with the same iteration the later epoch's is meant."""
     checkpoints = list_checkpoints(run)
-    if wanted is None:
+    if wanted == "best":
+        if (best := best_checkpoint(run)) is None:
+            raise UserError(f"run {run.name} has no best checkpoint yet: evaluate two of them, or name an iteration")
+        wanted = best.name
+    if wanted in (None, "latest"):
         newest = newest_checkpoint(run)
         if newest is None:
             raise UserError(f"run {run.name} has no checkpoint that can be read in {run.checkpoints}; train it first")

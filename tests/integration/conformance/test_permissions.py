@@ -77,6 +77,7 @@ TABLE = {
     Operation.READ_RUN: OWN_READ,
     Operation.READ_CHECKPOINTS: OWN_READ,
     Operation.READ_METRICS: OWN_READ,
+    Operation.READ_EVALUATIONS: OWN_READ,
     Operation.RESUME_RUN: OWN_WRITE,
     Operation.CLONE_RUN: OWN_WRITE,
 }
@@ -168,6 +169,7 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.READ_RUN),
         of_ours(of.READ_CHECKPOINTS),
         of_ours(of.READ_METRICS),
+        of_ours(of.READ_EVALUATIONS),
         of_ours(of.RESUME_RUN, {}),
         of_ours(of.CLONE_RUN, {"name": "x"}),
     ]
