@@ -80,9 +80,7 @@ def main() -> int:
     result = result_of(task, played, checkpoint.name, seed, started)
     if gang.is_main:
         print(result, flush=True)
-        told = result.write(
-            run, job.id, job=job.id, iteration=checkpoint.iteration, config=changes, **_circumstances(facts)
-        )
+        told = result.write(run, job.id, iteration=checkpoint.iteration, config=changes, **_circumstances(facts))
         print("\n".join(lines(told)), flush=True)
         print(f"written: {run.evaluations / told['table']} and .json", flush=True)
     gang.close()

@@ -111,7 +111,7 @@ class Evaluation:
             **facts: What else the summary says.
         """
         name = evaluation_name(self.checkpoint, job)
-        summary = {**self.summary(), **facts, "table": f"{name}.parquet", "time": time.time()}
+        summary = {**self.summary(), **facts, "job": job or None, "table": f"{name}.parquet", "time": time.time()}
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
         if earlier:
             summary["compared"] = self._compared(earlier[-1], facts.get("config") or {})
