@@ -35,12 +35,13 @@ def main() -> int:
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from shared_store.evaluations import lines
+    from worker.evaluation.blocks import SIZE, Blocks
     from worker.evaluation.episodes import Stopped, play
     from worker.evaluation.evaluation import result_of
     from worker.learning.algorithm import Share
     from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.setup import build_task, spaces_from, spaces_of
-    from worker.learning.trained import choose_checkpoint, load_policy
+    from worker.learning.trained import choose_checkpoint, load_policies
     from worker.tasks import find_task
 
     checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
@@ -52,8 +53,9 @@ def main() -> int:
     config = configure(task_type, {**trained, "config": merged(trained.get("config") or {}, changes)}, "evaluate")
     seed = job.setting("seed", held_out_seed(trained.get("seed", 0)), least=0)
     seed_generators(seed)
-    total = min(job.setting("worlds", WORLDS) * gang.size, max(episodes, gang.size))
-    share = Share.of(gang.rank, gang.size, total)
+    blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / SIZE)
+    dealt = Share.of(gang.rank, gang.size, max(blocks, gang.size))
+    share, total = Share(dealt.first * SIZE, dealt.count * SIZE, dealt.total * SIZE), dealt.total * SIZE
 
     def build(first: int) -> Task:
         task = build_task(task_type, config, Share(first + share.first, share.count, total), gang, seed)
@@ -61,7 +63,9 @@ def main() -> int:
         return task
 
     task = build(0)
-    policy = load_policy(checkpoint, gang.device)
+    # a GPU adds in no fixed order: there one batch is faster, and blocks would make no two evaluations equal
+    policies = load_policies(checkpoint, gang.device, dealt.count if gang.device == "cpu" else 1)
+    policy = Blocks(policies) if gang.device == "cpu" else policies[0]
     if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
         raise UserError(
             f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: it had {then}, it has {now}"

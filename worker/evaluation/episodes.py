@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
 from worker.distributed import Gang
-from worker.learning.algorithm import Policy
 from worker.learning.setup import observed
 
 if TYPE_CHECKING:
@@ -18,6 +17,16 @@ if TYPE_CHECKING:
 _RETURN, _LENGTH, _TIME_OUT, _CAUSE, _SUCCESS, _TERMS = range(6)
 LOOK = 32
 """Steps between two looks at whether any episode still runs: looking waits for the device and for the other ranks."""
+
+
+class Acting(Protocol):
+    """A policy, as far as it is evaluated: see :class:`worker.learning.algorithm.Policy`."""
+
+    def act(self, observations: Any) -> torch.Tensor:
+        """Mean actions, shape ``(worlds, actions)``, for the task's observation groups."""
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """Forget what is remembered of the running episodes, of all worlds or where ``worlds`` is true."""
 
 
 class Stopped(Exception):
@@ -73,7 +82,7 @@ class Episodes:
 
 def play(
     rounds: Iterable[Task],
-    policy: Policy,
+    policy: Acting,
     gang: Gang,
     *,
     episodes: int | None = None,
@@ -105,7 +114,7 @@ def play(
     return Episodes(torch.cat(parts)[:episodes], ended.columns, ended.names, success)
 
 
-def _one_round(task: Task, policy: Policy, gang: Gang, is_asked_to_stop: Callable[[], bool]) -> torch.Tensor:
+def _one_round(task: Task, policy: Acting, gang: Gang, is_asked_to_stop: Callable[[], bool]) -> torch.Tensor:
     """Rows of the first episode of each world after a reset, shape ``(worlds, columns)``."""
     task.reset()
     policy.reset()

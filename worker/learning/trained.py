@@ -57,6 +57,11 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
 
     Raises UserError where the checkpoint is of another version, its algorithm can't be found, or refuses the settings that it had then.
     """
+    return load_policies(checkpoint, device, 1)[0]
+
+
+def load_policies(checkpoint: Checkpoint, device: str, count: int) -> list[Policy]:
+    """:func:`load_policy`, several times: each remembers its own episodes."""
     from worker.learning.algorithms import find_algorithm, refusal
     from worker.learning.setup import spaces_from
 
@@ -66,17 +71,20 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
     algorithm = find_algorithm(facts["algorithm"])
     try:
         settings = algorithm.config_type(**facts["settings"])
-        policy = algorithm.build_policy(settings, spaces_from(facts["policy"]), device)
+        spaces = spaces_from(facts["policy"])
+        policies = [algorithm.build_policy(settings, spaces, device) for _ in range(count)]
     except (TypeError, ValueError) as error:
         refused = refusal("settings", error).removeprefix("train.")
         raise UserError(
             f"checkpoint {checkpoint.name}: algorithm {facts['algorithm']} refuses what it was trained with: {refused}"
         ) from error
     try:
-        policy.load_state_dict(load_learner(checkpoint, device)["algorithm"]["policy"])
+        learnt = load_learner(checkpoint, device)["algorithm"]["policy"]
+        for policy in policies:
+            policy.load_state_dict(learnt)
     except (RuntimeError, KeyError) as error:
         raise UserError(f"checkpoint {checkpoint.name}: its policy can't be read: {error}") from error
-    return policy
+    return policies
 
 
 def load_learner(checkpoint: Checkpoint, device: str = "cpu") -> dict[str, Any]:
