@@ -51,8 +51,8 @@ def share(hits: int, count: int) -> dict[str, float]:
     return {
         "count": hits,
         "share": portion,
-        "low": max(0.0, (middle - half) / scale),
-        "high": min(1.0, (middle + half) / scale),
+        "low": (middle - half) / scale if hits else 0.0,
+        "high": (middle + half) / scale if hits < count else 1.0,
     }
 
 
