@@ -17,13 +17,14 @@ from shared_store.layout import LARGEST_DESCRIPTION, Run
 TERMS_SHOWN = 6
 """Reward terms that a printed table has: those of the greatest size."""
 
-_NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9]{1,40})?")
+_NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
 _NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")
 
 
 def evaluation_name(checkpoint: str, job: str = "") -> str:
-    """What an evaluation is called: after its checkpoint, and after its job, where that did nothing else."""
-    return f"{checkpoint}-{job[:8]}" if job else checkpoint
+    """What an evaluation is called: after its checkpoint, and after its job, of an array with the index, where that did nothing else."""
+    parent, _, index = job.partition(":")
+    return "-".join(filter(None, (checkpoint, parent[:8], index)))
 
 
 def checkpoint_of(name: str) -> str | None:

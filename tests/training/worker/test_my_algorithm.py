@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from shared_store.evaluations import list_evaluations
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
@@ -82,7 +83,8 @@ def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_pat
     (exported,) = run.exports.iterdir()
     facts = json.loads((exported / "policy.json").read_text())
     assert facts["observation_names"] and facts["max_difference"] <= 1e-5
-    assert [path.name for path in run.evaluations.iterdir()] == [f"{exported.name}.json"]
+    both = list_evaluations(run)  # at the end of the training, and of the job
+    assert [each["checkpoint"] for each in both] == [exported.name] * 2 and both[1]["episodes"] == 100
 
 
 def test_two_ranks_of_it_hold_the_same_weights(tmp_path: Path) -> None:

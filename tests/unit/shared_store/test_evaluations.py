@@ -34,7 +34,8 @@ def evaluate(run: Run, name: str, mean: float, time: float = 1.0, episodes: int 
 def test_an_evaluation_is_called_after_its_checkpoint_and_its_job() -> None:
     assert evaluation_name("00000003-e1") == "00000003-e1"
     assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a") == "00000003-e1-1f2e3d4c"
-    assert checkpoint_of("00000003-e1-1f2e3d4c") == checkpoint_of("00000003-e1") == "00000003-e1"
+    assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a:7") == "00000003-e1-1f2e3d4c-7"
+    assert checkpoint_of("00000003-e1-1f2e3d4c-7") == checkpoint_of("00000003-e1") == "00000003-e1"
     assert checkpoint_of("notes") is None and checkpoint_of("00000003-e1-../x") is None
 
 

@@ -149,7 +149,7 @@ def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: C
 
 
 def test_a_success_that_names_nothing_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(ValueError, match="success: no metric and no termination is called sped; did you mean speed?"):
+    with pytest.raises(ValueError, match=r"success: no metric and no termination is called sped; did you mean speed\?"):
         Misspelt.sketch(config())
 
 
