@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks.load import Watch, add_option, told
 from benchmarks.stock import stock_runner
 from benchmarks.training import CUDA, build, wait
-from worker.learning.evaluation import evaluate
+from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop
 from worker.learning.setup import build_task
 

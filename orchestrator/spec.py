@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
@@ -129,20 +130,40 @@ else:
     Train = train_section(_Train, {name: section_of(name, each, _Section) for name, each in ALGORITHMS.items()})
 
 
+CheckpointName = int | Literal["best", "latest"]
+"""An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
+
+
+def _checkpoint(value: object) -> object:
+    if value in (None, "best", "latest") or (isinstance(value, int) and not isinstance(value, bool) and value >= 0):
+        return value
+    raise ValueError("expected an iteration, best or latest")
+
+
 class Evaluate(_Section):
     """Evaluate a checkpoint of a run with the mean action."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
-    episodes: int = Field(default=1, ge=1, description="episodes of each world")
-    worlds: int = Field(default=64, ge=1, description="simulated worlds of each rank")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
+    episodes: int = Field(default=100, ge=1, le=1_000_000, description="of all ranks together")
+    worlds: int = Field(default=1024, ge=1, description="simulated worlds of each rank, at most one for each episode")
+    seed: int | None = Field(
+        default=None, ge=0, lt=2**63, description="of the worlds; by default one that follows from the training's"
+    )
+    config: dict[str, Any] = Field(
+        default_factory=dict, description="changes of the task's configuration with which the run was trained"
+    )
 
 
 class Export(_Section):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
     episodes: int = Field(default=16, ge=0, description="on which bundle and policy are compared, at least; 0: none")
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 

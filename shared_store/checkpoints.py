@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.epoch import StaleEpoch, check_epoch
+from shared_store.evaluations import by_checkpoint, checkpoint_of
 from shared_store.files import (
     DamagedFile,
     open_regular,
@@ -172,12 +173,19 @@ def newest_checkpoint(
 
 
 def best_checkpoint(run: Run) -> Checkpoint | None:
-    """The checkpoint with the greatest score, the later one of equals; None where none has a score yet.
+    """The best checkpoint, the later one of equals; None where none has been evaluated or has a score yet.
 
-    A score is a mean over many episodes; the reward of the one iteration before a checkpoint counts for nothing here.
+    Where two or more have been evaluated in the worlds of their training, it is the one of them with the greatest mean return; one alone
+    would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
+    the one iteration before a checkpoint counts for nothing here.
     """
+    checkpoints = list_checkpoints(run)
+    evaluated = by_checkpoint(run)
+    judged = [checkpoint for checkpoint in checkpoints if checkpoint.name in evaluated]
+    if len(judged) > 1:
+        return max(reversed(judged), key=lambda checkpoint: evaluated[checkpoint.name]["mean_return"])
     best, found = None, -math.inf
-    for checkpoint in list_checkpoints(run):
+    for checkpoint in checkpoints:
         try:
             score = checkpoint.manifest.get("score")
         except DamagedCheckpoint:
@@ -278,13 +286,14 @@ class CheckpointWriter:
 
 
 def retain(run: Run, keep: int) -> list[str]:
-    """Delete all but the newest ``keep`` checkpoints, the best one (greatest ``score``) and those that an evaluation or an export
-    was made of; returns the deleted names.
+    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, and those that an evaluation or an export
+    was made of, the best evaluated one among them; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
     scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
     kept = {c.name for c in checkpoints[-max(1, keep) :]} | ({max(scored)[1]} if scored else set())
-    kept |= {path.stem for path in run.evaluations.glob("*.json")} | {path.name for path in run.exports.glob("*")}
+    kept |= {checkpoint_of(path.stem) or path.stem for path in run.evaluations.glob("*.json")}
+    kept |= {path.name for path in run.exports.glob("*")}
     deleted = [checkpoint for checkpoint in checkpoints if checkpoint.name not in kept]
     for checkpoint in deleted:
         remove_tree(checkpoint.path)

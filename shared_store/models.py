@@ -21,8 +21,9 @@ from typing import Any
 from shared_store import bundles
 from shared_store.bundles import DamagedBundle
 from shared_store.checkpoints import Checkpoint
+from shared_store.evaluations import list_evaluations
 from shared_store.files import read_json, refuse_links, write_json
-from shared_store.layout import LARGEST_DESCRIPTION, NAME, Run, Store
+from shared_store.layout import NAME, Run, Store
 from shared_store.policy_contract import Contract
 from shared_store.wording import nearest
 
@@ -172,7 +173,6 @@ def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: M
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Where a policy comes from, and what is known of how good it is."""
     description = run.description() or {}
-    evaluation = read_json(run.evaluations / f"{checkpoint.name}.json", LARGEST_DESCRIPTION)
     judged = (read_json(run.exports / checkpoint.name / bundles.REPORT) or {}).get("judged")
     return {
         "run": run.name,
@@ -185,7 +185,7 @@ def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> d
         "checkpoint_files": manifest.get("checkpoint_files"),
         "bundle": manifest.get("digest"),
         "score": manifest.get("score"),
-        "evaluations": [each for each in (evaluation,) if each],
+        "evaluations": [each for each in list_evaluations(run) if each.get("checkpoint") == checkpoint.name],
         "judged": judged,
         "registered": time.time(),
     }

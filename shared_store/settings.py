@@ -1,4 +1,4 @@
-"""Comparing the settings of two jobs: what a run that goes on, or a clone, may not change."""
+"""Comparing the settings of two jobs: what a run that goes on, or a clone, may not change; and changing some of them."""
 
 from __future__ import annotations
 
@@ -38,3 +38,12 @@ def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> l
     may_change = getattr(kind, "clone_may_change", ()) if of_clone else ()
     fixed = [key for key in getattr(kind, "fixed", ()) if key not in may_change]
     return fixed if saved is None else [key for key in fixed if key.partition(".")[0] in saved]
+
+
+def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``settings`` with the changes: sections key by key, all else, and a section that becomes empty, as a whole."""
+    result = dict(settings)
+    for key, value in changes.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if value and isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result

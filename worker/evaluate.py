@@ -1,17 +1,31 @@
-"""``python -m worker.evaluate``: one rank of a job that evaluates a checkpoint, without noise, on fresh worlds."""
+"""``python -m worker.evaluate``: one rank of a job that evaluates a checkpoint, without noise, on worlds held out from its training."""
 
 from __future__ import annotations
 
+import math
 import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
-from worker.learning.job import Job, configure, end_startup, run_command, user_errors
+from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.settings import merged
+from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+EPISODES = 100
+WORLDS = 1024
+"""Greatest number of worlds that a rank simulates at once, unless the job says more."""
 
 
 def main() -> int:
-    """Evaluate; returns the exit code."""
+    """Evaluate; returns the exit code: 0 done, 75 left on request (started again, it begins anew)."""
+    stop = StopRequest().listen()  # before the imports, which take seconds
     job = Job.from_env(os.environ, "evaluate")
     run = job.named_run()
-    episodes = job.setting("episodes", 1)
+    episodes = job.setting("episodes", EPISODES)
     from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -19,32 +33,88 @@ def main() -> int:
         placement = Placement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    from shared_store.evaluations import lines
+    from worker.evaluation.blocks import SIZE, Blocks
+    from worker.evaluation.episodes import Stopped, play
+    from worker.evaluation.evaluation import result_of
     from worker.learning.algorithm import Share
-    from worker.learning.evaluation import evaluate
     from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.setup import build_task, check_contract
-    from worker.learning.trained import choose_checkpoint, load_policy
+    from worker.learning.trained import choose_checkpoint, load_policies
     from worker.tasks import find_task
 
     checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
     facts = checkpoint.manifest
     with user_errors("task"):
         task_type = find_task(facts["task"])
-    config = configure(task_type, facts["train"])
-    seed = job.setting("seed", held_out_seed(facts["train"].get("seed", 0)), least=0)
+    changes = job.section.get("config") or {}
+    trained = facts["train"]
+    config = configure(task_type, {**trained, "config": merged(trained.get("config") or {}, changes)}, "evaluate")
+    seed = job.setting("seed", held_out_seed(trained.get("seed", 0)), least=0)
     seed_generators(seed)
-    share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
-    task = build_task(task_type, config, share, gang, seed)
-    task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
-    policy = load_policy(checkpoint, gang.device)
+    blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / SIZE)
+    dealt = Share.of(gang.rank, gang.size, max(blocks, gang.size))
+    share, total = Share(dealt.first * SIZE, dealt.count * SIZE, dealt.total * SIZE), dealt.total * SIZE
+
+    def build(first: int) -> Task:
+        task = build_task(task_type, config, Share(first + share.first, share.count, total), gang, seed)
+        task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
+        return task
+
+    task = build(0)
+    # a GPU adds in no fixed order: there one batch is faster, and blocks would make no two evaluations equal
+    policies = load_policies(checkpoint, gang.device, dealt.count if gang.device == "cpu" else 1)
+    policy = Blocks(policies) if gang.device == "cpu" else policies[0]
     check_contract(checkpoint, task)
     end_startup()
-    result = evaluate(task, policy, gang, checkpoint=checkpoint.name, episodes=episodes * share.total)
+    started = time.perf_counter()
+    rounds = _rounds(task, build, math.ceil(episodes / total), total, seed)
+    try:
+        played = play(rounds, policy, gang, episodes=episodes, is_asked_to_stop=lambda: stop.requested)
+    except Stopped:
+        if gang.is_main:
+            print(
+                "asked to stop: nothing was recorded; the evaluation begins anew when it is started again", flush=True
+            )
+        return EX_TEMPFAIL
+    result = result_of(task, played, checkpoint.name, seed, started)
     if gang.is_main:
         print(result, flush=True)
-        print(f"written: {result.write(run)}", flush=True)
+        told = result.write(run, job.id, iteration=checkpoint.iteration, config=changes, **_circumstances(facts))
+        print("\n".join(lines(told)), flush=True)
+        print(f"written: {run.evaluations / told['table']} and .json", flush=True)
     gang.close()
     return 0
+
+
+def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, seed: int) -> Iterator[Task]:
+    """The worlds of each round: those of the global indices ``round * total`` and on, whatever the rounds before did to them."""
+    yield task
+    for number in range(1, count):
+        if task.config.randomize.draws_worlds:  # when they are built
+            task = build(number * total)
+        else:
+            task.restart(seed, task.first_world + total)
+        yield task
+
+
+def _circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """With what the evaluation was done."""
+    import newton
+    import torch
+    import warp
+
+    from shared_store import __version__
+
+    return {
+        "algorithm": facts.get("algorithm"),
+        "versions": {
+            "muster": __version__,
+            "torch": torch.__version__,
+            "warp": warp.__version__,
+            "newton": newton.__version__,
+        },
+    }
 
 
 if __name__ == "__main__":

@@ -13,8 +13,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import submission
+from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context
-from orchestrator.api.continuing import CONFLICT, Changes, answered, check, choose, refusal, submit
+from orchestrator.api.continuing import Changes, answered, check, submit
 from orchestrator.api.errors import ClientError
 from orchestrator.api.runs import spec_of
 from orchestrator.api.sources import with_teacher

@@ -8,25 +8,21 @@ from typing import Any, Literal
 
 from orchestrator.admission import fit_in_queue
 from orchestrator.api import batch, definitions, limits, permissions, submission
+from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.definition import compile_definition, compile_submission, gang_needs
 from orchestrator.excerpts import excerpt
 from orchestrator.spec import Spec
 from orchestrator.tables import Job
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_checkpoint, list_checkpoints
-from shared_store.layout import Run
-
-CONFLICT = 409
-"""The request is well formed, but the state of things refuses it."""
 
 
 @dataclass(frozen=True)
 class Changes:
     """What is asked of the new job."""
 
-    checkpoint: int | Literal["best"] | None = None
-    """Iteration, or the one with the greatest score; the newest where None."""
+    checkpoint: int | Literal["best", "latest"] | None = None
+    """Iteration, or what :func:`shared_store.checkpoints.best_checkpoint` says; the newest where None."""
     assignments: tuple[str, ...] = ()
     """``key.path=value`` changes of the run's spec."""
     directory: str = ""
@@ -54,31 +50,6 @@ def answered(context: Context, run: str) -> Job | None:
             f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", CONFLICT
         )
     return job
-
-
-def choose(run: Run, wanted: int | Literal["best"] | None) -> Checkpoint | None:
-    """The checkpoint that is meant; None for the newest one of a run that has none. Raises ClientError where there is no such."""
-    checkpoints = list_checkpoints(run)
-    there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
-    if wanted is None:
-        return checkpoints[-1] if checkpoints else None
-    if wanted == "best":
-        chosen = best_checkpoint(run)
-        problem = ": no checkpoint has a score yet, which is a mean over at least 100 episodes; name an iteration"
-    else:
-        chosen = next((each for each in reversed(checkpoints) if each.iteration == wanted), None)
-        problem = f" has no checkpoint of iteration {wanted}; it has"
-    if chosen is None:
-        raise ClientError(f"run {run.name}{problem}: {there}", 404)
-    return chosen
-
-
-def refusal(run: Run, chosen: Checkpoint, error: DamagedCheckpoint) -> ClientError:
-    """What to say of a checkpoint that can't be used."""
-    if isinstance(error, NewerFormat):
-        return ClientError(f"run {run.name}: {error}", CONFLICT)
-    others = [str(each.iteration) for each in list_checkpoints(run) if each.name != chosen.name]
-    return ClientError(f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT)
 
 
 def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:

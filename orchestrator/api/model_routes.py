@@ -8,8 +8,8 @@ from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
 from orchestrator.api import permissions
+from orchestrator.api.checkpoints import CONFLICT, choose
 from orchestrator.api.context import controller_of, permitted_run
-from orchestrator.api.continuing import CONFLICT, choose
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.controller import Controller
@@ -27,8 +27,8 @@ class RegisterRequest(BaseModel):
     """Which policy of the run becomes the next version of which model."""
 
     name: str = Field(max_length=128, description="of the model")
-    checkpoint: int | Literal["best"] | None = Field(
-        default=None, description="iteration; best: the one with the greatest score; the newest where absent"
+    checkpoint: int | Literal["best", "latest"] | None = Field(
+        default=None, description="iteration; best; latest, the newest, where absent"
     )
 
 

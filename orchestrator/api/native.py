@@ -19,10 +19,11 @@ from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from orchestrator.admission import fit_in_queue, node_records
 from orchestrator.api import model_routes, permissions, rules, run_routes, runs
 from orchestrator.api.batch import validate
+from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import controller_of, permitted_run, queue_names
-from orchestrator.api.continuing import CONFLICT
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
+from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import sources_of
 from orchestrator.bus import BusError
@@ -95,7 +96,9 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     controller = controller_of(request)
     needs, definition = _gang_of(body), body.definition
     for source in sources_of(needs):
-        permitted_run(controller, source.run, Operation.READ_RUN)
+        run = permitted_run(controller, source.run, Operation.READ_RUN)
+        if source.key == "evaluate":
+            check_evaluation(run, (needs.spec or {}).get("evaluate"))
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))

@@ -109,6 +109,7 @@ class Operation(StrEnum):
     READ_RUN = "GET /api/runs/{name}"
     READ_CHECKPOINTS = "GET /api/runs/{name}/checkpoints"
     READ_METRICS = "GET /api/runs/{name}/metrics"
+    READ_EVALUATIONS = "GET /api/runs/{name}/evaluations"
     RESUME_RUN = "POST /api/runs/{name}/resume"
     CLONE_RUN = "POST /api/runs/{name}/clone"
     REGISTER_MODEL = "POST /api/runs/{name}/models"

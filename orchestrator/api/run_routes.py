@@ -11,7 +11,8 @@ from orchestrator.api import clones, permissions, runs
 from orchestrator.api.context import IDEMPOTENCY_HEADER, controller_of, permitted_run
 from orchestrator.api.continuing import Changes
 from orchestrator.api.permissions import Operation
-from shared_store.checkpoints import list_checkpoints
+from shared_store.checkpoints import best_checkpoint, list_checkpoints
+from shared_store.evaluations import by_checkpoint, list_evaluations
 from shared_store.metrics import history_of
 
 router = APIRouter()
@@ -24,7 +25,7 @@ class _ChangesRequest(BaseModel):
     nodes: int | None = Field(default=None, ge=1, description="another number of nodes; the worlds are dealt out anew")
     set: list[str] = Field(default_factory=list, description="key.path=value changes of the spec")
     directory: str = Field(default="", description="working directory of the job")
-    checkpoint: int | Literal["best"] | None = None
+    checkpoint: int | Literal["best", "latest"] | None = None
 
     def changes(self) -> Changes:
         return Changes(self.checkpoint, tuple(self.set), self.directory, self.nodes)
@@ -40,8 +41,8 @@ class CloneRequest(_ChangesRequest):
     """What the new run is called, from which checkpoint it has its weights, and what is different in it."""
 
     name: str = Field(max_length=128, description="of the new run, and of its job")
-    checkpoint: int | Literal["best"] | None = Field(
-        default=None, description="iteration; best: the one with the greatest score; the newest where absent"
+    checkpoint: int | Literal["best", "latest"] | None = Field(
+        default=None, description="iteration; best: by evaluations, else by score; latest, or absent: the newest"
     )
 
 
@@ -74,7 +75,31 @@ def run_detail(request: Request, name: str) -> Any:
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
     run = permitted_run(controller_of(request), name, Operation.READ_CHECKPOINTS)
-    return [runs.describe_checkpoint(checkpoint, verify) for checkpoint in list_checkpoints(run)]
+    evaluated, best = by_checkpoint(run), best_checkpoint(run)
+    return [
+        {
+            **runs.describe_checkpoint(checkpoint, verify),
+            "evaluated": _evaluated(evaluated.get(checkpoint.name)),
+            "best": best is not None and best.name == checkpoint.name,
+        }
+        for checkpoint in list_checkpoints(run)
+    ]
+
+
+def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
+    """How good a checkpoint was in the worlds of its training: ``mean``, ``low``, ``high`` of the return, ``episodes``."""
+    if summary is None:
+        return None
+    told = summary.get("return")
+    interval = told if isinstance(told, dict) else {}
+    ends = {end: interval.get(end) for end in ("low", "high")}
+    return {"mean": summary["mean_return"], **ends, "episodes": summary["episodes"], "name": summary["name"]}
+
+
+@router.get("/runs/{name}/evaluations")
+def run_evaluations(request: Request, name: str) -> list[dict[str, Any]]:
+    """The summaries of the run's evaluations, the newest last; ``table`` names the Parquet file beside each in ``evaluations/``."""
+    return list_evaluations(permitted_run(controller_of(request), name, Operation.READ_EVALUATIONS))
 
 
 @router.get("/runs/{name}/metrics")

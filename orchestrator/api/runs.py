@@ -10,8 +10,9 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from orchestrator.api import submission
+from orchestrator.api.checkpoints import CONFLICT, choose, refusal
 from orchestrator.api.context import Context, visible_runs
-from orchestrator.api.continuing import CONFLICT, Changes, answered, choose, refusal, submit
+from orchestrator.api.continuing import Changes, answered, submit
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import visible_queues
@@ -26,8 +27,9 @@ from orchestrator.ownership import owner_of
 from orchestrator.spec import ALGORITHMS, Spec, Train, override, validate
 from orchestrator.tables import Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
-from shared_store.files import DamagedFile, read_json
-from shared_store.layout import LARGEST_DESCRIPTION, Run
+from shared_store.evaluations import by_checkpoint
+from shared_store.files import DamagedFile
+from shared_store.layout import Run
 from shared_store.metrics import history_of
 from shared_store.parent import TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
@@ -340,10 +342,9 @@ def _of_run(run: Run) -> list[ColumnElement[bool]]:
 
 
 def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:
-    for checkpoint in reversed(checkpoints):
-        try:
-            if evaluation := read_json(run.evaluations / f"{checkpoint.name}.json", LARGEST_DESCRIPTION):
-                return evaluation
-        except (DamagedFile, OSError):
-            continue
-    return None
+    """That of the newest checkpoint that has one, in the worlds of its training."""
+    try:
+        found = by_checkpoint(run)
+    except OSError:
+        return None
+    return next((found[each.name] for each in reversed(checkpoints) if each.name in found), None)

@@ -12,6 +12,7 @@ from typing import Any
 from orchestrator.api import permissions
 from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
+from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
 from orchestrator.controller import Controller
 from orchestrator.definition import GangNeeds
@@ -74,6 +75,8 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> Teach
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source.run, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
+        if source.key == "evaluate" and not is_waiting:
+            check_evaluation(context.run(source.run), (needs.spec or {}).get("evaluate"))
         if is_teacher and not is_waiting:
             needed = TeacherNeeded(source.run, _checkpoint(context, source))
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take

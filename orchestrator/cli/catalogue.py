@@ -37,6 +37,18 @@ ENTRIES = (
     Entry("resume", "runs", _RUNS, "Go on with a run from its newest checkpoint, at the next iteration."),
     Entry("clone", "clones", _RUNS, "Start a new run with the weights of a checkpoint, and with nothing else of it."),
     Entry(
+        "evaluate",
+        "evaluations",
+        _RUNS,
+        "Evaluate a checkpoint: whole episodes on worlds that its training has not seen.",
+    ),
+    Entry(
+        "compare",
+        "comparing",
+        _RUNS,
+        "Compare runs, or groups of runs that differ in their seed alone; draw their curves.",
+    ),
+    Entry(
         "export",
         "export",
         _RUNS,

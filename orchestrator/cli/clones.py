@@ -25,8 +25,8 @@ def clone(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="RUN[@ITERATION|@best]",
-            help="Whose weights: of its newest checkpoint, of that of an iteration, or of the one with the best score.",
+            metavar="RUN[@ITERATION|@best|@latest]",
+            help="Whose weights: of its newest checkpoint, of that of an iteration, or of the best one.",
         ),
     ],
     name: Annotated[str, typer.Option(help="Of the new run, and of its job.")],
@@ -71,8 +71,10 @@ def split_reference(text: str) -> tuple[str, int | str | None]:
     run, sign, at = text.partition("@")
     if not sign:
         return run, None
-    if at == "best":
+    if at in ("best", "latest"):
         return run, at
     if at.isascii() and at.isdecimal() and len(at) < 10:
         return run, int(at)
-    raise UsageError(f"{text}: after @ stands an iteration, or best; `muster checkpoints {run}` lists the iterations")
+    raise UsageError(
+        f"{text}: after @ stands an iteration, best or latest; `muster checkpoints {run}` lists the iterations"
+    )

@@ -24,7 +24,7 @@ muster export ant-1f2e3d4c@300 --episodes 64 --set resources.gpus=1"""
 CheckpointArgument = Annotated[
     str,
     typer.Argument(
-        metavar="RUN[@ITERATION|@best]",
+        metavar="RUN[@ITERATION|@best|@latest]",
         help="Whose policy: of its newest checkpoint, of that of an iteration, or of the one with the best score.",
     ),
 ]
@@ -74,13 +74,13 @@ def chosen(client: Client, run: str, wanted: int | str | None) -> dict[str, Any]
     found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
     if not found:
         raise UsageError(f"run {run} has no checkpoint yet; train it first")
-    if wanted is None:
+    if wanted in (None, "latest"):
         return found[-1]
     if wanted == "best":
-        scored = [each for each in found if each.get("score") is not None]
-        if not scored:
-            raise UsageError(f"run {run} has no checkpoint with a score yet; name an iteration")
-        return max(scored, key=lambda each: each["score"])
+        best = next((each for each in found if each["best"]), None)
+        if best is None:
+            raise UsageError(f"run {run} has no checkpoint with a score or two evaluations yet; name an iteration")
+        return best
     there = [each for each in found if each["iteration"] == wanted]
     if not there:
         iterations = [str(each["iteration"]) for each in found]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -69,9 +69,8 @@ def checkpoints(
         echo(f"run {run} has no checkpoint yet")
     else:
         table = Table(box=None, pad_edge=False)
-        for column in ("CHECKPOINT", "ITERATION", "REWARD", "SCORE", "WORLDS", "SIZE", "CREATED", "STATE"):
+        for column in ("CHECKPOINT", "ITERATION", "REWARD", "SCORE", "EVALUATED", "WORLDS", "SIZE", "CREATED", "STATE"):
             table.add_column(column, no_wrap=True)
-        best = max((each["score"] for each in found if each.get("score") is not None), default=None)
         for each in found:
             reward = "-" if each.get("reward") is None else f"{each['reward']:.2f}"
             score = scored(each.get("score"), each.get("scoreError"))
@@ -80,11 +79,21 @@ def checkpoints(
                 time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each["created"])) if each.get("created") else "-"
             )
             state = each.get("problem") or ("verified" if each.get("verified") else "committed")
-            if best is not None and each.get("score") == best:
+            if each["best"]:
                 state += ", the best"
             table.add_row(
-                each["name"], str(each["iteration"]), reward, score, str(each.get("worlds", "-")), size, created, state
+                *(each["name"], str(each["iteration"]), reward, score, _evaluated(each["evaluated"])),
+                *(str(each.get("worlds", "-")), size, created, state),
             )
         print_cut(table)
     if damaged:
         raise typer.Exit(1)
+
+
+def _evaluated(told: dict[str, Any] | None) -> str:
+    """The mean return of an evaluation, with half of its 95 % interval."""
+    if told is None:
+        return "-"
+    if not isinstance(told["high"], int | float):
+        return f"{told['mean']:.2f}"
+    return f"{told['mean']:.2f} ± {told['high'] - told['mean']:.2f}"

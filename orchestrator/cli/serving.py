@@ -64,7 +64,7 @@ def run(
     raise typer.Exit(code)
 
 
-def see_through(client: Client, job: str) -> int:
+def see_through(client: Client, job: str, follow: Callable[[Client, str], int] = follow) -> int:
     """Follow a job to its end; Ctrl-C and SIGTERM stop it after a checkpoint. Returns the command's exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -122,8 +122,8 @@ def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
             raise UserError(f"{where}: expected a mapping, found {kind_of(given)}")
 
 
-def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
-    """``task``'s configuration with the overrides of a ``train`` section (``config``).
+def configure(task: type[Task], section: Mapping[str, Any], kind: str = "train") -> TaskConfig:
+    """``task``'s configuration with the overrides of a section (``config``) of the YAML, which ``kind`` names in errors.
 
     Raises UserError for an unknown key or an invalid value, in the same words as the submission.
     """
@@ -136,7 +136,7 @@ def configure(task: type[Task], section: Mapping[str, Any]) -> TaskConfig:
     try:
         return configured(task.config_type, section.get("config") or {})
     except Refused as refused:
-        raise UserError(": ".join((".".join(map(str, ("train", "config", *refused.path))), refused.words))) from refused
+        raise UserError(": ".join((".".join(map(str, (kind, "config", *refused.path))), refused.words))) from refused
 
 
 def end_startup() -> None:

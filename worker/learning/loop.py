@@ -12,13 +12,13 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
+from worker.evaluation.evaluation import evaluate
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.evaluation import evaluate
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
@@ -365,7 +365,7 @@ class Loop:
         if not self.gang.is_main:
             return
         try:
-            result.write(self.job.run)
+            result.write(self.job.run, iteration=self.state.progress.iteration, config={})
             from worker.plot import plot_reward
 
             plot: Path | None = plot_reward(self.job.run)

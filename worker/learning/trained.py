@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints, newest_checkpoint
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, best_checkpoint, list_checkpoints, newest_checkpoint
 from shared_store.layout import Run
 from worker.errors import UserError
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:
-    """The checkpoint that a user means: an iteration, a name, or None for the newest good one. All ranks call it.
+    """The checkpoint that a user means: an iteration, a name, ``best``, or ``latest`` or None for the newest good one. All ranks call it.
 
     Raises UserError where there is no such checkpoint, or it is damaged; the message says which there are.
     """
@@ -33,7 +33,11 @@ def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpo
 def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
     """See :func:`choose_checkpoint`; for one process. Of two with the same iteration the later epoch's is meant."""
     checkpoints = list_checkpoints(run)
-    if wanted is None:
+    if wanted == "best":
+        if (best := best_checkpoint(run)) is None:
+            raise UserError(f"run {run.name} has no best checkpoint yet: evaluate two of them, or name an iteration")
+        wanted = best.name
+    if wanted in (None, "latest"):
         newest = newest_checkpoint(run)
         if newest is None:
             raise UserError(f"run {run.name} has no checkpoint that can be read in {run.checkpoints}; train it first")
@@ -53,6 +57,11 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
 
     Raises UserError where the checkpoint is of another version, its algorithm can't be found, or refuses the settings that it had then.
     """
+    return load_policies(checkpoint, device, 1)[0]
+
+
+def load_policies(checkpoint: Checkpoint, device: str, count: int) -> list[Policy]:
+    """:func:`load_policy`, several times: each remembers its own episodes."""
     from worker.learning.algorithms import find_algorithm, refusal
     from worker.learning.setup import spaces_from
 
@@ -62,17 +71,20 @@ def load_policy(checkpoint: Checkpoint, device: str = "cpu") -> Policy:
     algorithm = find_algorithm(facts["algorithm"])
     try:
         settings = algorithm.config_type(**facts["settings"])
-        policy = algorithm.build_policy(settings, spaces_from(facts["policy"]), device)
+        spaces = spaces_from(facts["policy"])
+        policies = [algorithm.build_policy(settings, spaces, device) for _ in range(count)]
     except (TypeError, ValueError) as error:
         refused = refusal("settings", error).removeprefix("train.")
         raise UserError(
             f"checkpoint {checkpoint.name}: algorithm {facts['algorithm']} refuses what it was trained with: {refused}"
         ) from error
     try:
-        policy.load_state_dict(load_learner(checkpoint, device)["algorithm"]["policy"])
+        learnt = load_learner(checkpoint, device)["algorithm"]["policy"]
+        for policy in policies:
+            policy.load_state_dict(learnt)
     except (RuntimeError, KeyError) as error:
         raise UserError(f"checkpoint {checkpoint.name}: its policy can't be read: {error}") from error
-    return policy
+    return policies
 
 
 def load_learner(checkpoint: Checkpoint, device: str = "cpu") -> dict[str, Any]:

@@ -25,6 +25,11 @@ RETURN = wp.constant(0)
 STEPS = wp.constant(1)
 TERMS = wp.constant(2)
 """Columns of ``EpisodeArrays.sums``: return, steps lived, then one column a reward term."""
+TIME_OUT = wp.constant(0)
+PHYSICS_FAILED = wp.constant(1)
+TERMINATED = wp.constant(2)
+"""What ended an episode, in ``EpisodeArrays.causes``: the clock, physics that failed, or the task; of a declared task its first
+termination that did is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
 
 
 @wp.struct
@@ -52,6 +57,9 @@ class EpisodeArrays:
         broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
+        last_sums: The ``sums`` of the world's last episode that ended, shape ``(worlds, 2 + terms)``.
+        causes: By what it ended, see :data:`TERMINATED`; shape ``(worlds,)``.
+        successes: Of a declared task that says what a success is: whether the last step was one, shape ``(worlds,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
             a reward term and metric, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns, of a
             declared task the ends by each termination and by the clock; shape ``(6 + terms,)`` or more.
@@ -75,6 +83,9 @@ class EpisodeArrays:
     warm_start: wp.array2d(dtype=wp.float32)
     broken: wp.array(dtype=wp.int32)
     mishap: wp.array(dtype=wp.int32)
+    last_sums: wp.array2d(dtype=wp.float32)
+    causes: wp.array(dtype=wp.int32)
+    successes: wp.array(dtype=wp.bool)
     statistics: wp.array(dtype=wp.float64)
 
 
@@ -191,6 +202,15 @@ def end_step(
                 wp.atomic_add(episodes.statistics, 1 + column, wp.float64(episodes.sums[world, column]))
             whole = wp.float64(episodes.sums[world, RETURN])
             wp.atomic_add(episodes.statistics, TERMS + terms + 3, whole * whole)
+    if done:
+        for column in range(episodes.sums.shape[1]):
+            episodes.last_sums[world, column] = episodes.sums[world, column]
+        cause = TIME_OUT
+        if not sound:
+            cause = PHYSICS_FAILED
+        elif terminated:
+            cause = TERMINATED
+        episodes.causes[world] = cause
     return done
 
 

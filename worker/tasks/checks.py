@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from worker.tasks.interface import Interface, Observation
@@ -48,3 +49,17 @@ def checked_interface(task: Task) -> Interface:
                 f"they are {', '.join(names)}"
             )
     return interface
+
+
+def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:
+    """Replay the captured step once and check that it writes rewards: an empty graph would step for ever without an error; returns True.
+
+    Raises:
+        RuntimeError: The replay left a reward as it was.
+    """
+    task.rewards.fill_(float("nan"))
+    for launch in steps:
+        launch()
+    if task.rewards.isnan().any():
+        raise RuntimeError(f"the captured step of task {type(task).__name__} does not replay on {task.device}")
+    return True

@@ -218,6 +218,8 @@ def rewards(source: Source) -> list[str]:
         else:
             column = f"episodes.sums[world, TERMS + {number}]"
             lines += [f"{column} = {column} + total_{number}"]
+    if source.plan.success is not None:
+        lines += [f"episodes.successes[world] = {source.plan.success}"]
     return ["if valid:", *indent(lines)] if bounds else []
 
 
@@ -255,9 +257,11 @@ def remember_actions(plan: Plan, value: str) -> list[str]:
 
 
 def count_ends(plan: Plan) -> list[str]:
-    """Count by what the episode ended, where its end counts at all."""
+    """Note and count by what the episode ended, where its end counts at all."""
     first = f"TERMS + {len(plan.rewards) + len(plan.metrics)} + 4"
     lines = []
+    for number in reversed(range(len(plan.terminations))):  # of several at once the first one is the cause
+        lines += [f"if ended_{number}:", f"    episodes.causes[world] = TERMINATED + {number + 1}"]
     for number, _ in enumerate(plan.terminations):
         lines += [
             f"if ended_{number}:",

@@ -339,6 +339,9 @@ class Declaration:
     """Sensors by the names by which terms ask for them."""
     randomize: Mapping[str, Any] = field(default_factory=dict)
     """Quantities of the model that differ from world to world."""
+    success: str | None = None
+    """When an evaluated episode is a success: the name of a metric, which must be greater than 0 in its last step, or of the termination
+    that must have ended it. None: where only the clock ended it, which means nothing in a task without terminations."""
 
     def __post_init__(self) -> None:
         for section, kind in SECTIONS.items():

@@ -113,6 +113,7 @@ class DeclaredTask(Task):
         self.discrete = isinstance(self.declaration.actions, Choice)
         self.memory_size, self.lasting_size = plan.binder.memory, plan.binder.lasting
         self.metric_names = tuple(f"metric_{name}" for name in self.declaration.metrics)
+        self.success = self.declaration.success
         self.termination_names = tuple(f"termination_{name}" for name in (*self.declaration.terminations, "time_out"))
 
     def interface(self) -> Interface:

@@ -147,6 +147,7 @@ class Plan:
         self.terminations = [self._bind("terminations", name, term) for name, term in declaration.terminations.items()]
         if "time_out" in declaration.terminations:
             raise ValueError("terminations.time_out: the clock's own has this name; choose another")
+        self.success = self._success(declaration.success)
         rules = {name: term for name, term in declaration.curricula.items() if isinstance(term, Curriculum)}
         self.curricula = [self._bind("curricula", name, term, own=DRAWN) for name, term in rules.items()]
         self.adaptive = {name: term for name, term in declaration.curricula.items() if isinstance(term, Adaptive)}
@@ -191,6 +192,17 @@ class Plan:
         bound = self.binder.bind(f"{section}.{name}", term, **options)
         check_result(bound, section)
         return bound
+
+    def _success(self, name: str | None) -> str | None:
+        """Whether the last step was a success, in the words of the kernel that judges it. Raises ValueError for an unknown name."""
+        metrics, ends = list(self.declaration.metrics), list(self.declaration.terminations)
+        if name is None:
+            return None
+        if name in metrics:
+            return f"total_{len(self.rewards) + metrics.index(name)} > 0.0"
+        if name in ends:
+            return f"ended_{ends.index(name)}"
+        raise ValueError(f"success: no metric and no termination is called {name}; {nearest(name, [*metrics, *ends])}")
 
     def _reserve_commands(self) -> None:
         """Columns of all commands first, so that any term may name any of them."""

@@ -13,7 +13,17 @@ from worker.simulation.worlds import WorldArrays, is_sound
 from worker.tasks.binding import Bound
 from worker.tasks.plan import Plan
 
-_OURS = ("STEP", "TERMS", "add_reward", "begin_episode", "clear_row", "end_step", "numbered_stream", "random_stream")
+_OURS = (
+    "STEP",
+    "TERMINATED",
+    "TERMS",
+    "add_reward",
+    "begin_episode",
+    "clear_row",
+    "end_step",
+    "numbered_stream",
+    "random_stream",
+)
 
 
 class Source:

@@ -33,6 +33,9 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
     found["terminations"] = [
         _term(plan, bound) | {"counts as": "time out" if _is_cut(bound) else "end"} for bound in plan.terminations
     ]
+    if plan.declaration.success:
+        of = "metric" if plan.declaration.success in plan.declaration.metrics else "termination"
+        found["success"] = [{of: plan.declaration.success}]
     found["commands"] = [
         _term(plan, told.bound)
         | {

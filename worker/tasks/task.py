@@ -25,8 +25,9 @@ from worker.simulation.episodes import (
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
-from worker.tasks.checks import check_arguments, checked_interface
+from worker.tasks.checks import assert_replays, check_arguments, checked_interface
 from worker.tasks.config import TaskConfig, default_rewards, value_at
+from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface, deviations
 from worker.tasks.saved import NEWER, check_state
 
@@ -67,6 +68,7 @@ class Task:
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
         mishap: Which world was reset, and why, since :meth:`clear_statistics`: see :meth:`read_mishap`; shape ``(1,)``, int32.
+        ended: The last episode of each world that ended, see :class:`worker.tasks.ended.Ended`.
         randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
     """
@@ -95,6 +97,8 @@ class Task:
     """Names of what is logged besides the rewards, as a mean over the steps; of declared tasks."""
     termination_names: tuple[str, ...] = ()
     """Names of what ends episodes, which are counted; of declared tasks."""
+    success: str | None = None
+    """The metric or termination that makes an evaluated episode a success; None: that only the clock ended it."""
     memory_size: int = 0
     """Numbers that the kernels keep of each world in ``episodes.memory``, such as commands; they are part of the state."""
     lasting_size: int = 0
@@ -167,14 +171,8 @@ class Task:
             for _, part in self._parts():  # Loads every kernel, which a capture cannot do on every platform.
                 part()
         self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
-        self._assert_captured()
-        with on_torch_stream(self.device):
-            self.worlds.restore_defaults()
-            self._lasting.zero_()
-            self.seed(seed)
-            self._begin()
-        self.clear_statistics()
-        self.reset()
+        self.captured = assert_replays(self, self._steps)
+        self.restart(seed, first_world)
 
     @classmethod
     def sketch(cls, config: TaskConfig) -> Self:
@@ -247,6 +245,24 @@ class Task:
         """Begin a new episode, from fresh random numbers, in every world."""
         with on_torch_stream(self.device):
             self._launch_observe(RESET)
+
+    def restart(self, seed: int, first_world: int) -> None:
+        """Become the worlds of another seed or another global index, as if they had just been built.
+
+        The physics and the scene that ``config.randomize`` drew for each world stay (``config.randomize.draws_worlds``).
+
+        Args:
+            seed: Any integer >= 0.
+            first_world: Global index of world 0.
+        """
+        self.first_world = first_world
+        with on_torch_stream(self.device):
+            self.worlds.restore_defaults()
+            self._lasting.zero_()
+            self.seed(seed)
+            self._begin()
+        self.clear_statistics()
+        self.reset()
 
     def seed(self, seed: int) -> None:
         """Restart all random streams from another seed; the worlds change at their next reset.
@@ -351,6 +367,7 @@ class Task:
         self.level = buffer("level", (1,), wp.float32)
         self.level.fill_(1.0)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
+        self.ended = Ended.of(self, buffer)
 
     def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """The observation groups, and those before the reset. The critic's have buffers of their own only where there is noise."""
@@ -386,20 +403,6 @@ class Task:
             "random": self._random,
             "broken": self._broken,
         }
-
-    def _assert_captured(self) -> None:
-        """Replay the graph once and check that it writes rewards: an empty graph would step for ever without an error.
-
-        Raises:
-            RuntimeError: The replay left a reward as it was.
-        """
-        self.captured = False
-        self.rewards.fill_(float("nan"))
-        for launch in self._steps:
-            launch()
-        if self.rewards.isnan().any():
-            raise RuntimeError(f"the captured step of task {type(self).__name__} does not replay on {self.device}")
-        self.captured = True
 
     def _prepare(self) -> None:
         """Everything that the kernels take besides the worlds and episodes."""

@@ -141,7 +141,13 @@ def test_a_second_call_with_the_same_key_answers_what_the_first_did(full: Servin
     [
         ("nobody", "x", (), 2, ["run nobody does not exist"]),
         ("taught@4", "x", (), 2, ["run taught has no checkpoint of iteration 4; it has: 3, 6, 9"]),
-        ("taught@last", "x", (), 2, ["taught@last: after @ stands an iteration, or best", "muster checkpoints taught"]),
+        (
+            "taught@last",
+            "x",
+            (),
+            2,
+            ["taught@last: after @ stands an iteration, best or latest", "muster checkpoints taught"],
+        ),
         ("taught", "taught", (), 1, ["run taught exists already: give the clone another --name"]),
         ("taught", "a b", (), 2, ["clone of run taught: name: expected letters"]),
         ("taught", "a.b", (), 2, ["clone of run taught: name: expected letters, digits, '_' and '-'"]),

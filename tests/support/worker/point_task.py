@@ -46,6 +46,7 @@ class Point:
     action_size, discrete, observation_shape = 1, False, (2,)
     action_names = ("push",)
     observation_names = ("place", "velocity")
+    ended = None
 
     def __init__(
         self, config: PointConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"

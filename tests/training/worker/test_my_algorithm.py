@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from shared_store.evaluations import list_evaluations
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
@@ -83,7 +84,8 @@ def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_pat
     assert json.loads((exported / "contract.json").read_text())["groups"][0]["terms"]
     report = json.loads((exported / "report.json").read_text())
     assert report["parity"]["greatest_difference"]["onnx"] <= 1e-5 and report["judged"]["episodes"] == 16
-    assert [path.name for path in run.evaluations.iterdir()] == [f"{exported.name}.json"]
+    both = list_evaluations(run)  # at the end of the training, and of the job
+    assert [each["checkpoint"] for each in both] == [exported.name] * 2 and both[1]["episodes"] == 100
 
 
 def test_two_ranks_of_it_hold_the_same_weights(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def test_what_a_run_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture)
 
 
 def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
-    from worker.learning.evaluation import evaluate
+    from worker.evaluation.evaluation import evaluate
 
     started = train(training(tmp_path, iterations=1))
     before = started.task.state_dict()

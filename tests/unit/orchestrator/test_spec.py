@@ -169,7 +169,7 @@ WRONG_VALUES = {
     ppo("learning_rate: .nan"): "job.yaml:6: train.ppo.learning_rate: expected a finite number, found a number (nan)",
     "name: a\nevaluate: {run: ../x}\n": f"job.yaml:2: evaluate.run: {RUN_LETTERS}, found '../x'",
     "name: a\nexport: {run: x, checkpoint: new}\n": (
-        "job.yaml:2: export.checkpoint: expected a whole number, found a text ('new')"
+        "job.yaml:2: export.checkpoint: expected an iteration, best or latest, found 'new'"
     ),
 }
 

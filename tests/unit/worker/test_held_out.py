@@ -14,7 +14,7 @@ from shared_store.layout import Store
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import train
 from worker.distributed import Gang, Placement
-from worker.learning.evaluation import evaluate
+from worker.evaluation.evaluation import evaluate
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.state import Progress

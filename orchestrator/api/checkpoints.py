@@ -1,0 +1,40 @@
+"""Finding the checkpoint that a request means, and what to say where there is none."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from orchestrator.api.errors import ClientError
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_checkpoint, list_checkpoints
+from shared_store.layout import Run
+
+CONFLICT = 409
+"""The request is well formed, but the state of things refuses it."""
+
+
+def choose(run: Run, wanted: int | Literal["best", "latest"] | None) -> Checkpoint | None:
+    """The checkpoint that is meant; None for the newest one of a run that has none. Raises ClientError where there is no such."""
+    checkpoints = list_checkpoints(run)
+    there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
+    if wanted in (None, "latest"):
+        return checkpoints[-1] if checkpoints else None
+    if wanted == "best":
+        chosen = best_checkpoint(run)
+        problem = (
+            ": no checkpoint has a score yet, which is a mean over at least 100 episodes, and no two are evaluated; "
+            "name an iteration"
+        )
+    else:
+        chosen = next((each for each in reversed(checkpoints) if each.iteration == wanted), None)
+        problem = f" has no checkpoint of iteration {wanted}; it has"
+    if chosen is None:
+        raise ClientError(f"run {run.name}{problem}: {there}", 404)
+    return chosen
+
+
+def refusal(run: Run, chosen: Checkpoint, error: DamagedCheckpoint) -> ClientError:
+    """What to say of a checkpoint that can't be used."""
+    if isinstance(error, NewerFormat):
+        return ClientError(f"run {run.name}: {error}", CONFLICT)
+    others = [str(each.iteration) for each in list_checkpoints(run) if each.name != chosen.name]
+    return ClientError(f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT)

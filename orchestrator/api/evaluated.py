@@ -1,0 +1,40 @@
+"""What an evaluation asks of the run that it evaluates, checked before its job exists."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orchestrator.api.checkpoints import choose, refusal
+from orchestrator.api.errors import ClientError
+from orchestrator.settings import task_config
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.layout import Run
+from shared_store.settings import merged
+
+
+def check_evaluation(run: Run, section: Any) -> Checkpoint | None:
+    """The checkpoint that the ``evaluate`` section of a spec means; None where the section is none, which the rank refuses.
+
+    Raises ClientError: there is no such checkpoint, it can't be read, or the task that it was trained on refuses the changes.
+    """
+    if not isinstance(section, dict):
+        return None
+    wanted, changes = section.get("checkpoint"), section.get("config") or {}
+    if not (wanted in (None, "best", "latest") or isinstance(wanted, int)) or not isinstance(changes, dict):
+        return None
+    chosen = choose(run, wanted)
+    if chosen is None:
+        raise ClientError(f"run {run.name} has no checkpoint yet; train it first", 404)
+    try:
+        facts = chosen.manifest
+    except DamagedCheckpoint as error:
+        raise refusal(run, chosen, error) from None
+    task, trained = facts.get("task"), facts.get("train")
+    kind = task_config(task) if isinstance(task, str) else None
+    before = trained.get("config") if isinstance(trained, dict) else None
+    if changes and kind is not None:
+        problem = kind.problem_with(merged(before if isinstance(before, dict) else {}, changes))
+        if problem:
+            path, words = problem
+            raise ClientError(f"{'.'.join(map(str, ('evaluate', 'config', *path)))}: {words}")
+    return chosen

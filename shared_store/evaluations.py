@@ -1,0 +1,132 @@
+"""The evaluations of a run: ``evaluations/<checkpoint>[-<job>].json`` sums one up, the ``.parquet`` beside it has a row an episode.
+
+The table is written first: an evaluation exists once its summary does.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from shared_store.files import DamagedFile, read_json
+from shared_store.layout import LARGEST_DESCRIPTION, Run
+
+TERMS_SHOWN = 6
+"""Reward terms that a printed table has: those of the greatest size."""
+
+_NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
+_NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")
+
+
+def evaluation_name(checkpoint: str, job: str = "") -> str:
+    """What an evaluation is called: after its checkpoint, and after its job, of an array with the index, where that did nothing else."""
+    parent, _, index = job.partition(":")
+    return "-".join(filter(None, (checkpoint, parent[:8], index)))
+
+
+def checkpoint_of(name: str) -> str | None:
+    """Name of the checkpoint that the evaluation called ``name`` is of; None where no evaluation is called so."""
+    match = _NAME.fullmatch(name)
+    return match[1] if match else None
+
+
+def list_evaluations(run: Run) -> list[dict[str, Any]]:
+    """The summaries of a run's evaluations, the newest last; what is damaged is passed over. Raises OSError."""
+    try:
+        names = [path.stem for path in run.evaluations.glob("*.json")]
+    except FileNotFoundError:
+        return []
+    found = [(name, _read(run, name)) for name in names if checkpoint_of(name)]
+    sound = [{**summary, "name": name, "checkpoint": checkpoint_of(name)} for name, summary in found if summary]
+    return sorted(sound, key=lambda summary: (summary["time"], summary["name"]))
+
+
+def _read(run: Run, name: str) -> dict[str, Any] | None:
+    try:
+        summary = read_json(run.evaluations / f"{name}.json", LARGEST_DESCRIPTION)
+    except DamagedFile:
+        return None
+    numbers = [summary.get(key) for key in _NUMBERS] if summary else [None]
+    return summary if all(isinstance(number, int | float) for number in numbers) else None
+
+
+def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
+    """Of each checkpoint its evaluation in the worlds of its own training: that of the most episodes, the newer one of equals."""
+    found: dict[str, dict[str, Any]] = {}
+    for summary in list_evaluations(run):
+        before = found.get(summary["checkpoint"])
+        if not summary.get("config") and (before is None or before["episodes"] <= summary["episodes"]):
+            found[summary["checkpoint"]] = summary
+    return found
+
+
+def lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """An evaluation as a person reads it."""
+    task, seed = summary.get("task"), summary.get("seed")
+    yield f"{summary['episodes']} episodes of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
+    for place, value in flattened(_mapping(summary, "config")):
+        yield f"  with config.{place}: {value}"
+    yield f"{'':20} {'mean':>10} {'95 % interval':>24} {'std':>10}"
+    success = _mapping(summary, "success")
+    if success:
+        ends = f"{_percent(success.get('low'))} to {_percent(success.get('high'))}"
+        yield f"{'success':20} {_percent(success.get('share')):>10} {ends:>24} {'':10}  {summary.get('success_is', '')}"
+    yield _row("return", _mapping(summary, "return"))
+    yield f"{_row('length', _mapping(summary, 'length'))}  of at most {summary['max_length']}"
+    rewards = _mapping(summary, "rewards")
+    largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
+    for name in largest[:TERMS_SHOWN]:
+        yield _row(f"reward {name}", _mapping(rewards, name))
+    metrics = _mapping(summary, "metrics")
+    for name in metrics:
+        yield _row(f"metric {name}", _mapping(metrics, name))
+    causes = _mapping(summary, "causes")
+    counted = ", ".join(f"{name} {_mapping(causes, name).get('count')}" for name in causes)
+    yield f"ended by: {counted}"
+    if compared := _mapping(summary, "compared"):
+        yield _comparison(compared)
+
+
+def flattened(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The values of nested mappings, by their place: ``randomize.friction``."""
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((f"{key}.{place}", each) for place, each in flattened(value))
+        else:
+            yield str(key), value
+
+
+def _comparison(compared: Mapping[str, Any]) -> str:
+    when = compared.get("time")
+    there = time.strftime(" of %Y-%m-%d %H:%M", time.localtime(when)) if isinstance(when, int | float) else ""
+    others = " in other worlds" if compared.get("other_worlds") else ""
+    told = _mapping(compared, "return")
+    interval = f" ({_number(told.get('low'), '+')} to {_number(told.get('high'), '+')}, Welch)"
+    return (
+        f"compared with the evaluation{there} of checkpoint {compared.get('checkpoint')}{others}: "
+        f"return {_number(told.get('difference'), '+')}{interval}: {told.get('verdict')}"
+    )
+
+
+def _row(name: str, figures: Mapping[str, Any]) -> str:
+    ends = f"{_number(figures.get('low'))} to {_number(figures.get('high'))}" if figures.get("low") is not None else "-"
+    return f"{name:20} {_number(figures.get('mean')):>10} {ends:>24} {_number(figures.get('std')):>10}"
+
+
+def _mapping(found: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """What any job may have written there."""
+    value = found.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: Any, sign: str = "") -> str:
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return "-"
+    return format(value, f"{sign}.2f" if abs(value) >= 1 or value == 0 else f"{sign}.4f")
+
+
+def _percent(value: Any) -> str:
+    return f"{100 * value:.1f} %" if isinstance(value, int | float) else "-"

@@ -1,0 +1,115 @@
+"""The evaluations of a run: what they are called, which one counts for a checkpoint, which checkpoint is the best and is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store.checkpoints import best_checkpoint, list_checkpoints, retain
+from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, lines, list_evaluations
+from shared_store.files import write_json
+from shared_store.layout import Run, Store
+from shared_store.settings import merged
+from tests.support.orchestrator.trained import add_checkpoint, add_run
+
+FIGURES: dict[str, Any] = {"mean_length": 9.0, "max_length": 10, "task": "Cartpole", "config": {}}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    store = Store(tmp_path)
+    add_run(store, "taught")
+    for iteration, score in ((3, 5.0), (6, 9.0), (9, 7.0)):
+        add_checkpoint(store, "taught", iteration, score=score)
+    return store.run("taught")
+
+
+def evaluate(run: Run, name: str, mean: float, time: float = 1.0, episodes: int = 100, **facts: Any) -> None:
+    found = {**FIGURES, "mean_return": mean, "time": time, "episodes": episodes, **facts}
+    write_json(run.evaluations / f"{name}.json", found)
+
+
+def test_an_evaluation_is_called_after_its_checkpoint_and_its_job() -> None:
+    assert evaluation_name("00000003-e1") == "00000003-e1"
+    assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a") == "00000003-e1-1f2e3d4c"
+    assert evaluation_name("00000003-e1", "1f2e3d4c-5b6a:7") == "00000003-e1-1f2e3d4c-7"
+    assert checkpoint_of("00000003-e1-1f2e3d4c-7") == checkpoint_of("00000003-e1") == "00000003-e1"
+    assert checkpoint_of("notes") is None and checkpoint_of("00000003-e1-../x") is None
+
+
+def test_evaluations_are_listed_by_time_and_what_is_damaged_is_passed_over(run: Run) -> None:
+    evaluate(run, "00000009-e1", 1.0, time=30.0)
+    evaluate(run, "00000003-e1-b", 2.0, time=20.0)
+    evaluate(run, "notes", 9.0, time=1.0)
+    evaluate(run, "00000006-e1", 3.0, time=1.0, mean_length="long")
+    (run.evaluations / "00000006-e1-c.json").write_text("[" * 200)
+    found = list_evaluations(run)
+    assert [(each["name"], each["checkpoint"]) for each in found] == [
+        ("00000003-e1-b", "00000003-e1"),
+        ("00000009-e1", "00000009-e1"),
+    ]
+
+
+def test_of_a_checkpoint_the_evaluation_of_the_most_episodes_in_its_own_worlds_counts(run: Run) -> None:
+    evaluate(run, "00000003-e1-a", 1.0, time=1.0, episodes=500)
+    evaluate(run, "00000003-e1-b", 2.0, time=2.0, episodes=100)
+    evaluate(run, "00000003-e1-c", 3.0, time=3.0, episodes=900, config={"randomize": {"friction": [0.5, 0.5]}})
+    assert by_checkpoint(run)["00000003-e1"]["mean_return"] == 1.0
+    evaluate(run, "00000003-e1-d", 4.0, time=4.0, episodes=500)
+    assert by_checkpoint(run)["00000003-e1"]["mean_return"] == 4.0
+
+
+def test_the_best_checkpoint_is_that_of_two_evaluated_ones_and_else_that_of_the_greatest_score(run: Run) -> None:
+    def best() -> int:
+        found = best_checkpoint(run)
+        assert found is not None
+        return found.iteration
+
+    assert best() == 6
+    evaluate(run, "00000009-e1", 100.0)
+    assert best() == 6, "the last one alone would be the best of one"
+    evaluate(run, "00000003-e1-a", 200.0, config={"level": 1})
+    assert best() == 6, "in other worlds"
+    evaluate(run, "00000003-e1-b", 99.0)
+    assert best() == 9
+    evaluate(run, "00000003-e1-c", 100.0, episodes=200)
+    assert best() == 9, "of equals the later one"
+    evaluate(run, "00000003-e1-d", 101.0, episodes=300)
+    assert best() == 3
+
+
+def test_retention_keeps_what_was_evaluated_by_a_job(run: Run) -> None:
+    evaluate(run, "00000003-e1-1f2e3d4c", 1.0)
+    add_checkpoint(Store(run.path.parent.parent), "taught", 12)
+    assert retain(run, keep=1) == ["00000009-e1"]
+    assert [each.iteration for each in list_checkpoints(run)] == [3, 6, 12], (
+        "evaluated, of the greatest score, the newest"
+    )
+
+
+def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
+    told = "\n".join(
+        lines({**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}})
+    )
+    assert "3 episodes of Cartpole, checkpoint 00000003-e1" in told and "success" not in told
+    config = {"randomize": {"friction": [0.4, 0.6]}, "curriculum": {}}
+    share = {"share": 0.94, "low": 0.875, "high": 0.972}
+    whole = {
+        "checkpoint": "00000003-e1",
+        "episodes": 100,
+        "config": config,
+        "success": share,
+        "success_is": "it stands",
+    }
+    told = "\n".join(lines({**FIGURES, **whole}))
+    assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
+    assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
+
+
+def test_changes_reach_into_sections_and_an_empty_section_replaces_one() -> None:
+    trained = {"rewards": {"alive": 1.0, "fall": -1.0}, "curriculum": {"level": [[0, 0.0]]}, "angle": 1.0}
+    changes = {"rewards": {"alive": 2.0}, "curriculum": {}, "angle": {"new": 1}}
+    assert merged(trained, changes) == {"rewards": {"alive": 2.0, "fall": -1.0}, "curriculum": {}, "angle": {"new": 1}}
+    assert trained["rewards"] == {"alive": 1.0, "fall": -1.0}

@@ -1,0 +1,233 @@
+"""Episodes of an evaluation: what is recorded of each, causes and successes, and that batches of worlds do not matter."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+import torch
+from tensordict import TensorDict
+
+from shared_store.layout import Run
+from worker.distributed import Gang, Placement
+from worker.evaluation.blocks import SIZE, Blocks
+from worker.evaluation.episodes import Episodes, Stopped, play
+from worker.evaluation.evaluation import result_of
+from worker.evaluation.table import write_table
+from worker.tasks import terms
+from worker.tasks.cartpole import Cartpole
+from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.tasks.declaration import Declaration, Metric
+from worker.tasks.ended import Ended
+
+GANG = Gang(Placement(), "cpu", None, ["here"])
+
+
+class Push:
+    """A policy that pushes the cart in the direction in which it finds the pole, so hard that it mostly falls on the other side."""
+
+    def __init__(self, strength: float = 1.0) -> None:
+        self.strength, self.resets = strength, 0
+
+    def act(self, observations: Any) -> torch.Tensor:
+        return (observations["policy"][:, 1:2] * 20.0).clamp(-1.0, 1.0) * self.strength
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        self.resets += worlds is None
+
+
+def config(**fields: Any) -> CartpoleConfig:
+    return CartpoleConfig(episode_seconds=1.0, **fields)
+
+
+@pytest.fixture(scope="module")
+def task() -> Cartpole:
+    """Six worlds whose poles are upright, but for those that start far to a side."""
+    return Cartpole(config(angle_limit=0.12, start_angle=0.15), 6, seed=3)
+
+
+def by_hand(task: Cartpole, policy: Push) -> list[dict[str, float]]:
+    """Return, length and sum of the term `alive` of each world's first episode, from the rewards and observations alone."""
+    task.restart(3, 0)
+    task.reset()
+    found = [{"return": 0.0, "length": 0, "over": False} for _ in range(6)]
+    for _ in range(60):
+        task.step(policy.act(task.groups))
+        for world, row in enumerate(found):
+            if not row["over"]:
+                row["return"] += float(task.rewards[world])
+                row["length"] += 1
+                row["over"] = bool(task.dones[world])
+                row["time_out"] = bool(task.time_outs[world])
+    return found
+
+
+def test_each_episode_has_its_return_length_terms_cause_and_success(task: Cartpole) -> None:
+    expected = by_hand(task, Push())
+    task.restart(3, 0)
+    played = play([task], Push(), GANG)
+    assert played.lengths.tolist() == [row["length"] for row in expected]
+    assert played.returns.tolist() == pytest.approx([row["return"] for row in expected], abs=1e-5)
+    assert played.time_outs.tolist() == [row["time_out"] for row in expected]
+    assert played.ends == ["time_out" if row["time_out"] else "dropped_pole" for row in expected]
+    assert set(played.ends) == {"time_out", "dropped_pole"}, "the starts are chosen so that both happen"
+    assert played.successes is not None and played.successes.tolist() == [row["time_out"] for row in expected]
+    # 0.1 for each step that did not end by a termination; -2 for one that did
+    assert played.term("reward_alive").tolist() == pytest.approx(
+        [0.1 * (row["length"] - (not row["time_out"])) for row in expected], abs=1e-5
+    )
+    assert played.term("reward_fall").tolist() == [0.0 if row["time_out"] else -2.0 for row in expected]
+    terms = sum(played.term(name) for name in played.terms)
+    assert torch.allclose(terms, played.returns, atol=1e-5), "the weighted terms of a return make it"
+
+
+def test_an_episode_is_the_same_whatever_rounds_and_worlds_it_was_played_in(task: Cartpole) -> None:
+    def rounds() -> Iterator[Cartpole]:
+        for number in range(3):
+            task.restart(3, 6 * number)
+            yield task
+
+    batches = play(rounds(), Push(), GANG, episodes=16)
+    whole = play([Cartpole(task.config, 16, seed=3)], Push(), GANG)
+    assert len(batches.rows) == 16 and torch.equal(batches.rows, whole.rows)
+    assert len({tuple(row) for row in whole.rows.tolist()}) == 16, "and no two episodes are alike"
+
+
+class Judged(Cartpole):
+    """A cart-pole that says what a success is."""
+
+    says: str | None = None
+
+    def declare(self, config: CartpoleConfig) -> Declaration:
+        declared = super().declare(config)
+        metrics = {"speed": Metric(terms.joint_velocity_squared, joints="slider")}
+        return Declaration(
+            **{
+                **{
+                    name: getattr(declared, name)
+                    for name in ("actions", "observations", "rewards", "terminations", "events")
+                }
+            },
+            metrics=metrics,
+            success=self.says,
+        )
+
+
+class ByMetric(Judged):
+    says = "speed"
+
+
+class ByTermination(Judged):
+    says = "dropped_pole"
+
+
+class Misspelt(Judged):
+    says = "sped"
+
+
+def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: Cartpole) -> None:
+    moving = play([ByMetric(task.config, 6, seed=3)], Push(), GANG)
+    assert (
+        moving.successes is not None and moving.successes.all() and moving.success == "speed above 0 in the last step"
+    )
+    fallen = play([ByTermination(task.config, 6, seed=3)], Push(), GANG)
+    assert fallen.successes is not None and fallen.success == "dropped_pole ended the episode"
+    assert fallen.successes.tolist() == [end == "dropped_pole" for end in fallen.ends]
+    # of a metric the table has its mean over the steps
+    other = ByMetric(task.config, 6, seed=3)
+    other.reset()
+    total, length = 0.0, int(moving.lengths[0])
+    for _ in range(length):
+        other.step(Push().act(other.groups))
+        total += float(other.ended.sums[0, -1]) if other.dones[0] else 0.0
+    assert float(moving.term("metric_speed")[0]) == pytest.approx(total / length, rel=1e-5)
+
+
+def test_a_success_that_names_nothing_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ValueError, match=r"success: no metric and no termination is called sped; did you mean speed\?"):
+        Misspelt.sketch(config())
+
+
+def test_a_task_that_nothing_but_the_clock_ends_has_no_success() -> None:
+    names = ["time_out", "physics_failed", "terminated"]
+    sums, flags = torch.zeros(1, 2), torch.zeros(1, dtype=torch.bool)
+    without = Ended(sums, torch.zeros(1, dtype=torch.int32), flags, names, [], None, False)
+    assert not without.says_success and without.meaning == "the task does not say"
+
+
+def test_who_is_asked_to_stop_records_nothing() -> None:
+    with pytest.raises(Stopped):
+        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_asked_to_stop=lambda: True)
+
+
+def test_blocks_of_worlds_have_policies_of_their_own() -> None:
+    policies = [Push(), Push(0.5)]
+    blocks = Blocks(policies)
+    seen = TensorDict({"policy": torch.full((2 * SIZE, 4), 1.0)}, [2 * SIZE])
+    assert blocks.act(seen).flatten().tolist() == [1.0] * SIZE + [0.5] * SIZE
+    blocks.reset()
+    blocks.reset(torch.ones(2 * SIZE, dtype=torch.bool))
+    assert [policy.resets for policy in policies] == [1, 1]
+
+
+@pytest.fixture(scope="module")
+def played(task: Cartpole) -> Episodes:
+    task.restart(3, 0)
+    return play([task], Push(), GANG)
+
+
+def test_the_table_has_a_row_an_episode_and_the_same_episodes_are_the_same_bytes(
+    played: Episodes, tmp_path: Path
+) -> None:
+    write_table(tmp_path / "one.parquet", played, 7)
+    write_table(tmp_path / "two.parquet", played, 7)
+    assert (tmp_path / "one.parquet").read_bytes() == (tmp_path / "two.parquet").read_bytes()
+    table = pyarrow.parquet.read_table(tmp_path / "one.parquet").to_pydict()
+    assert list(table)[:6] == ["episode", "seed", "return", "length", "success", "cause"]
+    assert table["episode"] == [0, 1, 2, 3, 4, 5] and table["seed"] == [7] * 6 and table["cause"] == played.ends
+    assert table["return"] == played.returns.tolist() and table["reward_fall"] == played.term("reward_fall").tolist()
+
+
+def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
+    task: Cartpole, played: Episodes, tmp_path: Path
+) -> None:
+    run = Run(tmp_path / "run")
+    first = result_of(task, played, "00000003-e1", 7, 0.0).write(run, "first-job", config={})
+    assert "compared" not in first and first["table"] == "00000003-e1-first-jo.parquet"
+    fell = played.ends.count("dropped_pole")
+    assert first["causes"]["dropped_pole"]["count"] == fell and first["success"]["count"] == 6 - fell
+    assert (
+        first["rewards"]["fall"]["mean"] == pytest.approx(-2.0 * fell / 6)
+        and first["rewards"]["fall"]["weight"] == -2.0
+    )
+    second = result_of(task, played, "00000006-e1", 7, 0.0).write(run, "second-job", config={"angle_limit": 0.3})
+    assert second["compared"]["checkpoint"] == "00000003-e1" and second["compared"]["other_worlds"]
+    assert (
+        second["compared"]["return"]["difference"] == 0.0 and second["compared"]["return"]["verdict"] == "within noise"
+    )
+    assert json.loads((run.evaluations / "00000006-e1-second-j.json").read_text()) == json.loads(json.dumps(second))
+
+
+def test_a_killed_evaluation_leaves_no_half_table_and_the_next_one_clears_what_it_left(
+    task: Cartpole, played: Episodes, tmp_path: Path
+) -> None:
+    run = Run(tmp_path / "run")
+    run.evaluations.mkdir(parents=True)
+    half = run.evaluations / ".00000003-e1-job.parquet.0123abcd.tmp"
+    half.write_bytes(b"PAR1")
+    pid = os.fork()
+    if pid == 0:  # killed between the table and the summary
+        write_table(run.evaluations / "00000003-e1-job.parquet", played, 7)
+        os._exit(9)
+    os.waitpid(pid, 0)
+    assert not half.exists() and list(run.evaluations.glob("*.json")) == []
+    result_of(task, played, "00000003-e1", 7, 0.0).write(run, "job", config={})
+    assert sorted(path.name for path in run.evaluations.iterdir()) == [
+        "00000003-e1-job.json",
+        "00000003-e1-job.parquet",
+    ]

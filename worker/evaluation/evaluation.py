@@ -1,0 +1,170 @@
+"""Deterministic evaluation: the mean action, whole episodes from a fresh reset, the worlds of all ranks; and what is kept of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from shared_store.evaluations import checkpoint_of, evaluation_name, list_evaluations
+from shared_store.files import write_json
+from shared_store.layout import Run
+from worker.distributed import Gang
+from worker.evaluation.episodes import Episodes, play
+from worker.evaluation.statistics import Sample, difference, share
+from worker.evaluation.table import write_table
+from worker.learning.algorithm import Policy
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The episodes of all ranks, and what they are of.
+
+    Attributes:
+        checkpoint: Its name.
+        task: Name of the task.
+        episodes: What is known of each.
+        max_length: The longest that an episode can be [steps].
+        weights: Weight of each reward term.
+        seed: Of the worlds.
+        seconds: How long it took, by the clock [s].
+    """
+
+    checkpoint: str
+    task: str
+    played: Episodes
+    max_length: int
+    weights: Mapping[str, float]
+    seed: int | None
+    seconds: float
+
+    @property
+    def episodes(self) -> int:
+        """How many there are."""
+        return len(self.played.rows)
+
+    @property
+    def mean_return(self) -> float:
+        """Mean sum of the rewards."""
+        return float(self.played.returns.mean())
+
+    @property
+    def mean_length(self) -> float:
+        """Mean length [steps]."""
+        return float(self.played.lengths.mean())
+
+    def __str__(self) -> str:
+        percent = round(100 * self.mean_length / self.max_length)
+        return (
+            f"evaluation: mean episode length {self.mean_length:.1f} of {self.max_length} ({percent} %), "
+            f"mean return {self.mean_return:.2f} over {self.episodes} episodes"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Everything but the episodes themselves, as JSON values; lengths in steps, intervals of 95 %."""
+        played, count = self.played, self.episodes
+        returns = Sample.of(played.returns)
+        ends = Counter(played.ends)
+        successes = played.successes
+        return {
+            "format": FORMAT,
+            "checkpoint": self.checkpoint,
+            "task": self.task,
+            "episodes": count,
+            "seed": self.seed,
+            "mean_return": returns.mean,
+            "std_return": returns.std,
+            "min_return": float(played.returns.min()),
+            "max_return": float(played.returns.max()),
+            "mean_length": self.mean_length,
+            "max_length": self.max_length,
+            "full_length": float(played.time_outs.double().mean()),
+            "return": returns.describe(),
+            "length": Sample.of(played.lengths).describe(),
+            "success": None if successes is None else share(int(successes.sum()), count),
+            "success_is": played.success,
+            "causes": {name: share(ends[name], count) for name in played.causes if ends[name]},
+            "rewards": {
+                name: {**self._described(f"reward_{name}"), "weight": self.weights.get(name)}
+                for name in self._named("reward_")
+            },
+            "metrics": {name: self._described(f"metric_{name}") for name in self._named("metric_")},
+            "seconds": self.seconds,
+        }
+
+    def write(self, run: Run, job: str = "", **facts: Any) -> dict[str, Any]:
+        """Write the table, then the summary, which is also returned. Raises OSError.
+
+        Args:
+            run: The run that was evaluated.
+            job: Id of the job that did nothing else; it names the files.
+            **facts: What else the summary says.
+        """
+        name = evaluation_name(self.checkpoint, job)
+        summary = {**self.summary(), **facts, "job": job or None, "table": f"{name}.parquet", "time": time.time()}
+        earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
+        if earlier:
+            summary["compared"] = self._compared(earlier[-1], facts.get("config") or {})
+        summary = _finite(summary)
+        write_table(run.evaluations / summary["table"], self.played, self.seed)
+        write_json(run.evaluations / f"{name}.json", summary)
+        return summary
+
+    def _named(self, prefix: str) -> list[str]:
+        return [name.removeprefix(prefix) for name in self.played.terms if name.startswith(prefix)]
+
+    def _described(self, term: str) -> dict[str, float | None]:
+        return Sample.of(self.played.term(term)).describe()
+
+    def _compared(self, old: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
+        """How this one differs from an earlier one of the run."""
+        std = old.get("std_return")
+        before = Sample(int(old["episodes"]), float(old["mean_return"]), float(std or 0.0))
+        return {
+            "name": old["name"],
+            "checkpoint": checkpoint_of(old["name"]),
+            "time": old["time"],
+            "other_worlds": (old.get("config") or {}) != config,
+            "return": difference(Sample.of(self.played.returns), before),
+        }
+
+
+def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
+    """Run at least ``episodes`` episodes, by default one a world; all ranks call it. The worlds are left as they were."""
+    started = time.perf_counter()
+    before = task.state_dict()
+    worlds = int(gang.sum(torch.tensor(float(task.world_count), device=gang.device)))
+    played = play([task] * (1 if episodes is None else math.ceil(episodes / worlds)), policy, gang)
+    task.load_state_dict(before)
+    task.clear_statistics()
+    return result_of(task, played, checkpoint, None, started)
+
+
+def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, started: float) -> Evaluation:
+    """The evaluation that these episodes make; ``started`` by ``time.perf_counter``."""
+    return Evaluation(
+        checkpoint=checkpoint,
+        task=type(task).__name__,
+        played=played,
+        max_length=task.max_episode_length,
+        weights=getattr(task.config, "rewards", {}),
+        seed=seed,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity: None in its place."""
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,81 @@
+"""What a task tells of an episode once it has ended: sums of its reward terms and metrics, by what it ended, whether it was a success."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+import warp as wp
+
+from worker.simulation.episodes import PHYSICS_FAILED, STEPS, TERMS
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+CLOCK = "time_out"
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The last episode of each world that ended: live views, valid in every world where one has.
+
+    Attributes:
+        sums: Return, steps, the weighted sum of each reward term, the sum of each metric, shape ``(worlds, 2 + terms)``, float32.
+        causes: Index into ``names`` of what ended it, shape ``(worlds,)``, int32. Of several terminations in one step it is the first.
+        judged: Whether it was a success as the task declares it, shape ``(worlds,)``, bool; meaningless where ``success`` is None.
+        names: What can end an episode: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
+            the terminations of a declared task.
+        columns: Names of the columns of ``sums`` behind the first two.
+        success: The metric or termination that makes a success; None: that only the clock ended it.
+        says_success: Whether success means anything: of a task without terminations that declares none it does not.
+    """
+
+    sums: torch.Tensor
+    causes: torch.Tensor
+    judged: torch.Tensor
+    names: Sequence[str]
+    columns: Sequence[str]
+    success: str | None
+    says_success: bool
+
+    @classmethod
+    def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> Ended:
+        """What ``task`` tells, in buffers that ``buffer`` allocates among its ``EpisodeArrays``: name, shape, Warp's type."""
+        count = task.world_count
+        rewards = [f"reward_{name}" for name in task.reward_terms]
+        ends = [name.removeprefix("termination_") for name in task.termination_names]
+        return cls(
+            buffer("last_sums", (count, int(TERMS) + len(rewards) + len(task.metric_names)), wp.float32),
+            buffer("causes", (count,), wp.int32),
+            buffer("successes", (count,), wp.bool),
+            [CLOCK, "physics_failed", "terminated", *(name for name in ends if name != CLOCK)],
+            [*rewards, *task.metric_names],
+            task.success,
+            task.success is not None or ends != [CLOCK],
+        )
+
+    @property
+    def terms(self) -> torch.Tensor:
+        """Of each reward term its weighted sum, of each metric its mean over the steps, shape ``(worlds, terms)``, named by ``columns``."""
+        steps = self.sums[:, int(STEPS)].clamp(min=1.0)
+        rewards = sum(name.startswith("reward_") for name in self.columns)
+        first = int(TERMS) + rewards
+        return torch.cat([self.sums[:, int(TERMS) : first], self.sums[:, first:] / steps[:, None]], 1)
+
+    @property
+    def meaning(self) -> str:
+        """What a success is, in words."""
+        if self.success is None:
+            return "the clock ended the episode" if self.says_success else "the task does not say"
+        metric = f"metric_{self.success}" in self.columns
+        return f"{self.success} above 0 in the last step" if metric else f"{self.success} ended the episode"
+
+    def successes(self, time_outs: torch.Tensor) -> torch.Tensor:
+        """Whether each episode was a success, shape ``(worlds,)``, bool; none is whose physics failed.
+
+        Args:
+            time_outs: Whether the clock ended it, or a termination that counts as the clock, shape ``(worlds,)``, bool.
+        """
+        return time_outs if self.success is None else self.judged & (self.causes != int(PHYSICS_FAILED))
