@@ -25,6 +25,8 @@ RETURN = wp.constant(0)
 STEPS = wp.constant(1)
 TERMS = wp.constant(2)
 """Columns of ``EpisodeArrays.sums``: return, steps lived, then one column a reward term."""
+WATCHED = 16
+"""Of so many worlds at most, the first ones, each reward term of a step is kept for those who look on."""
 
 
 @wp.struct
@@ -41,6 +43,8 @@ class EpisodeArrays:
         ages: Steps on the clock of the running episode, shape ``(worlds,)``.
         sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
+        terms: Reward terms of the step, weighted, of the worlds that can be watched (:mod:`worker.telemetry`), which sets them to zero;
+            shape ``(min(WATCHED, worlds), terms)``.
         weights: Weight of each reward term, shape ``(terms,)``.
         level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
         memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
@@ -66,6 +70,7 @@ class EpisodeArrays:
     ages: wp.array(dtype=wp.int32)
     sums: wp.array2d(dtype=wp.float32)
     random: wp.array2d(dtype=wp.int32)
+    terms: wp.array2d(dtype=wp.float32)
     weights: wp.array(dtype=wp.float32)
     level: wp.array(dtype=wp.float32)
     memory: wp.array2d(dtype=wp.float32)
@@ -112,6 +117,8 @@ def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
     weighted = episodes.weights[term] * value
     episodes.rewards[world] = episodes.rewards[world] + weighted
     episodes.sums[world, TERMS + term] = episodes.sums[world, TERMS + term] + weighted
+    if world < episodes.terms.shape[0]:
+        episodes.terms[world, term] = weighted
 
 
 @wp.func
