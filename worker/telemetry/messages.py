@@ -1,8 +1,8 @@
-"""The messages of a recording: ROS 2's own types as CDR, one type of Muster's, and Foxglove's scenes."""
+"""The messages of a recording, all of them CDR: ROS 2's own types, Foxglove's scenes as ROS 2 knows them, and one type of Muster's."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -25,14 +25,57 @@ float32[] action                # what the policy asked for
 string[] observation_names
 float32[] observation           # what it sees next; of an episode that has ended, the first of the next one
 """
+SCENE = "foxglove_msgs/msg/SceneUpdate"
+_POSED = "geometry_msgs/Pose pose"
+_LOOK = "foxglove_msgs/Color color"
+_SCENE_TYPES = {
+    "Color": ("float64 r", "float64 g", "float64 b", "float64 a"),
+    "KeyValuePair": ("string key", "string value"),
+    "SceneEntityDeletion": ("builtin_interfaces/Time timestamp", "uint8 type", "string id"),
+    "ArrowPrimitive": (
+        _POSED,
+        *(f"float64 {part}" for part in ("shaft_length", "shaft_diameter", "head_length", "head_diameter")),
+        _LOOK,
+    ),
+    "CubePrimitive": (_POSED, "geometry_msgs/Vector3 size", _LOOK),
+    "SpherePrimitive": (_POSED, "geometry_msgs/Vector3 size", _LOOK),
+    "CylinderPrimitive": (_POSED, "geometry_msgs/Vector3 size", "float64 bottom_scale", "float64 top_scale", _LOOK),
+    "LinePrimitive": (
+        *("uint8 type", _POSED, "float64 thickness", "bool scale_invariant", "geometry_msgs/Point[] points"),
+        *(_LOOK, "foxglove_msgs/Color[] colors", "uint32[] indices"),
+    ),
+    "TriangleListPrimitive": (
+        *(_POSED, "geometry_msgs/Point[] points", _LOOK, "foxglove_msgs/Color[] colors", "uint32[] indices"),
+    ),
+    "TextPrimitive": (*(_POSED, "bool billboard", "float64 font_size", "bool scale_invariant", _LOOK, "string text"),),
+    "ModelPrimitive": (
+        *(_POSED, "geometry_msgs/Vector3 scale", _LOOK, "bool override_color"),
+        *("string url", "string media_type", "uint8[] data"),
+    ),
+    "SceneEntity": (
+        *("builtin_interfaces/Time timestamp", "string frame_id", "string id", "builtin_interfaces/Duration lifetime"),
+        *("bool frame_locked", "foxglove_msgs/KeyValuePair[] metadata"),
+        *(
+            f"foxglove_msgs/{kind}Primitive[] {name}"
+            for kind, name in {
+                **{"Arrow": "arrows", "Cube": "cubes", "Sphere": "spheres", "Cylinder": "cylinders"},
+                **{"Line": "lines", "TriangleList": "triangles", "Text": "texts", "Model": "models"},
+            }.items()
+        ),
+    ),
+    "SceneUpdate": ("foxglove_msgs/SceneEntityDeletion[] deletions", "foxglove_msgs/SceneEntity[] entities"),
+}
+"""Fields of Foxglove's scenes: names and types are those of its ROS 2 package ``foxglove_msgs``, by which viewers know them."""
 
 
 @cache
 def types() -> Any:
-    """The type store: that of ROS 2 Jazzy, and Muster's own."""
+    """The type store: that of ROS 2 Jazzy, Foxglove's scenes, and Muster's own."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
+    for name, fields in _SCENE_TYPES.items():
+        store.register(get_types_from_msg("\n".join(fields), f"foxglove_msgs/msg/{name}"))
     store.register(get_types_from_msg(STEP_DEFINITION, STEP))
     return store
 
@@ -60,14 +103,12 @@ def header(nanoseconds: int, frame: str) -> Any:
     return types().types["std_msgs/msg/Header"](stamp=stamp(nanoseconds), frame_id=frame)
 
 
-def transforms(nanoseconds: int, parent: str, children: Sequence[str], poses: np.ndarray) -> bytes:
-    """A ``tf2_msgs/TFMessage``: frames in their parent.
+def transforms(nanoseconds: int, frames: Sequence[tuple[str, str, Sequence[float]]]) -> bytes:
+    """A ``tf2_msgs/TFMessage``.
 
     Args:
         nanoseconds: When [ns].
-        parent: Name of the frame that they are in.
-        children: Their names.
-        poses: Position [m] and quaternion xyzw, shape ``(children, 7)``.
+        frames: Parent, child, and the child's pose in it: position [m] and quaternion xyzw.
     """
     known = types().types
     transform, vector = known["geometry_msgs/msg/Transform"], known["geometry_msgs/msg/Vector3"]
@@ -78,7 +119,7 @@ def transforms(nanoseconds: int, parent: str, children: Sequence[str], poses: np
             child_frame_id=child,
             transform=transform(translation=vector(x=x, y=y, z=z), rotation=quaternion(x=i, y=j, z=k, w=w)),
         )
-        for child, (x, y, z, i, j, k, w) in zip(children, poses.tolist(), strict=True)
+        for parent, child, (x, y, z, i, j, k, w) in frames
     ]
     return encoded("tf2_msgs/msg/TFMessage", transforms=made)
 
@@ -115,44 +156,40 @@ def picture(nanoseconds: int, frame: str, image: np.ndarray) -> bytes:
     return encoded("sensor_msgs/msg/CompressedImage", header=header(nanoseconds, frame), format="png", data=data)
 
 
-@cache
-def scene_schema() -> tuple[str, bytes]:
-    """Name and schema of Foxglove's scenes: all files that define it, as a protobuf descriptor set."""
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-
-    found = FileDescriptorSet()
-    seen: set[str] = set()
-
-    def add(file: Any) -> None:
-        if file.name in seen:
-            return
-        seen.add(file.name)
-        for each in file.dependencies:
-            add(each)
-        file.CopyToProto(found.file.add())
-
-    add(SceneUpdate.DESCRIPTOR.file)
-    return SceneUpdate.DESCRIPTOR.full_name, found.SerializeToString()
-
-
-def scene(nanoseconds: int, models: dict[str, bytes]) -> bytes:
-    """A ``foxglove.SceneUpdate``: a model on each frame, which moves with it.
+def scene(nanoseconds: int, models: Mapping[str, bytes]) -> bytes:
+    """A ``foxglove_msgs/SceneUpdate``: a model on each frame, which moves with it.
 
     Args:
         nanoseconds: When [ns].
         models: Binary glTF by frame.
     """
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
-    update = SceneUpdate()
+    known = types().types
+    point, vector = known["geometry_msgs/msg/Point"], known["geometry_msgs/msg/Vector3"]
+    turn = known["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    here = known["geometry_msgs/msg/Pose"](position=point(x=0.0, y=0.0, z=0.0), orientation=turn)
+    plain = known["foxglove_msgs/msg/Color"](r=1.0, g=1.0, b=1.0, a=1.0)
+    nothing: dict[str, list[Any]] = {
+        name: [] for name in ("metadata", "arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts")
+    }
+    entities = []
     for frame, data in models.items():
-        entity = update.entities.add()
-        entity.id = entity.frame_id = frame
-        entity.frame_locked = True
-        entity.timestamp.FromNanoseconds(nanoseconds)
-        model = entity.models.add()
-        model.media_type, model.data = "model/gltf-binary", data
-        model.pose.orientation.w = 1.0
-        model.scale.x = model.scale.y = model.scale.z = 1.0
-    return bytes(update.SerializeToString())
+        model = known["foxglove_msgs/msg/ModelPrimitive"](
+            pose=here,
+            scale=vector(x=1.0, y=1.0, z=1.0),
+            color=plain,
+            override_color=False,
+            url="",
+            media_type="model/gltf-binary",
+            data=np.frombuffer(data, np.uint8),
+        )
+        entity = known["foxglove_msgs/msg/SceneEntity"](
+            timestamp=stamp(nanoseconds),
+            frame_id=frame,
+            id=frame,
+            lifetime=known["builtin_interfaces/msg/Duration"](sec=0, nanosec=0),  # for ever
+            frame_locked=True,
+            models=[model],
+            **nothing,
+        )
+        entities.append(entity)
+    return encoded(SCENE, deletions=[], entities=entities)

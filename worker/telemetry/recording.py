@@ -143,38 +143,34 @@ class Recording:
     def _begin(self, description: str | None) -> None:
         """What stands once at the beginning: the places of the worlds, and what is seen on the links."""
         worlds, now = self._stage.worlds, self._began
-        places = np.zeros((worlds, 7))
-        places[:, 1] = APART * (np.arange(worlds) - (worlds - 1) / 2)
-        places[:, 6] = 1.0
         names = [f"world_{world}" for world in range(worlds)]
-        self._add("/tf_static", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, "world", names, places))
+        places = [
+            ("world", name, [0.0, APART * (world - (worlds - 1) / 2), 0.0, 0.0, 0.0, 0.0, 1.0])
+            for world, name in enumerate(names)
+        ]
+        self._add("/tf_static", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, places))
         if description is not None:
             data = messages.encoded("std_msgs/msg/String", data=description)
             self._add("/robot_description", "std_msgs/msg/String", now, data)
         meshes = self._stage.meshes()
         if ground := meshes.pop("ground", None):
-            self._add_scene("/ground", now, {"world": ground})
+            self._add("/ground", messages.SCENE, now, messages.scene(now, {"world": ground}))
         for name in names:
             frames = {f"{name}/{link}" if link else name: data for link, data in meshes.items()}
-            self._add_scene(f"/{name}/scene", now, frames)
-
-    def _add_scene(self, topic: str, now: int, models: dict[str, bytes]) -> None:
-        name, schema = messages.scene_schema()
-        if topic not in self._channels:
-            if name not in self._schemas:
-                self._schemas[name] = self._writer.register_schema(name, "protobuf", schema)
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
-        self._put(topic, now, messages.scene(now, models))
+            self._add(f"/{name}/scene", messages.SCENE, now, messages.scene(now, frames))
 
     def _write_step(self, rows: Rows, step: int) -> None:
         stage, layout = self._stage, rows.layout
         self._rate, number = layout.control_hz, rows.first + step + 1
         now = self._time(number, layout.control_hz)
-        poses = stage.pose(rows.coordinates[step])
+        frames = [
+            (f"world_{world}", f"world_{world}/{link}", pose)
+            for world, poses in enumerate(stage.pose(rows.coordinates[step]))
+            for link, pose in zip(stage.links, poses.tolist(), strict=True)
+        ]
+        self._add("/tf", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, frames))
         for world in range(stage.worlds):
             frame = f"world_{world}"
-            links = [f"{frame}/{link}" for link in stage.links]
-            self._add("/tf", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, frame, links, poses[world]))
             if stage.joints:
                 positions = rows.coordinates[step, world, stage.coordinates]
                 velocities = rows.velocities[step, world, stage.dofs]
@@ -220,7 +216,9 @@ class Recording:
             "end": cause,
         }
         self._writer.add_metadata("episode", known)
-        self.say(f"world {world}: episode {fields['episode']} ended by {cause} after {int(steps)} steps, return {total:.4g}")
+        self.say(
+            f"world {world}: episode {fields['episode']} ended by {cause} after {int(steps)} steps, return {total:.4g}"
+        )
 
     def _add(self, topic: str, kind: str, now: int, data: bytes) -> None:
         if topic not in self._channels:
@@ -228,9 +226,6 @@ class Recording:
                 text = messages.definition(kind).encode()
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], _qos(topic))
-        self._put(topic, now, data)
-
-    def _put(self, topic: str, now: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], now, data, now)
 
     def _flush(self) -> None:
@@ -245,10 +240,18 @@ class Recording:
         )
 
 
+_FOR_EVER = {"sec": 9223372036, "nsec": 854775807}
+_LATCHED = {
+    **{"history": 1, "depth": 1, "reliability": 1, "durability": 1, "liveliness": 1},
+    **{name: _FOR_EVER for name in ("deadline", "lifespan", "liveliness_lease_duration")},
+    "avoid_ros_namespace_conventions": False,
+}
+"""The quality of service, in ROS 2's numbers, of what stands once: a player keeps it for whoever comes later."""
+
+
 def _qos(topic: str) -> dict[str, str]:
-    """Players of ROS 2 keep what stands once for whoever comes later."""
-    latched = topic in ("/tf_static", "/robot_description")
-    return {"offered_qos_profiles": json.dumps([{"durability": "transient_local"}]) if latched else ""}
+    latched = topic in ("/tf_static", "/robot_description", "/ground") or topic.endswith("/scene")
+    return {"offered_qos_profiles": json.dumps([_LATCHED])} if latched else {}
 
 
 def recover(partial: Path) -> tuple[Path, int]:
