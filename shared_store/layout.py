@@ -63,6 +63,10 @@ class Run:
     def exports(self) -> Path:
         return self.path / "exports"
 
+    @property
+    def recordings(self) -> Path:
+        return self.path / "recordings"
+
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
 
@@ -74,7 +78,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "logs", "outcomes", "parent", "teachers"):
+        for name in ("checkpoints", "metrics", "evaluations", "recordings", "logs", "outcomes", "parent", "teachers"):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:

@@ -38,6 +38,10 @@ ENTRIES = (
     Entry("clone", "clones", _RUNS, "Start a new run with the weights of a checkpoint, and with nothing else of it."),
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
+    Entry("record", "recordings", _RUNS, "Record what a policy does as an MCAP file, for ROS 2's tools and viewers."),
+    Entry(
+        "render", "recordings", _RUNS, "Film what a checkpoint's policy does, or show six moments of it in a picture."
+    ),
     Entry(
         "verify-resume",
         "verify",

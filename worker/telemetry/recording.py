@@ -52,7 +52,6 @@ class Recording:
         stage: What the worlds look like; it has as many as are recorded.
         facts: Of the run, for the metadata of each episode: ``run``, ``checkpoint``, ….
         attachments: Further files, by name: the policy's contract, the job.
-        description: Text of a robot's URDF file, for ``/robot_description``; None: there is none.
 
     Raises:
         UserError: The file can't be written.
@@ -64,7 +63,6 @@ class Recording:
         stage: Stage,
         facts: Mapping[str, str],
         attachments: Mapping[str, bytes],
-        description: str | None = None,
     ) -> None:
         from mcap.writer import CompressionType, Writer
 
@@ -82,7 +80,7 @@ class Recording:
             self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
             self._writer.start("ros2", "muster")
             self._attach(attachments)
-            self._begin(description)
+            self._begin()
             self._flush()
         except OSError as error:
             raise self._full(error) from error
@@ -140,8 +138,11 @@ class Recording:
             kind = media.get(Path(name).suffix, "application/octet-stream")
             self._writer.add_attachment(self._began, self._began, name, kind, data)
 
-    def _begin(self, description: str | None) -> None:
-        """What stands once at the beginning: the places of the worlds, and what is seen on the links."""
+    def _begin(self) -> None:
+        """What stands once at the beginning: the places of the worlds, and what is seen on the links.
+
+        A robot from URDF is described by its file. No ROS tool reads MJCF: such a file is attached, and the links have their shapes.
+        """
         worlds, now = self._stage.worlds, self._began
         names = [f"world_{world}" for world in range(worlds)]
         places = [
@@ -149,8 +150,11 @@ class Recording:
             for world, name in enumerate(names)
         ]
         self._add("/tf_static", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, places))
-        if description is not None:
-            data = messages.encoded("std_msgs/msg/String", data=description)
+        name, text = self._stage.robot_file or ("", "")
+        if name:
+            self._attach({name: text.encode()})
+        if name.endswith(".urdf"):
+            data = messages.encoded("std_msgs/msg/String", data=text)
             self._add("/robot_description", "std_msgs/msg/String", now, data)
         meshes = self._stage.meshes()
         if ground := meshes.pop("ground", None):

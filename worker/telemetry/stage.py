@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import newton
@@ -11,6 +12,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation import robot_files
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
 from worker.tasks.declared import DeclaredTask
@@ -37,7 +39,7 @@ class Stage:
         coordinates: Their columns among the joint coordinates.
         dofs: Their columns among the joint velocities.
         root: The body that a picture follows, -1 where the robot stands on the world.
-        ground: Shapes of the ground, which belong to no world.
+        robot_file: ``robot.urdf`` or ``robot.xml`` (MJCF) and the text of the robot's file; None of other kinds of files.
 
     Raises:
         ValueError: The robot can't be read.
@@ -66,8 +68,7 @@ class Stage:
             scene.add_ground_plane()
         self.model = scene.finalize(device=device)
         self.state = self.model.state()
-        owners = self.model.shape_world.numpy()
-        self.ground = [int(shape) for shape in np.flatnonzero(owners < 0)]
+        self.robot_file = _robot_file(sketch, config)
 
     def pose(self, coordinates: np.ndarray) -> np.ndarray:
         """Put the worlds where joint coordinates say.
@@ -131,6 +132,18 @@ def _seen(task_type: type[Task]) -> type[Task]:
         return {name: _with_visuals(each) for name, each in task_type.objects(self, config).items()}
 
     return type(task_type.__name__, (task_type,), {"robot": robot, "objects": objects})
+
+
+def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
+    """Name and text of the robot's file; None where it is binary, or the task has no such file."""
+    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, DeclaredTask) else None
+    if file is None:
+        return None
+    found = robot_files.read(file)
+    if found.format not in ("urdf", "mjcf"):
+        return None
+    text = found.source if found.source.lstrip().startswith("<") else Path(found.source).read_text()
+    return ("robot.urdf" if found.format == "urdf" else "robot.xml"), text
 
 
 def _with_visuals(entity: Any) -> Any:
