@@ -98,7 +98,7 @@ def render(
         values: dict[str, Any] = {"run": run["run"], "checkpoint": _iteration(client, run, source), "worlds": worlds}
         values |= {"seconds": seconds, "width": int(found[1]), "height": int(found[2])}
         try:
-            section = Render(**values, format=output.suffix[1:])
+            section = Render.model_validate({**values, "format": output.suffix[1:]})
         except ValueError:
             raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels") from None
         _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
