@@ -51,7 +51,10 @@ def main() -> int:
     target = run.recordings / f"{rollout.checkpoint.name}-{(job.id or 'job')[:8]}{ending}"
     data = picture.encode(taken, ending, frames)
     picture.write(target, data)
-    print(f"rendered: {seconds:g} s of {worlds} worlds, {len(data) / 1e6:.2f} MB, {spent:.1f} s for the camera", flush=True)
+    print(
+        f"rendered: {seconds:g} s of {worlds} worlds, {len(data) / 1e6:.2f} MB, {spent:.1f} s for the camera",
+        flush=True,
+    )
     print(f"written: {target}", flush=True)
     return 0
 

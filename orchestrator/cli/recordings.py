@@ -174,7 +174,7 @@ def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> Non
     """Run the job and bring what it made to ``output``. Raises typer.Exit, ServerError."""
     job = submit_spec(client, spec, spec.name)["jobId"]
     for line in client.logs(job, follow=True):
-        if line["rank"] is not None and not line["text"].startswith("written: "):
+        if line["rank"] is not None and line["text"].startswith(("recorded: ", "rendered: ", "compiling ")):
             echo(line["text"])
     detail = client.get(f"/api/jobs/{job}")
     if detail["status"] != "SUCCEEDED":

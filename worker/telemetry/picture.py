@@ -28,6 +28,7 @@ _VIEW = (-0.55, -0.78, 0.3)
 """From the robot to the camera, for which only the direction counts: behind, on its right, a little above."""
 _SKY = 0x00E6D9CC
 """Packed as alpha, blue, green, red."""
+_LIGHT, _AMBIENT = (1.2, 1.2, 1.15), (0.45, 0.45, 0.48)
 _SMOOTH = 0.15
 """Share of the way to the robot that the camera goes in each frame, up and down; along the ground it keeps up."""
 
@@ -58,16 +59,20 @@ class Camera:
             default_render_config=configuration,
             load_textures=False,
         )
-        self._sensor.create_default_light(enable_shadows=True, direction=wp.normalize(wp.vec3f(0.4, 0.35, -0.85)))
-        self._sensor.set_ambient_light((0.35, 0.35, 0.38), (0.15, 0.14, 0.13))
+        self._sensor.create_default_light(
+            enable_shadows=True, direction=wp.normalize(wp.vec3f(0.5, 0.35, -0.8)), color=_LIGHT
+        )
+        self._sensor.set_ambient_light(_AMBIENT, _AMBIENT)
         planes = np.flatnonzero((model.shape_type.numpy() == newton.GeoType.PLANE) & (model.shape_world.numpy() < 0))
         if len(planes):
             self._sensor.assign_checkerboard_material(shape_indices=planes)
         self._rays = SensorCamera.compute_camera_rays_pinhole(
-            *self.size, camera_fov=_FOV, sample_count=4, device=model.device
+            *self.size, camera_fov=_FOV, sample_count=2, device=model.device
         )
         self._pixels = self._sensor.allocate_image_color(stage.worlds, *self.size)
         self._targets: np.ndarray | None = None
+        self._offset = np.zeros(3)
+        """From a robot's root to its middle [m]."""
         self._distance = 1.0
 
     def take(self, coordinates: np.ndarray) -> np.ndarray:
@@ -98,15 +103,16 @@ class Camera:
         return whole
 
     def _aim(self, poses: np.ndarray) -> None:
-        """Point at the root of each robot, or at the middle of one that stands on the world, from as far as shows all of it."""
-        seen = poses[:, self.stage.root, :3] if self.stage.root >= 0 else None
+        """Point at the root of each robot, from as far as shows all of it."""
+        seen = poses[:, self.stage.root, :3]
         if self._targets is None:
             middle, radius = self._extent(poses)
-            self._targets = np.repeat(middle[None], self.stage.worlds, 0) if seen is None else seen.copy()
-            self._distance = 1.25 * radius / math.tan(_FOV / 2) * max(1.0, self.size[1] / self.size[0])
-        elif seen is not None:
-            self._targets[:, :2] = seen[:, :2]
-            self._targets[:, 2] += _SMOOTH * (seen[:, 2] - self._targets[:, 2])
+            self._offset = middle - seen[0]
+            self._targets = seen + self._offset
+            self._distance = 0.85 * radius / math.sin(_FOV / 2)  # the radii of shapes are those of balls around them
+            return
+        self._targets[:, :2] = seen[:, :2] + self._offset[:2]
+        self._targets[:, 2] += _SMOOTH * (seen[:, 2] + self._offset[2] - self._targets[:, 2])
 
     def _extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
         """Middle and radius of what is seen of the first world [m]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
+_GROUND = (0.6, 0.62, 0.6)
+"""Its colour."""
+
 
 class Stage:
     """Some worlds of a task as they are seen: with the shapes that a robot's file has only for the eye.
@@ -38,7 +42,7 @@ class Stage:
         joints: Names of the joints with one degree of freedom.
         coordinates: Their columns among the joint coordinates.
         dofs: Their columns among the joint velocities.
-        root: The body that a picture follows, -1 where the robot stands on the world.
+        root: The body that a picture follows.
         robot_file: ``robot.urdf`` or ``robot.xml`` (MJCF) and the text of the robot's file; None of other kinds of files.
 
     Raises:
@@ -56,17 +60,20 @@ class Stage:
             self.joints += [own + name for name in view.joint_names]
             self.coordinates += view.coordinates
             self.dofs += view.dofs
-        self.root = views[0].root_body if views[0].root_coordinate >= 0 else -1
+        self.root = views[0].root_body
         self.links = _link_names(template.body_label)
         scene = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(scene)
         scene.replicate(template, worlds)
-        stands_on = sketch.stands_on()
+        stands_on, first = sketch.stands_on(), len(scene.shape_color)
         if isinstance(stands_on, Terrain):
             stands_on.add_to(scene)
         elif stands_on:
             scene.add_ground_plane()
-        self.model = scene.finalize(device=device)
+        scene.shape_color[first:] = [_GROUND] * (len(scene.shape_color) - first)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")  # nothing collides here
+            self.model = scene.finalize(device=device)
         self.state = self.model.state()
         self.robot_file = _robot_file(sketch, config)
 
