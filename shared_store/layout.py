@@ -67,6 +67,10 @@ class Run:
     def recordings(self) -> Path:
         return self.path / "recordings"
 
+    @property
+    def telemetry(self) -> Path:
+        return self.path / "telemetry"
+
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
 
@@ -78,7 +82,17 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "recordings", "logs", "outcomes", "parent", "teachers"):
+        for name in (
+            "checkpoints",
+            "metrics",
+            "evaluations",
+            "recordings",
+            "telemetry",
+            "logs",
+            "outcomes",
+            "parent",
+            "teachers",
+        ):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:

@@ -38,7 +38,7 @@ def main() -> int:
     )
     for rows in rollout.steps(episodes * rollout.task.max_episode_length):
         recording.write(rows, rollout.images())
-        if (rows.mark("episode") + rows.mark("done")).min() >= episodes:
+        if recording.complete(episodes):
             break
     path = recording.finish()
     print(

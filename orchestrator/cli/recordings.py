@@ -67,8 +67,9 @@ def record(
         client = connect()
         run, live = _find(client, source)
         if live is not None:
-            options = ["--worlds", str(worlds), "--episodes", str(episodes), "--output", str(output.absolute())]
-            raise typer.Exit(_worker("worker.telemetry.live", live, *options))
+            options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
+            given = [text for pair in options.items() for text in pair]
+            raise typer.Exit(_worker("worker.telemetry.live", run["path"], "--job", live, *given))
         section = Record(run=run["run"], checkpoint=_iteration(client, run, source), worlds=worlds, episodes=episodes)
         _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
 
@@ -118,7 +119,7 @@ def _check_output(path: Path, *endings: str) -> None:
 
 
 def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
-    """The run that is meant, and its directory where a job that is training now is meant. Raises ApiError, UsageError."""
+    """The run that is meant, and the job where one that is training now is meant. Raises ApiError, UsageError."""
     name = split_reference(source)[0]
     try:
         return client.get(f"/api/runs/{named(name)}"), None
@@ -131,7 +132,7 @@ def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
             raise (error if other.status == 404 else other) from None
     run: dict[str, Any] = detail["results"] or {}
     if detail["status"] in _RUNNING and detail["kind"] == "train" and "@" not in source:
-        return run, run.get("path")
+        return run, detail["id"]
     if not run.get("checkpoints"):
         raise UsageError(f"job {name} is {detail['status']} and its run has no checkpoint yet; there is nothing to see")
     return run, None

@@ -31,6 +31,7 @@ from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
 from worker.tasks.config import value_at
+from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
@@ -80,6 +81,7 @@ class Loop:
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
         self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
+        self.attending = Attending(job.run, self.task, self.gate) if gang.is_main else None
         self.state.saver.start()
         end_startup()
 
@@ -110,6 +112,8 @@ class Loop:
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:
+                if self.attending and self.attending.attend():
+                    self._collecting.release()  # the rollout is recorded anew, with the tap
                 record, signals = self._iterate()
                 if progress.iteration == self._kill_at:
                     die()
@@ -128,6 +132,8 @@ class Loop:
                 self.reporter.do(report.close)
             self.reporter.close()
             self.fence.close()
+            if self.attending:
+                self.attending.close()
 
     def close(self) -> None:
         """Leave the gang, and end what saves; nothing can be trained afterwards."""

@@ -75,6 +75,9 @@ class Recording:
         """Return and steps of each running episode."""
         self._poses: np.ndarray | None = None
         self.steps = self.episodes = self.lost = 0
+        self._ended = np.zeros(stage.worlds, np.int64)
+        self._whole = np.zeros(stage.worlds, bool)
+        """Whether each running episode was recorded from its first step on, without a gap."""
         try:
             self._file = self.partial.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
@@ -97,6 +100,8 @@ class Recording:
         """
         try:
             self.lost += rows.lost
+            if rows.lost:
+                self._whole[:] = False
             for step in range(len(rows)):
                 self._write_step(rows, step)
             for camera, seen in (images or {}).items():
@@ -109,6 +114,10 @@ class Recording:
                 self._flush()
         except OSError as error:
             raise self._full(error) from error
+
+    def complete(self, episodes: int) -> bool:
+        """Whether each world has ended so many episodes."""
+        return bool((self._ended >= episodes).all())
 
     def say(self, text: str, level: int = 20, name: str = "muster") -> None:
         """Add a line of the job's log, at the time of the last step."""
@@ -202,6 +211,8 @@ class Recording:
             "observation": rows.observations[step, world],
         }
         self._add(f"/{frame}/rl/step", messages.STEP, now, messages.encoded(messages.STEP, **fields))
+        if not self._sums[world, 1]:
+            self._whole[world] = done or fields["age"] == 1
         self._sums[world] += fields["reward"], 1
         if done:
             self._end_episode(world, fields)
@@ -210,6 +221,7 @@ class Recording:
         total, steps = self._sums[world]
         self._sums[world] = 0.0
         self.episodes += 1
+        self._ended[world] += 1
         cause = "time_out" if fields["time_out"] else "termination"
         known = {
             **self._facts,
@@ -218,6 +230,7 @@ class Recording:
             "return": f"{total:.6g}",
             "length": str(int(steps)),
             "end": cause,
+            "complete": "true" if self._whole[world] else "false",
         }
         self._writer.add_metadata("episode", known)
         self.say(
