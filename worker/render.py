@@ -31,7 +31,7 @@ def main() -> int:
 
     picture.check_film(ending)
     rollout = Rollout.of(run, job.section.get("checkpoint"), worlds)
-    stage = rollout.stage()
+    stage = rollout.stage(rollout.task.device)
     end_startup()
     rate = rollout.config.control_hz
     steps = max(1, round(seconds * rate))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -203,4 +204,6 @@ def _worker(module: str, *arguments: str) -> int:
     """Run a part of the worker on this machine, since this package never imports it; returns its exit code. Raises ServerError."""
     if find_spec("newton") is None:
         raise ServerError("this needs the simulation on this machine: pip install 'muster[worker]'")
-    return subprocess.run([sys.executable, "-P", "-m", module, *arguments], check=False).returncode
+    started = subprocess.Popen([sys.executable, "-P", "-m", module, *arguments])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for it: it completes its file
+    return started.wait()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint
+from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
@@ -35,6 +36,7 @@ from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
+    from worker.telemetry.picture import Glance
 
 
 EVALUATED = 256
@@ -355,7 +357,9 @@ class Loop:
             )
         self.beacon.tell(done=True)
         self._say(f"evaluating checkpoint {name}")
-        result = evaluate(self.held_out_worlds(), self.algorithm.policy(), self.gang, checkpoint=name)
+        worlds = self.held_out_worlds()
+        glance = self._glance(worlds)
+        result = evaluate(worlds, self.algorithm.policy(), self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:
             return
@@ -370,6 +374,25 @@ class Loop:
         self._say(f"last checkpoint: {self.job.run.checkpoints / name}")
         if plot:
             self._say(f"reward plot: {plot}")
+        if glance:
+            self._show(glance)
+
+    def _glance(self, worlds: Task) -> Glance | None:
+        """What looks on while the policy is evaluated, where a picture is wanted."""
+        if not self.gang.is_main or os.environ.get("MUSTER_PICTURE") == "0":
+            return None
+        from worker.telemetry.picture import Glance
+
+        return Glance(worlds)
+
+    def _show(self, glance: Glance) -> None:
+        """Write the picture. Whatever goes wrong with it, the training has succeeded."""
+        path = self.job.run.metrics / "policy.png"
+        try:
+            write_atomic(path, glance.picture(self.config))
+            self._say(f"picture of the policy: {path}")
+        except Exception as error:
+            self._say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
 
     def held_out_worlds(self) -> Task:
         """The worlds on which the policy is evaluated. All ranks call it.

@@ -20,6 +20,7 @@ import numpy as np
 from shared_store.files import DamagedFile, read_json, write_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
+from shared_store.metrics import history_of
 from worker.errors import UserError
 from worker.telemetry.attending import answer_of, is_alive, request_of
 from worker.telemetry.recording import Recording, recover
@@ -44,7 +45,9 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
     Raises:
         UserError: It can't be recorded; one line says why.
     """
-    segment, there = _attach(run, worlds, patience)
+    stop: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: stop.append(number))
+    segment, there = _attach(run, worlds, patience, stop)
     try:
         recording = _open(run, there, output, {"job": job})
         if there < worlds:
@@ -52,25 +55,21 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         log = LogFollower(run, job)
         for _ in log.drain():
             pass  # what was said before the recording began
-        stop: list[int] = []
-        before = signal.signal(signal.SIGINT, lambda number, _: stop.append(number))
         segment.skip()
-        try:
-            for rows in _rows(segment, there, stop):
-                recording.write(rows)
-                for line in log.poll():
-                    recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
-                if recording.complete(episodes):
-                    break
-        finally:
-            signal.signal(signal.SIGINT, before)
+        for rows in _rows(segment, there, stop):
+            recording.write(rows)
+            for line in log.poll():
+                recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
+            if recording.complete(episodes):
+                break
         recording.finish()
         return recording
     finally:
+        signal.signal(signal.SIGINT, before)
         request_of(run).unlink(missing_ok=True)  # the training sees that nobody reads any more
 
 
-def _attach(run: Run, worlds: int, patience: float) -> tuple[Segment, int]:
+def _attach(run: Run, worlds: int, patience: float, stop: list[int]) -> tuple[Segment, int]:
     """Ask for the tap; returns it, and how many worlds are to be read. Raises UserError."""
     request, answer = request_of(run), answer_of(run)
     try:
@@ -88,6 +87,8 @@ def _attach(run: Run, worlds: int, patience: float) -> tuple[Segment, int]:
                     f"run {run.name}: its training did not answer within {patience:.0f} s: it does not run on this machine, or not any "
                     f"more; record its newest checkpoint: muster record {run.name} -o FILE.mcap"
                 )
+            if stop:
+                raise UserError(f"run {run.name}: interrupted before its training answered; nothing was recorded")
             time.sleep(0.1)
         if "problem" in told:
             answer.unlink(missing_ok=True)
@@ -124,11 +125,14 @@ def _rows(segment: Segment, worlds: int, stop: list[int]) -> Iterator[Rows]:
 
 def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recording:
     """The recording, with what the run's description says of its training."""
+    import warp
+
     from worker.learning.job import configure, user_errors
     from worker.tasks import find_task
     from worker.telemetry.rollout import facts_of, job_attachment
     from worker.telemetry.stage import Stage
 
+    warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
     spec: dict[str, Any] = (run.description() or {}).get("spec") or {}
     train = spec.get("train")
     if not isinstance(train, dict) or not isinstance(train.get("task"), str):
@@ -136,8 +140,10 @@ def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recordi
     with user_errors():
         task_type = find_task(train["task"])
         stage = Stage(task_type, configure(task_type, train), worlds)
+    told = history_of(run).last() or {}
+    known = {**known, "iteration": str(told.get("iteration", 0)), "seed": str(train.get("seed", ""))}
     facts = facts_of(run, {"task": train["task"], "algorithm": train.get("algorithm", "ppo")})
-    return Recording(output, stage, {**facts, **known, "seed": str(train.get("seed", ""))}, job_attachment(run))
+    return Recording(output, stage, {**facts, **known}, job_attachment(run))
 
 
 def main() -> int:

@@ -9,6 +9,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import newton
 import numpy as np
@@ -18,10 +19,16 @@ from newton.sensors import SensorCamera
 from worker.errors import UserError
 from worker.simulation.camera import look
 from worker.telemetry.stage import Stage
+from worker.telemetry.tap import Reading, Tap
+
+if TYPE_CHECKING:
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
 
 FILMS = (".gif", ".mp4")
 MOMENTS = 6
 """Pictures beside each other in one that stands still."""
+_GLANCE_STEPS, _GLANCE_SECONDS = 4096, 2.0
 _FOV = 0.7
 """Vertical [rad]."""
 _VIEW = (-0.55, -0.78, 0.3)
@@ -128,6 +135,29 @@ class Camera:
         if not np.isfinite(least).all():
             return poses[0, 0, :3].copy(), 1.0
         return (least + most) / 2, float(np.linalg.norm(most - least)) / 2
+
+
+class Glance:
+    """A picture of what a policy does while it is evaluated: moments of the first episode of world 0.
+
+    Args:
+        task: The worlds; between here and :meth:`picture` they step.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._tap = Tap(task, 1, rows=min(task.max_episode_length + 1, _GLANCE_STEPS))
+        self._tap.open()
+
+    def picture(self, config: TaskConfig, width: int = 320, height: int = 180) -> bytes:
+        """:data:`MOMENTS` frames of that size as one PNG."""
+        rows = Reading(self._tap).take()
+        self._tap.close()
+        length = int(np.argmax(rows.mark("done")[:, 0])) if rows.mark("done").any() else len(rows)
+        span = max(1, min(length, round(_GLANCE_SECONDS * config.control_hz)))
+        camera = Camera(Stage(type(self._task), config, 1, self._task.device), width, height)
+        steps = np.linspace(0, span - 1, MOMENTS).round().astype(int)
+        return encode([strip([camera.take(rows.coordinates[step]) for step in steps])], ".png", 1.0)
 
 
 def strip(pictures: Sequence[np.ndarray], columns: int = 3) -> np.ndarray:

@@ -82,10 +82,10 @@ class Rollout:
             )
         return cls(run, checkpoint, config, task, policy, seed)
 
-    def stage(self) -> Stage:
+    def stage(self, device: str = "cpu") -> Stage:
         """What these worlds look like."""
         with user_errors():
-            return Stage(type(self.task), self.config, self.task.world_count)
+            return Stage(type(self.task), self.config, self.task.world_count, device)
 
     def steps(self, most: int) -> Iterator[Rows]:
         """Act for at most ``most`` control steps from a fresh reset; after each of them its row."""
