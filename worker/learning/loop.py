@@ -83,7 +83,6 @@ class Loop:
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
         self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
-        self.attending = Attending(job.run, self.task, self.gate) if gang.is_main else None
         self.state.saver.start()
         end_startup()
 
@@ -110,11 +109,12 @@ class Loop:
         """
         progress = self.state.progress
         report = Report(self.job, self.training.iterations, progress.iteration) if self.gang.is_main else None
+        attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
         self._say(self._beginning())
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:
-                if self.attending and self.attending.attend():
+                if attending and attending.attend():
                     self._collecting.release()  # the rollout is recorded anew, with the tap
                 record, signals = self._iterate()
                 if progress.iteration == self._kill_at:
@@ -134,8 +134,8 @@ class Loop:
                 self.reporter.do(report.close)
             self.reporter.close()
             self.fence.close()
-            if self.attending:
-                self.attending.close()
+            if attending:
+                attending.close()
 
     def close(self) -> None:
         """Leave the gang, and end what saves; nothing can be trained afterwards."""
