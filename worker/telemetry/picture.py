@@ -192,8 +192,8 @@ def encode(pictures: Sequence[np.ndarray], ending: str, rate: float) -> bytes:
     if ending == ".png":
         images[0].save(buffer, "PNG", optimize=True)
         return buffer.getvalue()
-    # one palette for all frames: otherwise colours flicker
-    palette = images[len(images) // 2].quantize(128)
+    # one palette for all frames, or colours would flicker; taken from some of them
+    palette = Image.fromarray(strip(pictures[:: max(1, len(pictures) // 8)])).quantize(128)
     small = [image.quantize(128, palette=palette, dither=Image.Dither.NONE) for image in images]
     small[0].save(buffer, "GIF", save_all=True, append_images=small[1:], duration=round(1000 / rate), loop=0)
     return buffer.getvalue()
