@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -317,7 +318,7 @@ def recover(partial: Path) -> tuple[Path, int]:
                         writer.add_attachment(*told)
                     elif isinstance(record, Metadata):
                         writer.add_metadata(record.name, record.metadata)
-            except (McapError, EOFError, ValueError, KeyError):
+            except (McapError, EOFError, ValueError, KeyError, struct.error):
                 pass  # here it was cut
             if not started:
                 raise UserError(f"{partial}: it does not begin as an MCAP file does; nothing can be recovered")
