@@ -58,10 +58,10 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     assert all(held[int(each["iteration"])] == each["policy_sha256"] for each in facts)
 
     picture = tmp_path / "policy.png"
-    size = ["--size", "80x60", "--worlds", "1", "--seconds", "0.5"]
+    size = ["--size", "96x64", "--worlds", "1", "--seconds", "0.5"]
     done = server.muster("render", job, "-o", str(picture), *size, timeout=300)
     assert done.returncode == 0, done.stderr + done.stdout
-    assert Image.open(picture).size == (3 * 80 + 4, 2 * 60 + 2)
+    assert Image.open(picture).size == (3 * 96 + 4, 2 * 64 + 2)
     assert not list(run.recordings.iterdir()), "what was brought to the user is not kept twice"
 
     iterations = sorted(held)
