@@ -39,7 +39,7 @@ from orchestrator.spec_values import (
 from shared_store.log_files import LEAST_LIMIT, LIMIT
 from shared_store.wording import explain, kind_of, nearest, path_of
 
-KINDS = ("train", "evaluate", "export", "command")
+KINDS = ("train", "evaluate", "export", "record", "render", "command")
 """What a job can do: exactly one of these keys is in a spec."""
 
 LONGEST_CHANGES = 24 << 10
@@ -168,6 +168,30 @@ class Export(_Section):
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
+class Record(_Section):
+    """Record a checkpoint's policy on a few worlds as an MCAP file."""
+
+    run: RunName
+    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    worlds: int = Field(default=4, ge=1, le=16, description="worlds that are recorded")
+    episodes: int = Field(default=2, ge=1, description="episodes of each world")
+    seed: int | None = Field(
+        default=None, ge=0, lt=2**31, description="of the worlds; not that of the training where absent"
+    )
+
+
+class Render(_Section):
+    """Film a checkpoint's policy."""
+
+    run: RunName
+    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    format: Literal["mp4", "gif", "png"] = Field(default="gif", description="png: six moments side by side")
+    worlds: int = Field(default=4, ge=1, le=16, description="worlds, side by side")
+    seconds: float = Field(default=6.0, gt=0, le=600, description="simulated")
+    width: int = Field(default=640, ge=64, le=4096, description="of a frame [px]")
+    height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
+
+
 class CheckpointPolicy(_Section):
     """When training is saved, and how many checkpoints are kept (the best one is always kept too)."""
 
@@ -209,6 +233,8 @@ class Spec(_Section):
     train: Train | None = None
     evaluate: Evaluate | None = None
     export: Export | None = None
+    record: Record | None = None
+    render: Render | None = None
     command: list[Argument] | None = Field(
         default=None, min_length=1, description="program and arguments, run on every node"
     )

@@ -67,6 +67,14 @@ class Run:
     def exports(self) -> Path:
         return self.path / "exports"
 
+    @property
+    def recordings(self) -> Path:
+        return self.path / "recordings"
+
+    @property
+    def telemetry(self) -> Path:
+        return self.path / "telemetry"
+
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
 
@@ -78,7 +86,18 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
-        for name in ("checkpoints", "metrics", "evaluations", "exports", "logs", "outcomes", "parent", "teachers"):
+        for name in (
+            "checkpoints",
+            "metrics",
+            "evaluations",
+            "exports",
+            "recordings",
+            "telemetry",
+            "logs",
+            "outcomes",
+            "parent",
+            "teachers",
+        ):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:

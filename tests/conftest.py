@@ -30,6 +30,9 @@ MUSTER = str(Path(sys.executable).parent / "muster")
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.
 os.environ.setdefault("WARP_CACHE_PATH", str(REPOSITORY / ".pytest_cache" / "kernels"))
 
+# A picture at the end of each training would take a second of every one of them; test_picture.py has one made.
+os.environ.setdefault("MUSTER_PICTURE", "0")
+
 
 def run_muster(
     *arguments: str, home: Path, timeout: float = 120, cwd: Path = REPOSITORY, **env: str

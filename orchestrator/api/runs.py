@@ -65,7 +65,7 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
     jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
     checkpoints = list_checkpoints(run)
     evaluation = _newest_evaluation(run, checkpoints)
-    plot = run.metrics / "reward.png"
+    plot, picture = run.metrics / "reward.png", run.metrics / "policy.png"
     return {
         "run": run.name,
         "path": str(run.path),
@@ -78,6 +78,7 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
         "iteration": checkpoints[-1].iteration if checkpoints else 0,
         "checkpoint": str(checkpoints[-1].path) if checkpoints else None,
         "plot": str(plot) if plot.exists() else None,
+        "picture": str(picture) if picture.exists() else None,
         "evaluation": evaluation,
         "parent": description.get("parent"),
     }

@@ -1,4 +1,4 @@
-"""The other runs that a job from YAML reads: those that it evaluates or exports, and the teacher that its policy imitates."""
+"""The other runs that a job from YAML reads: those that it evaluates, exports or shows, and the teacher that its policy imitates."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def _sources(spec: str) -> Iterator[Source]:
     except (ValueError, RecursionError):
         return  # refused where it is read
     sections = document if isinstance(document, dict) else {}
-    for kind in ("evaluate", "export"):
+    for kind in ("evaluate", "export", "record", "render"):
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield Source(section["run"], kind)

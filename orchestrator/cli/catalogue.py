@@ -62,6 +62,10 @@ ENTRIES = (
     ),
     Entry("checkpoint", "jobs", _RUNS, "Have a training job save now; returns when the checkpoint is durable."),
     Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify exit 1 where one is damaged."),
+    Entry("record", "recordings", _RUNS, "Record what a policy does as an MCAP file, for ROS 2's tools and viewers."),
+    Entry(
+        "render", "recordings", _RUNS, "Film what a checkpoint's policy does, or show six moments of it in a picture."
+    ),
     Entry(
         "verify-resume",
         "verify",

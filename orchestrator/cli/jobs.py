@@ -269,7 +269,9 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
-    facts |= {"checkpoint": results.get("checkpoint"), "plot": results.get("plot"), "directory": results.get("path")}
+    facts |= {name: results.get(name) for name in ("checkpoint", "plot", "picture")} | {
+        "directory": results.get("path")
+    }
     for name, value in facts.items():
         if value:
             console.print(f"  {name + ':':13} {value}", markup=False)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shared_store.checkpoints import Checkpoint
+from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
@@ -40,9 +41,11 @@ from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
 from worker.tasks.config import value_at
+from worker.telemetry.attending import Attending
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
+    from worker.telemetry.picture import Glance
 
 
 EVALUATED = 256
@@ -117,10 +120,13 @@ class Loop:
         """
         progress = self.state.progress
         report = Report(self.job, self.training.iterations, progress.iteration) if self.gang.is_main else None
+        attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
         self._say(self._beginning())
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:
+                if attending and attending.attend():
+                    self._collecting.release()  # the rollout is recorded anew, with the tap
                 record, signals = self._iterate()
                 if progress.iteration == self._kill_at:
                     die()
@@ -139,6 +145,8 @@ class Loop:
                 self.reporter.do(report.close)
             self.reporter.close()
             self.fence.close()
+            if attending:
+                attending.close()
 
     def close(self) -> None:
         """Leave the gang, and end what saves; nothing can be trained afterwards."""
@@ -360,7 +368,9 @@ class Loop:
             )
         self.beacon.tell(done=True)
         self._say(f"evaluating checkpoint {name}")
-        result = evaluate(self.held_out_worlds(), self.algorithm.policy(), self.gang, checkpoint=name)
+        worlds = self.held_out_worlds()
+        glance = self._glance(worlds)
+        result = evaluate(worlds, self.algorithm.policy(), self.gang, checkpoint=name)
         self._say(str(result))
         if not self.gang.is_main:
             return
@@ -375,6 +385,25 @@ class Loop:
         self._say(f"last checkpoint: {self.job.run.checkpoints / name}")
         if plot:
             self._say(f"reward plot: {plot}")
+        if glance:
+            self._show(glance)
+
+    def _glance(self, worlds: Task) -> Glance | None:
+        """What looks on while the policy is evaluated, where a picture is wanted."""
+        if not self.gang.is_main or os.environ.get("MUSTER_PICTURE") == "0":
+            return None
+        from worker.telemetry.picture import Glance
+
+        return Glance(worlds)
+
+    def _show(self, glance: Glance) -> None:
+        """Write the picture. Whatever goes wrong with it, the training has succeeded."""
+        path = self.job.run.metrics / "policy.png"
+        try:
+            write_atomic(path, glance.picture(self.config))
+            self._say(f"picture of the policy: {path}")
+        except Exception as error:
+            self._say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
 
     def held_out_worlds(self) -> Task:
         """The worlds on which the policy is evaluated. All ranks call it.

@@ -30,6 +30,8 @@ PHYSICS_FAILED = wp.constant(1)
 TERMINATED = wp.constant(2)
 """What ended an episode, in ``EpisodeArrays.causes``: the clock, physics that failed, or the task; of a declared task its first
 termination that did is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
+WATCHED = 16
+"""Of so many worlds at most, the first ones, each reward term of a step is kept for those who look on."""
 
 
 @wp.struct
@@ -46,6 +48,8 @@ class EpisodeArrays:
         ages: Steps on the clock of the running episode, shape ``(worlds,)``.
         sums: Return, steps lived and one sum a reward term of the running episode, shape ``(worlds, 2 + terms)``.
         random: Seed, global world index and number of streams drawn, shape ``(worlds, 3)``.
+        terms: Reward terms of the step, weighted, of the worlds that can be watched (:mod:`worker.telemetry`), which sets them to zero;
+            shape ``(min(WATCHED, worlds), terms)``.
         weights: Weight of each reward term, shape ``(terms,)``.
         level: How hard the task is to be now, from 0 to 1, as the curriculum says (1 without one), shape ``(1,)``.
         memory: What the task itself keeps from step to step, zero when an episode begins, shape ``(worlds, memory_size)``.
@@ -74,6 +78,7 @@ class EpisodeArrays:
     ages: wp.array(dtype=wp.int32)
     sums: wp.array2d(dtype=wp.float32)
     random: wp.array2d(dtype=wp.int32)
+    terms: wp.array2d(dtype=wp.float32)
     weights: wp.array(dtype=wp.float32)
     level: wp.array(dtype=wp.float32)
     memory: wp.array2d(dtype=wp.float32)
@@ -123,6 +128,8 @@ def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
     weighted = episodes.weights[term] * value
     episodes.rewards[world] = episodes.rewards[world] + weighted
     episodes.sums[world, TERMS + term] = episodes.sums[world, TERMS + term] + weighted
+    if world < episodes.terms.shape[0]:
+        episodes.terms[world, term] = weighted
 
 
 @wp.func

@@ -17,6 +17,7 @@ from worker.simulation.episodes import (
     NO_MISHAP,
     RESET,
     STEP,
+    WATCHED,
     EpisodeArrays,
     check_observations,
     randomize_ages,
@@ -40,7 +41,6 @@ class Task:
 
     Args:
         config: The task's configuration, of type ``config_type``.
-        world_count: Number of worlds.
         seed: Seed of all random numbers (any integer >= 0; 64 bits count).
         first_world: Global index of world 0. Random numbers are keyed by (seed, global index, draws so far), so N ranks
             with W / N worlds each see the worlds of one rank with W.
@@ -52,7 +52,6 @@ class Task:
     Attributes:
         world_count: Number of worlds.
         max_episode_length: Control steps after which the clock ends an episode.
-        device: As given.
         actions: What to do next, shape ``(worlds, action_size)``, or ``(worlds, 1)`` where they are choices; float32.
         observations: What the policy sees, shape ``(worlds, *observation_shape)``: float32, or uint8 where there is a camera.
         states: What ``observe`` writes, named by ``observation_names``, shape ``(worlds, states)``, float32: without a camera the
@@ -105,6 +104,7 @@ class Task:
     """Numbers that survive episodes, in ``episodes.lasting``."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
+    template: newton.ModelBuilder  # of a sketch
     _exact: tuple[wp.array, wp.array] | None = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
@@ -121,20 +121,14 @@ class Task:
         self.device = "cuda:0" if device == "cuda" else device
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
         self.first_world = first_world
-        template = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(template)
-        self.build(template)
+        template = self._template()
         self.action_size = len(self.action_names)
         self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.statistic_names: tuple[str, ...] = (
-            "episodes",
-            "episode_return",
-            "episode_length",
+            *("episodes", "episode_return", "episode_length"),
             *(f"reward_{name}" for name in self.reward_terms),
             *self.metric_names,
-            "nan_worlds",
-            "solver_overflows",
-            "squared_return",
+            *("nan_worlds", "solver_overflows", "squared_return"),
             *self.termination_names,
         )
         try:
@@ -176,20 +170,17 @@ class Task:
 
     @classmethod
     def sketch(cls, config: TaskConfig) -> Self:
-        """The task without any worlds: its names, and what a declared task's :attr:`plan` holds.
-
-        Args:
-            config: The task's configuration, of type ``config_type``.
-
-        Raises:
-            ValueError: The robot can't be read, or the declaration does not fit it.
-        """
+        """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError where nothing fits."""
         task = cls.__new__(cls)
         task.config = config
+        task.template = task._template()
+        return task
+
+    def _template(self) -> newton.ModelBuilder:
         template = newton.ModelBuilder()
         SolverMuJoCo.register_custom_attributes(template)
-        task.build(template)
-        return task
+        self.build(template)
+        return template
 
     def build(self, builder: newton.ModelBuilder) -> None:
         """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
@@ -240,6 +231,13 @@ class Task:
         self.actions.copy_(actions)
         for launch in self._steps:
             launch()
+
+    def watch(self, look: Callable[[], None] | None) -> None:
+        """Have ``look`` called after every control step, in place of what was called before; None: nothing. It has run once before.
+
+        It launches kernels alone, which write nothing that the task reads. Whoever holds a graph of :meth:`step` records it anew.
+        """
+        self._steps[len(self._parts()) :] = [] if look is None else [CapturedStep(look, self.device).launch]
 
     def reset(self) -> None:
         """Begin a new episode, from fresh random numbers, in every world."""
@@ -356,6 +354,7 @@ class Task:
         self.episode_length = buffer("ages", (count,), wp.int32)
         self._sums = buffer("sums", (count, 2 + len(self.reward_terms) + len(self.metric_names)), wp.float32)
         self._random = buffer("random", (count, 3), wp.int32)
+        buffer("terms", (min(WATCHED, count), len(self.reward_terms)), wp.float32)
         self._memory = buffer("memory", (count, self.memory_size), wp.float32)
         self._lasting = buffer("lasting", (count, self.lasting_size), wp.float32)
         self._last_actions = buffer("last_actions", tuple(self.actions.shape), wp.float32)

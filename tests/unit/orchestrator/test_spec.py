@@ -46,7 +46,7 @@ LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digi
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
 TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, Quadruped"
 TOP = (
-    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, command, environment, image, checkpoint, logs, retry, "
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, record, render, command, environment, image, checkpoint, logs, retry, "
     "on_child_failure, timeout, stall_timeout"
 )
 
@@ -74,9 +74,9 @@ MISSING = {
     "- a\n": "job.yaml: expected a mapping of keys such as name, nodes, train; found a list",
     "text": "job.yaml: expected a mapping of keys such as name, nodes, train; found a text ('text')",
     "command: [x]\n": "job.yaml: name: is required",
-    "name: a\n": "job.yaml: expected exactly one of train, evaluate, export, command; found none",
+    "name: a\n": "job.yaml: expected exactly one of train, evaluate, export, record, render, command; found none",
     f"{COMMAND}{TRAIN}\n": (
-        "job.yaml: expected exactly one of train, evaluate, export, command; found train and command"
+        "job.yaml: expected exactly one of train, evaluate, export, record, render, command; found train and command"
     ),
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": "job.yaml:2: train.task: is required",
     "name: a\nevaluate: {}\n": "job.yaml:2: evaluate.run: is required",

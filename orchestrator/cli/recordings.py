@@ -1,0 +1,209 @@
+"""``muster record`` and ``muster render``: see what a policy does."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.cli.clones import split_reference
+from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.serving import CpusOption, StoreOption, controller
+from orchestrator.cli.terminal import echo
+from orchestrator.client import Client, named
+from orchestrator.errors import ApiError, ServerError, UsageError
+from orchestrator.spec import Record, Render, Resources, Retry, Spec
+
+SourceArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="RUN[@ITERATION|@best] | JOB",
+        help="Of a run: its newest checkpoint, that of an iteration, or the one with the best score.",
+    ),
+]
+OutOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file that is made.", show_default=False)]
+_RUNNING = ("STARTING", "RUNNING")
+
+
+def register(app: typer.Typer) -> None:
+    app.command(epilog="Example:  muster record ant-1f2e3d4c@best -o ant.mcap --worlds 4 --episodes 2")(record)
+    app.command(epilog="Example:  muster render ant-1f2e3d4c -o gait.gif --seconds 6")(render)
+
+
+def record(
+    source: SourceArgument = None,
+    output: OutOption = None,
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds.")] = 4,
+    episodes: Annotated[int, typer.Option(min=1, help="Of each world.")] = 2,
+    recover: Annotated[
+        Path | None,
+        typer.Option(
+            help="Make a readable file of a .mcap.partial that was cut short; nothing is recorded.", metavar="FILE"
+        ),
+    ] = None,
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+) -> None:
+    """Record what a policy does as an MCAP file, for ROS 2's tools and viewers.
+
+    Foxglove, Lichtblick, PlotJuggler and Rerun open it. Of a RUN, a checkpoint's policy acts with its mean action on fresh worlds, in a job of its own. Of a JOB that is training on this
+    machine, the worlds of its main rank are recorded as they train.
+    """
+    if recover is not None:
+        if source is not None or output is not None:
+            raise UsageError("--recover: give the cut file alone; the recovered one lies beside it")
+        raise typer.Exit(_worker("worker.telemetry.live", "--recover", str(recover)))
+    if source is None or output is None:
+        raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
+    _check_output(output, ".mcap")
+    with controller(store, cpus) as connect:
+        client = connect()
+        run, live = _find(client, source)
+        if live is not None:
+            options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
+            given = [text for pair in options.items() for text in pair]
+            raise typer.Exit(_worker("worker.telemetry.live", run["path"], "--job", live, *given))
+        section = Record(run=run["run"], checkpoint=_iteration(client, run, source), worlds=worlds, episodes=episodes)
+        _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
+
+
+def render(
+    source: SourceArgument,
+    output: OutOption,
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds, side by side.")] = 4,
+    seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
+    size: Annotated[str, typer.Option(help="Width and height of a frame [px].")] = "640x360",
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+) -> None:
+    """Film what a checkpoint's policy does, or show six moments of it in a picture.
+
+    The ending of the file says which: .mp4 and .gif are films, .png is a picture.
+    """
+    if source is None or output is None:
+        raise UsageError("give a run, and -o FILE.gif (or .mp4, .png)")
+    _check_output(output, ".gif", ".mp4", ".png")
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
+    if not found:
+        raise UsageError(f"--size {size}: expected WIDTHxHEIGHT, such as 640x360")
+    with controller(store, cpus) as connect:
+        client = connect()
+        run, _ = _find(client, source)
+        values: dict[str, Any] = {"run": run["run"], "checkpoint": _iteration(client, run, source), "worlds": worlds}
+        values |= {"seconds": seconds, "width": int(found[1]), "height": int(found[2])}
+        try:
+            section = Render.model_validate({**values, "format": output.suffix[1:]})
+        except ValueError:
+            raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels") from None
+        _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
+
+
+def _check_output(path: Path, *endings: str) -> None:
+    """Refuse what can't be written before anything runs. Raises UsageError."""
+    if path.is_dir():
+        raise UsageError(f"-o {path}: it is a directory; name a file in it, such as {path / ('policy' + endings[0])}")
+    if path.suffix not in endings:
+        raise UsageError(f"-o {path}: the ending says what it is to be: {', '.join(endings)}")
+    above = path.absolute().parent
+    if not above.is_dir():
+        raise UsageError(f"-o {path}: there is no directory {above}; create it first")
+    if not os.access(above, os.W_OK):
+        raise UsageError(f"-o {path}: {above} can't be written to; choose another directory")
+
+
+def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
+    """The run that is meant, and the job where one that is training now is meant. Raises ApiError, UsageError."""
+    name = split_reference(source)[0]
+    try:
+        return client.get(f"/api/runs/{named(name)}"), None
+    except ApiError as error:
+        if error.status != 404:
+            raise
+        try:
+            detail = client.get(f"/api/jobs/{named(name)}")
+        except ApiError as other:
+            raise (error if other.status == 404 else other) from None
+    run: dict[str, Any] = detail["results"] or {}
+    if detail["status"] in _RUNNING and detail["kind"] == "train" and "@" not in source:
+        return run, detail["id"]
+    if not run.get("checkpoints"):
+        raise UsageError(f"job {name} is {detail['status']} and its run has no checkpoint yet; there is nothing to see")
+    return run, None
+
+
+def _iteration(client: Client, run: dict[str, Any], source: str) -> int | None:
+    """The checkpoint that is meant, None: the newest. Raises UsageError where there is none."""
+    wanted = split_reference(source)[1]
+    there = client.get(f"/api/runs/{named(run['run'])}/checkpoints")
+    if not there:
+        raise UsageError(f"run {run['run']} has no checkpoint yet; train it first")
+    if wanted is None:
+        return None
+    iterations = [each["iteration"] for each in there]
+    if wanted == "best":
+        scored = [each for each in there if each.get("score") is not None]
+        if not scored:
+            raise UsageError(
+                f"run {run['run']} has no checkpoint with a score; there are: {', '.join(map(str, iterations))}"
+            )
+        best: int = max(scored, key=lambda each: each["score"])["iteration"]
+        return best
+    if wanted not in iterations:
+        closest = min(iterations, key=lambda each: abs(each - int(wanted)))
+        raise UsageError(f"run {run['run']} has no checkpoint of iteration {wanted}; the nearest is {closest}")
+    return int(wanted)
+
+
+def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
+    """What the job has of the one that trained: its queue, image and environment; a CPU is enough."""
+    spec = run.get("spec") or {}
+    kept = {key: spec[key] for key in ("queue", "share", "image", "environment") if spec.get(key)}
+    memory = (spec.get("resources") or {}).get("memory", 2048)
+    cpus = min(1.0, (spec.get("resources") or {}).get("cpus", 1.0))
+    resources = Resources(cpus=cpus, memory=max(memory, 2048))
+    return {"name": f"{run['run'][:100]}-{kind}", "resources": resources, "retry": Retry(attempts=1), **kept}
+
+
+def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> None:
+    """Run the job and bring what it made to ``output``. Raises typer.Exit, ServerError."""
+    job = submit_spec(client, spec, spec.name)["jobId"]
+    for line in client.logs(job, follow=True):
+        if line["rank"] is not None and line["text"].startswith(("recorded: ", "rendered: ", "compiling ")):
+            echo(line["text"])
+    detail = client.get(f"/api/jobs/{job}")
+    if detail["status"] != "SUCCEEDED":
+        raise ServerError(f"{spec.name} failed: {detail['statusReason']}")
+    made = list((Path(run["path"]) / "recordings").glob(f"*-{job[:8]}{output.suffix}"))
+    if not made:
+        echo(
+            f"made in the run's directory {run['path']}/recordings, which can't be seen from this machine: *-{job[:8]}{output.suffix}"
+        )
+        return
+    hidden = output.with_name(f".{output.name}.{job[:8]}.tmp")
+    try:
+        shutil.copyfile(made[0], hidden)
+        os.replace(hidden, output)
+        made[0].unlink(missing_ok=True)
+    except OSError as error:
+        hidden.unlink(missing_ok=True)
+        raise ServerError(
+            f"-o {output}: it can't be written ({error.strerror or error}); it lies at {made[0]}"
+        ) from None
+    echo(f"written: {output}")
+
+
+def _worker(module: str, *arguments: str) -> int:
+    """Run a part of the worker on this machine, since this package never imports it; returns its exit code. Raises ServerError."""
+    if find_spec("newton") is None:
+        raise ServerError("this needs the simulation on this machine: pip install 'muster[worker]'")
+    started = subprocess.Popen([sys.executable, "-P", "-m", module, *arguments])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for it: it completes its file
+    return started.wait()

@@ -1,0 +1,82 @@
+"""A training is recorded as it runs, its checkpoint afterwards, and a picture of it is made: all through the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from mcap.reader import make_reader
+from PIL import Image
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Store
+from tests.conftest import Serving, wait_for
+
+SMALL = {
+    "nodes": 1,
+    "train.worlds": 8,
+    "train.iterations": 1000000,
+    "train.config": {"episode_seconds": 0.5},
+    "checkpoint.every": 50,
+    "train.ppo.hidden_sizes": [8],
+    "train.ppo.steps": 8,
+}
+"""Episodes of 30 steps."""
+
+
+def episodes(path: Path) -> list[dict[str, str]]:
+    with path.open("rb") as file:
+        return [each.metadata for each in make_reader(file).iter_metadata() if each.name == "episode"]
+
+
+def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving, tmp_path: Path) -> None:
+    options = [part for key, value in SMALL.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    job = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)["jobId"]
+    run = Store(server.home / "store").run(server.detail(job)["run"])
+    wait_for(lambda: list_checkpoints(run), timeout=300, what="the first checkpoint")
+
+    live = tmp_path / "live.mcap"
+    done = server.muster("record", job, "-o", str(live), "--worlds", "2", "--episodes", "2", timeout=180)
+    assert done.returncode == 0, done.stderr
+    known = episodes(live)
+    assert {each["world"] for each in known} == {"0", "1"} and {each["job"] for each in known} == {job}
+    assert all(each["length"] == "30" for each in known if each["complete"] == "true" and each["end"] == "time_out")
+    assert not list(run.telemetry.iterdir()) and server.detail(job)["status"] == "RUNNING"
+    with live.open("rb") as file:
+        assert any(b"iteration" in message.data for _, _, message in make_reader(file).iter_messages("/rosout"))
+
+    stopped = server.muster("stop", job, timeout=180)
+    assert stopped.returncode == 0, stopped.stderr
+    file = tmp_path / "policy.mcap"
+    done = server.muster("record", f"{run.name}@best", "-o", str(file), "--worlds", "2", "--episodes", "1", timeout=180)
+    assert done.returncode == 0, done.stderr + done.stdout
+    facts = episodes(file)
+    assert [(each["world"], each["complete"], each["run"]) for each in facts] == [
+        (world, "true", run.name) for world in sorted(each["world"] for each in facts)
+    ]
+    held = {each.iteration: each.manifest["files"]["learner.pt"]["sha256"] for each in list_checkpoints(run)}
+    assert all(held[int(each["iteration"])] == each["policy_sha256"] for each in facts)
+
+    picture = tmp_path / "policy.png"
+    size = ["--size", "96x64", "--worlds", "1", "--seconds", "0.5"]
+    done = server.muster("render", job, "-o", str(picture), *size, timeout=300)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert Image.open(picture).size == (3 * 96 + 4, 2 * 64 + 2)
+    assert not list(run.recordings.iterdir()), "what was brought to the user is not kept twice"
+
+    iterations = sorted(held)
+    refused = {
+        ("record", "nothing", "-o", "x.mcap"): "run nothing does not exist",
+        ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; the nearest is {iterations[0]}",
+        ("record", run.name, "-o", str(tmp_path)): "it is a directory; name a file in it",
+        ("record", run.name, "-o", str(tmp_path / "no" / "x.mcap")): f"there is no directory {tmp_path / 'no'}",
+        ("record", run.name, "-o", "x.bag"): "the ending says what it is to be: .mcap",
+        ("record", run.name): "give a run or a job, and -o FILE.mcap",
+        ("record", "--recover", str(tmp_path / "x.mcap.partial")): "there is no such file",
+        ("render", run.name, "-o", "x.avi"): "the ending says what it is to be: .gif, .mp4, .png",
+        ("render", run.name, "-o", "x.gif", "--size", "big"): "expected WIDTHxHEIGHT, such as 640x360",
+    }
+    for arguments, words in refused.items():
+        done = server.muster(*arguments)
+        assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
+        assert len(done.stderr.strip().splitlines()) == 1

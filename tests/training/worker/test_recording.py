@@ -1,0 +1,257 @@
+"""Recordings, as readers that are not Muster's see them; one that is cut short by SIGKILL, and one for which there is no space."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.support.waiting import wait_for
+from worker.errors import UserError
+from worker.tasks.cartpole import Cartpole
+from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.telemetry.recording import Recording, recover
+from worker.telemetry.rows import Rows
+from worker.telemetry.stage import Stage
+from worker.telemetry.tap import Reading, Tap
+
+torch.set_num_threads(1)
+REPOSITORY = Path(__file__).parents[3]
+CONFIG = CartpoleConfig(episode_seconds=0.2)
+"""Episodes of 12 steps."""
+STEPS = 30
+
+
+class Recorded:
+    """A recording of two worlds, with what went into it."""
+
+    def __init__(self, path: Path) -> None:
+        task, self.stage = Cartpole(CONFIG, 2, seed=3), Stage(Cartpole, CONFIG, 2)
+        tap = Tap(task, 2, rows=64)
+        tap.open()
+        reading = Reading(tap)
+        image = np.zeros((2, 8, 16, 3), np.uint8)
+        image[1, 2, 5] = (255, 128, 0)
+        recording = Recording(path, self.stage, {"run": "taught", "seed": "3"}, {"job.json": b"{}"})
+        self.rows: list[Rows] = []
+        for number in range(STEPS):
+            task.step(torch.full((2, 1), 0.1))
+            self.rows.append(reading.take())
+            recording.write(self.rows[-1], {"eye": image} if number == 0 else None)
+        self.path = recording.finish()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    return Recorded(tmp_path_factory.mktemp("recorded") / "two.mcap")
+
+
+@pytest.fixture(scope="module")
+def messages(recorded: Recorded) -> dict[str, list[Any]]:
+    """By topic, decoded by mcap-ros2-support, which shares no code with what wrote them."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    found: dict[str, list[Any]] = {}
+    with recorded.path.open("rb") as file:
+        for decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            found.setdefault(decoded.channel.topic, []).append(decoded.decoded_message)
+    return found
+
+
+def test_joints_and_steps_read_as_the_tap_saw_them(recorded: Recorded, messages: dict[str, list[Any]]) -> None:
+    joints, taken = messages["/world_1/joint_states"], messages["/world_1/rl/step"]
+    assert len(joints) == len(taken) == STEPS
+    for number, rows in enumerate(recorded.rows):
+        assert joints[number].name == ["slider", "hinge"]
+        np.testing.assert_array_equal(joints[number].position, rows.coordinates[0, 1].astype(float))
+        np.testing.assert_array_equal(joints[number].velocity, rows.velocities[0, 1].astype(float))
+        step = taken[number]
+        assert (step.world, step.age, step.done) == (1, rows.mark("age")[0, 1], bool(rows.mark("done")[0, 1]))
+        assert step.reward_names == list(Cartpole.reward_terms) and step.action_names == ["slider"]
+        assert step.observation_names == ["slider_position", "hinge_position", "slider_velocity", "hinge_velocity"]
+        np.testing.assert_array_equal(np.float32(step.observation), rows.observations[0, 1])
+        np.testing.assert_array_equal(np.float32(step.reward_terms), rows.terms[0, 1])
+        assert np.float32(step.reward) == rows.rewards[0, 1]
+
+
+def test_times_are_simulated_ones_on_the_time_of_day(messages: dict[str, list[Any]]) -> None:
+    stamps = [step.header.stamp.sec * 10**9 + step.header.stamp.nanosec for step in messages["/world_0/rl/step"]]
+    np.testing.assert_allclose(np.diff(stamps), 1e9 / 60.0, atol=1.0)
+    assert stamps[0] > 1_700_000_000 * 10**9
+
+
+def test_every_link_has_its_frame_in_a_world_of_its_own(recorded: Recorded, messages: dict[str, list[Any]]) -> None:
+    apart = {each.child_frame_id: each for each in messages["/tf_static"][0].transforms}
+    assert [(name, each.header.frame_id, each.transform.translation.y) for name, each in apart.items()] == [
+        ("world_0", "world", -1.5),
+        ("world_1", "world", 1.5),
+    ]
+    for number, message in enumerate(messages["/tf"]):
+        frames = {each.child_frame_id: each for each in message.transforms}
+        assert list(frames) == ["world_0/cart", "world_0/pole", "world_1/cart", "world_1/pole"]
+        slider, hinge = recorded.rows[number].coordinates[0, 1].tolist()
+        pole = frames["world_1/pole"]
+        assert pole.header.frame_id == "world_1"
+        where, turn = pole.transform.translation, pole.transform.rotation
+        # the pole hangs on the cart, 1 m above the ground, and turns about y
+        np.testing.assert_allclose([where.x, where.y, where.z], [slider, 0.0, 1.0], atol=1e-6)
+        np.testing.assert_allclose(
+            [turn.x, turn.y, turn.z, turn.w], [0.0, np.sin(hinge / 2), 0.0, np.cos(hinge / 2)], atol=1e-6
+        )
+
+
+def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]) -> None:
+    (scene,) = messages["/world_0/scene"]
+    entities = {entity.frame_id: entity for entity in scene.entities}
+    assert set(entities) == {"world_0", "world_0/cart", "world_0/pole"} and entities["world_0/cart"].frame_locked
+    (model,) = entities["world_0/cart"].models
+    assert model.media_type == "model/gltf-binary" and model.url == ""
+    cart = trimesh.load(io.BytesIO(bytes(model.data)), file_type="glb")
+    # a box of 0.4 x 0.24 x 0.16 m; glTF's y is up
+    np.testing.assert_allclose(cart.bounds, [[-0.2, -0.08, -0.12], [0.2, 0.08, 0.12]], atol=1e-6)
+
+
+def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]]) -> None:
+    from PIL import Image
+
+    (message,) = messages["/world_1/eye/image/compressed"]
+    pixels = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
+    assert message.format == "png" and pixels.shape == (8, 16, 3)
+    assert pixels[2, 5].tolist() == [255, 128, 0] and pixels.sum() == 383
+
+
+def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached(recorded: Recorded) -> None:
+    from mcap.reader import make_reader
+
+    with recorded.path.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        episodes = [each.metadata for each in reader.iter_metadata() if each.name == "episode"]
+        attached = {each.name: each.data for each in reader.iter_attachments()}
+    assert [(each["world"], each["episode"], each["length"], each["end"]) for each in episodes] == [
+        (world, episode, "12", "time_out") for episode in "01" for world in "01"
+    ]
+    assert {(each["run"], each["seed"], each["complete"]) for each in episodes} == {("taught", "3", "true")}
+    rewards = sum(float(rows.rewards[0, 0]) for rows in recorded.rows[:12])
+    assert float(episodes[0]["return"]) == pytest.approx(rewards, rel=1e-5)
+    assert attached["job.json"] == b"{}"
+    assert attached["robot.xml"] == (REPOSITORY / "worker/tasks/cartpole.xml").read_bytes()
+
+
+def test_ros_2_s_reader_in_python_opens_the_file(recorded: Recorded) -> None:
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([recorded.path]) as reader:
+        kinds = {each.topic: each.msgtype for each in reader.connections}
+        assert kinds["/world_0/rl/step"] == "muster_msgs/msg/Step" and kinds["/tf"] == "tf2_msgs/msg/TFMessage"
+        wanted = [each for each in reader.connections if each.topic == "/world_0/rl/step"]
+        read = [reader.deserialize(raw, each.msgtype) for each, _, raw in reader.messages(connections=wanted)]
+    assert [step.age for step in read] == [rows.mark("age")[0, 0] for rows in recorded.rows]
+
+
+def test_rerun_finds_nothing_wrong_with_the_file(recorded: Recorded, tmp_path: Path) -> None:
+    rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    if rerun is None:
+        pytest.skip("rerun-sdk (the extra [viz], 170 MB) is not installed: Rerun has not read the recording")
+    checked = subprocess.run([rerun, "mcap", "check", recorded.path], capture_output=True, text=True, check=True)
+    assert len([line for line in checked.stdout.splitlines() if line.startswith("ok")]) == 11, checked.stdout
+    subprocess.run(
+        [rerun, "mcap", "convert", recorded.path, "-o", tmp_path / "two.rrd"], check=True, capture_output=True
+    )
+    assert (tmp_path / "two.rrd").stat().st_size > 10_000
+
+
+FOR_EVER = """
+import sys
+from pathlib import Path
+import torch
+import warp
+warp.config.log_level = warp.LOG_WARNING
+from tests.training.worker.test_recording import CONFIG, Cartpole, Reading, Recording, Stage, Tap, UserError
+task = Cartpole(CONFIG, 2, seed=3)
+tap = Tap(task, 2)
+tap.open()
+reading = Reading(tap)
+try:
+    recording = Recording(Path(sys.argv[1]), Stage(Cartpole, CONFIG, 2), {}, {})
+    while True:
+        task.step(torch.zeros(2, 1))
+        recording.write(reading.take())
+except UserError as error:
+    print(error)
+"""
+
+
+def recording_process(path: Path, before: str = "") -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", before + FOR_EVER, str(path)], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
+    )
+
+
+def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path, partial = tmp_path / "cut.mcap", tmp_path / "cut.mcap.partial"
+    process = recording_process(path)
+    begun = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
+    flushed = wait_for(
+        lambda: (size := partial.stat().st_size) > begun + 20_000 and size, 60, "some steps that were flushed"
+    )
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not path.exists()
+    with partial.open("ab") as file:  # as a write that was cut off in the middle of a record
+        file.write(b"\x06" + (1 << 20).to_bytes(8, "little") + b"cut")
+    cut = partial.read_bytes()
+    assert len(cut) > flushed
+    done = subprocess.run(
+        [sys.executable, "-m", "worker.telemetry.live", "--recover", str(partial)],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert str(path) in done.stdout and partial.read_bytes() == cut
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        topics = {
+            channel.topic: summary.statistics.channel_message_counts[key] for key, channel in summary.channels.items()
+        }
+        assert len([each for each in reader.iter_metadata()]) > 0
+    assert topics["/tf"] > 20 and topics["/tf"] - topics["/world_1/rl/step"] in (0, 1)
+    assert topics["/world_0/scene"] == 1
+    with pytest.raises(UserError, match="exists already; move it away first"):
+        recover(partial)
+
+
+def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_what_it_has(tmp_path: Path) -> None:
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
+    process = recording_process(tmp_path / "full.mcap", limit)
+    said, _ = process.communicate()
+    assert process.returncode == 0
+    (said,) = [line for line in said.splitlines() if "Warp" not in line]
+    assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
+    path, count = recover(tmp_path / "full.mcap.partial")
+    assert count > 20 and path == tmp_path / "full.mcap" and not os.path.exists(tmp_path / ".full.mcap.tmp")
+
+
+def test_what_is_no_recording_is_not_recovered(tmp_path: Path) -> None:
+    (tmp_path / "text.mcap.partial").write_text("no recording")
+    with pytest.raises(UserError, match="does not begin as an MCAP file does"):
+        recover(tmp_path / "text.mcap.partial")
+    with pytest.raises(UserError, match="there is no such file"):
+        recover(tmp_path / "nothing.mcap.partial")
+    assert [each.name for each in tmp_path.iterdir()] == ["text.mcap.partial"]

@@ -1,0 +1,53 @@
+"""``python -m worker.record``: record a checkpoint's policy on fresh worlds as an MCAP file.
+
+It writes ``recordings/<checkpoint>-<job>.mcap`` of the run that the job names; its directory entry appears when the file is whole.
+"""
+
+from __future__ import annotations
+
+import os
+
+from worker.errors import UserError
+from worker.learning.job import Job, end_startup, run_command
+
+
+def main() -> int:
+    """Record on rank 0; the other ranks, if any, have nothing to do."""
+    job = Job.from_env(os.environ, "record")
+    if int(os.environ.get("RANK") or 0):
+        return 0
+    run, worlds, episodes = job.named_run(), job.setting("worlds", 4), job.setting("episodes", 2)
+    from worker.distributed import use_cpu_threads
+
+    use_cpu_threads(os.environ)
+    from worker.telemetry.recording import Recording
+    from worker.telemetry.rollout import Rollout
+
+    seed = job.setting("seed", 0, least=0) if "seed" in job.section else None
+    rollout = Rollout.of(run, job.section.get("checkpoint"), worlds, seed)
+    stage = rollout.stage()
+    end_startup()
+    try:
+        run.recordings.mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{run.recordings}: it can't be made ({error.strerror or error})") from error
+    target = run.recordings / f"{rollout.checkpoint.name}-{(job.id or 'job')[:8]}.mcap"
+    recording = Recording(target, stage, rollout.facts(), rollout.attachments())
+    recording.say(
+        f"checkpoint {rollout.checkpoint.name} of run {run.name}: {worlds} worlds, {episodes} episodes of each"
+    )
+    for rows in rollout.steps(episodes * rollout.task.max_episode_length):
+        recording.write(rows, rollout.images())
+        if recording.complete(episodes):
+            break
+    path = recording.finish()
+    print(
+        f"recorded: {recording.steps} steps, {recording.episodes} episodes, {path.stat().st_size / 1e6:.1f} MB",
+        flush=True,
+    )
+    print(f"written: {path}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)

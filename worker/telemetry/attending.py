@@ -1,0 +1,145 @@
+"""The training's side of a live recording: a thread that sees a request, and brings the tap's rows to the one who asked.
+
+A reader puts ``telemetry/request.json`` into the run's directory and finds the answer in ``telemetry/tap.json``. Both are on one
+machine: the rows go through its memory. Until somebody asks nothing is tapped; from then on the tap fills its ring to the end of the
+training, and the thread works while the reader lives.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shared_store.files import read_json, write_json
+from shared_store.layout import Run
+from worker.learning.reporter import Gate
+from worker.simulation.episodes import WATCHED
+from worker.telemetry.segment import Segment
+from worker.telemetry.tap import Reading, Tap
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+LOOK_SECONDS = 1.0
+"""Between two looks for a request."""
+DRAIN_SECONDS = 0.02
+"""Between two looks at the tap, while somebody reads."""
+
+
+def request_of(run: Run) -> Path:
+    """Where a reader asks."""
+    return run.telemetry / "request.json"
+
+
+def answer_of(run: Run) -> Path:
+    """Where the training answers."""
+    return run.telemetry / "tap.json"
+
+
+def is_alive(host: object, process: object) -> bool:
+    """Whether a process of this machine runs; of another machine nobody here knows, which counts as no."""
+    if host != socket.gethostname() or not isinstance(process, int) or process <= 0:
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass  # another user's
+    return True
+
+
+class Attending:
+    """Of the main rank. :meth:`attend` belongs to the training's thread, everything else to its own.
+
+    Args:
+        run: The run.
+        task: Its worlds on this rank.
+        gate: Which keeps this thread from the interpreter while the training's needs it.
+    """
+
+    def __init__(self, run: Run, task: Task, gate: Gate) -> None:
+        self._run, self._task, self._gate = run, task, gate
+        self._tap: Tap | None = None
+        self._wanted = 0
+        """Worlds that a request asks for and the tap does not have yet."""
+        self._segment: Segment | None = None
+        self._reader: tuple[object, object] = ("", 0)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
+        self._thread.start()
+
+    def attend(self) -> bool:
+        """Between two iterations: open the tap where somebody has asked for it; returns whether graphs have to be recorded anew."""
+        if not self._wanted:
+            return False
+        tap = Tap(self._task, self._wanted)
+        tap.open()
+        self._tap, self._wanted = tap, 0
+        return True
+
+    def close(self) -> None:
+        """The training is over; the reader is told."""
+        self._over.set()
+        self._thread.join(5.0)
+
+    def _work(self) -> None:
+        reading: Reading | None = None
+        waited = 0.0
+        while not self._over.wait(DRAIN_SECONDS if self._segment else LOOK_SECONDS):
+            # a volume that is away for a while, memory that is short: training goes on, and the reader says what it misses
+            with contextlib.suppress(OSError, ValueError):
+                if self._segment is None:
+                    reading = self._answer()
+                    continue
+                assert reading is not None
+                self._gate.wait()
+                rows = reading.take()
+                if len(rows):
+                    self._segment.append(rows)
+                waited += DRAIN_SECONDS
+                if waited >= LOOK_SECONDS:
+                    waited = 0.0
+                    if not is_alive(*self._reader):
+                        self._leave()
+        with contextlib.suppress(OSError, ValueError):
+            if self._segment is not None and reading is not None:
+                self._segment.append(reading.take())
+                self._leave()
+
+    def _answer(self) -> Reading | None:
+        """Answer a request once the tap has as many worlds as it asks for."""
+        request = read_json(request_of(self._run))
+        if request is None or answer_of(self._run).exists():
+            return None
+        if not is_alive(request.get("host"), request.get("process")):
+            if request.get("host") != socket.gethostname():
+                self._say(
+                    problem=f"the training runs on {socket.gethostname()}, and its rows do not leave that machine"
+                )
+            return None
+        asked = request.get("worlds")
+        worlds = min(max(1, asked if isinstance(asked, int) else 1), WATCHED, self._task.world_count)
+        if self._tap is None or self._tap.layout.worlds < worlds:
+            self._wanted = worlds
+            return None
+        reading = Reading(self._tap)
+        reading.next = int(self._tap.count)
+        segment = Segment.create(self._tap.layout)
+        self._segment, self._reader = segment, (request["host"], request["process"])
+        self._say(path=str(segment.path), layout=self._tap.layout.to_json())
+        return reading
+
+    def _say(self, **answer: Any) -> None:
+        write_json(answer_of(self._run), {**answer, "process": os.getpid()}, 0o600)
+
+    def _leave(self) -> None:
+        if self._segment is not None:
+            self._segment.close()
+        self._segment = None
+        for path in (answer_of(self._run), request_of(self._run)):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,331 @@
+"""A recording: what the tap saw of some worlds as an MCAP file that ROS 2's tools, Foxglove, Lichtblick, PlotJuggler and Rerun open.
+
+Frames are ``world`` with one ``world_<k>`` for each recorded world, apart from each other, and in it ``world_<k>/<link>``. Times are
+simulated ones, counted from the time of day at which the recording began.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from worker.errors import UserError
+from worker.telemetry import messages
+from worker.telemetry.rows import Rows
+
+if TYPE_CHECKING:
+    from worker.telemetry.stage import Stage
+
+APART = 3.0
+"""Between the origins of two recorded worlds, along y [m]; a viewer shows them side by side."""
+_CHUNK = 256 << 10
+"""Bytes after which a chunk is closed and compressed."""
+_FLUSH_SECONDS = 1.0
+"""Between two chunks that are closed for the sake of what a kill would lose [s]."""
+PARTIAL = ".partial"
+"""Behind the name of a file that is being written."""
+
+
+def check_target(path: Path, *suffixes: str) -> None:
+    """Refuse a path at which no file can be made, in one line, before any work is done. Raises UserError."""
+    if path.is_dir():
+        raise UserError(f"{path}: it is a directory; name a file in it, such as {path / ('recording' + suffixes[0])}")
+    if path.suffix not in suffixes:
+        raise UserError(f"{path}: what it is to be follows from its ending; use one of {', '.join(suffixes)}")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"{path}: the directory {path.absolute().parent} does not exist; create it, or name another")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise UserError(f"{path}: {path.absolute().parent} can't be written to; name another directory")
+
+
+class Recording:
+    """An MCAP file that is being written: as ``<path>.partial``, which gets its name when it is whole.
+
+    Args:
+        path: The file.
+        stage: What the worlds look like; it has as many as are recorded.
+        facts: Of the run, for the metadata of each episode: ``run``, ``checkpoint``, ….
+        attachments: Further files, by name: the policy's contract, the job.
+
+    Raises:
+        UserError: The file can't be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        stage: Stage,
+        facts: Mapping[str, str],
+        attachments: Mapping[str, bytes],
+    ) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.path, self._stage, self._facts = path, stage, dict(facts)
+        self.partial = path.with_name(path.name + PARTIAL)
+        self._began = time.time_ns()
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._sums = np.zeros((stage.worlds, 2))
+        """Return and steps of each running episode."""
+        self._poses: np.ndarray | None = None
+        self.steps = self.episodes = self.lost = 0
+        self._ended = np.zeros(stage.worlds, np.int64)
+        self._whole = np.zeros(stage.worlds, bool)
+        """Whether each running episode was recorded from its first step on, without a gap."""
+        try:
+            self._file = self.partial.open("wb")
+            self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+            self._writer.start("ros2", "muster")
+            self._attach(attachments)
+            self._begin()
+            self._flush()
+        except OSError as error:
+            raise self._full(error) from error
+
+    def write(self, rows: Rows, images: Mapping[str, np.ndarray] | None = None) -> None:
+        """Add control steps.
+
+        Args:
+            rows: The next ones.
+            images: Of the last of them, by camera: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
+
+        Raises:
+            UserError: There is no space left, or the volume is gone.
+        """
+        try:
+            self.lost += rows.lost
+            if rows.lost:
+                self._whole[:] = False
+            for step in range(len(rows)):
+                self._write_step(rows, step)
+            for camera, seen in (images or {}).items():
+                now = self._time(rows.first + len(rows), rows.layout.control_hz)
+                for world, image in enumerate(seen):
+                    topic = f"/world_{world}/{camera}/image/compressed"
+                    data = messages.picture(now, f"world_{world}", image)
+                    self._add(topic, "sensor_msgs/msg/CompressedImage", now, data)
+            if time.monotonic() - self._flushed > _FLUSH_SECONDS:
+                self._flush()
+        except OSError as error:
+            raise self._full(error) from error
+
+    def complete(self, episodes: int) -> bool:
+        """Whether each world has ended so many episodes."""
+        return bool((self._ended >= episodes).all())
+
+    def say(self, text: str, level: int = 20, name: str = "muster") -> None:
+        """Add a line of the job's log, at the time of the last step."""
+        now = self._time(self.steps, self._rate)
+        self._add("/rosout", "rcl_interfaces/msg/Log", now, messages.log(now, level, name, text))
+
+    def finish(self) -> Path:
+        """Complete the file and give it its name; returns the path. Raises UserError as :meth:`write`."""
+        try:
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self.partial, self.path)
+        except OSError as error:
+            raise self._full(error) from error
+        return self.path
+
+    _rate = 1.0
+
+    def _time(self, step: int, rate: float) -> int:
+        return self._began + round(step * 1e9 / rate)
+
+    def _attach(self, attachments: Mapping[str, bytes]) -> None:
+        for name, data in attachments.items():
+            media = {".json": "application/json", ".xml": "application/xml", ".urdf": "application/xml"}
+            kind = media.get(Path(name).suffix, "application/octet-stream")
+            self._writer.add_attachment(self._began, self._began, name, kind, data)
+
+    def _begin(self) -> None:
+        """What stands once at the beginning: the places of the worlds, and what is seen on the links.
+
+        A robot from URDF is described by its file. No ROS tool reads MJCF: such a file is attached, and the links have their shapes.
+        """
+        worlds, now = self._stage.worlds, self._began
+        names = [f"world_{world}" for world in range(worlds)]
+        places = [
+            ("world", name, [0.0, APART * (world - (worlds - 1) / 2), 0.0, 0.0, 0.0, 0.0, 1.0])
+            for world, name in enumerate(names)
+        ]
+        self._add("/tf_static", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, places))
+        name, text = self._stage.robot_file or ("", "")
+        if name:
+            self._attach({name: text.encode()})
+        if name.endswith(".urdf"):
+            data = messages.encoded("std_msgs/msg/String", data=text)
+            self._add("/robot_description", "std_msgs/msg/String", now, data)
+        meshes = self._stage.meshes()
+        if ground := meshes.pop("ground", None):
+            self._add("/ground", messages.SCENE, now, messages.scene(now, {"world": ground}))
+        for name in names:
+            frames = {f"{name}/{link}" if link else name: data for link, data in meshes.items()}
+            self._add(f"/{name}/scene", messages.SCENE, now, messages.scene(now, frames))
+
+    def _write_step(self, rows: Rows, step: int) -> None:
+        stage, layout = self._stage, rows.layout
+        self._rate, number = layout.control_hz, rows.first + step + 1
+        now = self._time(number, layout.control_hz)
+        frames = [
+            (f"world_{world}", f"world_{world}/{link}", pose)
+            for world, poses in enumerate(stage.pose(rows.coordinates[step]))
+            for link, pose in zip(stage.links, poses.tolist(), strict=True)
+        ]
+        self._add("/tf", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, frames))
+        for world in range(stage.worlds):
+            frame = f"world_{world}"
+            if stage.joints:
+                positions = rows.coordinates[step, world, stage.coordinates]
+                velocities = rows.velocities[step, world, stage.dofs]
+                data = messages.joint_states(now, frame, stage.joints, positions, velocities)
+                self._add(f"/{frame}/joint_states", "sensor_msgs/msg/JointState", now, data)
+            self._write_world(rows, step, world, now)
+        self.steps = number
+
+    def _write_world(self, rows: Rows, step: int, world: int, now: int) -> None:
+        layout, frame = rows.layout, f"world_{world}"
+        done = bool(rows.mark("done")[step, world])
+        fields = {
+            "header": messages.header(now, frame),
+            "world": world,
+            "episode": int(rows.mark("episode")[step, world]),
+            "age": int(rows.mark("age")[step, world]),
+            "done": done,
+            "time_out": bool(rows.mark("time_out")[step, world]),
+            "reward": float(rows.rewards[step, world]),
+            "reward_names": list(layout.terms),
+            "reward_terms": rows.terms[step, world],
+            "action_names": list(layout.actions),
+            "action": rows.actions[step, world],
+            "observation_names": list(layout.observations),
+            "observation": rows.observations[step, world],
+        }
+        self._add(f"/{frame}/rl/step", messages.STEP, now, messages.encoded(messages.STEP, **fields))
+        if not self._sums[world, 1]:
+            self._whole[world] = done or fields["age"] == 1
+        self._sums[world] += fields["reward"], 1
+        if done:
+            self._end_episode(world, fields)
+
+    def _end_episode(self, world: int, fields: Mapping[str, Any]) -> None:
+        total, steps = self._sums[world]
+        self._sums[world] = 0.0
+        self.episodes += 1
+        self._ended[world] += 1
+        cause = "time_out" if fields["time_out"] else "termination"
+        known = {
+            **self._facts,
+            "world": str(world),
+            "episode": str(fields["episode"]),
+            "return": f"{total:.6g}",
+            "length": str(int(steps)),
+            "end": cause,
+            "complete": "true" if self._whole[world] else "false",
+        }
+        self._writer.add_metadata("episode", known)
+        self.say(
+            f"world {world}: episode {fields['episode']} ended by {cause} after {int(steps)} steps, return {total:.4g}"
+        )
+
+    def _add(self, topic: str, kind: str, now: int, data: bytes) -> None:
+        if topic not in self._channels:
+            if kind not in self._schemas:
+                text = messages.definition(kind).encode()
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], _qos(topic))
+        self._writer.add_message(self._channels[topic], now, data, now)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._file.flush()
+        self._flushed = time.monotonic()
+
+    def _full(self, error: OSError) -> UserError:
+        return UserError(
+            f"{self.partial}: it can't be written ({error.strerror or error}); what is there is kept: free space, then "
+            f"muster record --recover {self.partial}"
+        )
+
+
+_FOR_EVER = {"sec": 9223372036, "nsec": 854775807}
+_LATCHED = {
+    **{"history": 1, "depth": 1, "reliability": 1, "durability": 1, "liveliness": 1},
+    **{name: _FOR_EVER for name in ("deadline", "lifespan", "liveliness_lease_duration")},
+    "avoid_ros_namespace_conventions": False,
+}
+"""The quality of service, in ROS 2's numbers, of what stands once: a player keeps it for whoever comes later."""
+
+
+def _qos(topic: str) -> dict[str, str]:
+    latched = topic in ("/tf_static", "/robot_description", "/ground") or topic.endswith("/scene")
+    return {"offered_qos_profiles": json.dumps([_LATCHED])} if latched else {}
+
+
+def recover(partial: Path) -> tuple[Path, int]:
+    """Make a readable file of one that was cut short, beside it; returns its path and how many messages it has.
+
+    All chunks that were written whole are kept. The cut file stays as it is.
+
+    Raises:
+        UserError: There is no such file, or nothing in it can be read.
+    """
+    from mcap.exceptions import McapError
+    from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+    from mcap.stream_reader import StreamReader
+    from mcap.writer import CompressionType, Writer
+
+    if not partial.is_file():
+        raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
+    name = partial.name.removesuffix(PARTIAL)
+    target = partial.with_name(name if name != partial.name else f"{partial.stem}-recovered{partial.suffix}")
+    if target.exists():
+        raise UserError(f"{target}: it exists already; move it away first")
+    hidden = target.with_name(f".{target.name}.tmp")
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    count = 0
+    try:
+        with partial.open("rb") as source, hidden.open("wb") as made:
+            writer = Writer(made, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+            started = False
+            try:
+                for record in StreamReader(source, emit_chunks=False).records:
+                    if isinstance(record, Header):
+                        writer.start(record.profile, record.library)
+                        started = True
+                    elif isinstance(record, Schema) and record.id not in schemas:
+                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+                    elif isinstance(record, Channel) and record.id not in channels:
+                        own = record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                        channels[record.id] = writer.register_channel(*own)
+                    elif isinstance(record, Message):
+                        where = channels[record.channel_id], record.log_time, record.data, record.publish_time
+                        writer.add_message(*where, record.sequence)
+                        count += 1
+                    elif isinstance(record, Attachment):
+                        told = record.create_time, record.log_time, record.name, record.media_type, record.data
+                        writer.add_attachment(*told)
+                    elif isinstance(record, Metadata):
+                        writer.add_metadata(record.name, record.metadata)
+            except (McapError, EOFError, ValueError, KeyError, struct.error):
+                pass  # here it was cut
+            if not started:
+                raise UserError(f"{partial}: it does not begin as an MCAP file does; nothing can be recovered")
+            writer.finish()
+        os.replace(hidden, target)
+    except OSError as error:
+        raise UserError(f"{target}: it can't be written ({error.strerror or error})") from error
+    finally:
+        hidden.unlink(missing_ok=True)
+    return target, count

@@ -1,0 +1,152 @@
+"""A checkpoint's policy on a few fresh worlds, as recordings and pictures show it: the mean action, in the order of a control step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import warp
+
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Run
+from worker.errors import UserError
+from worker.learning.job import configure, user_errors
+from worker.learning.randomness import held_out_seed, seed_generators
+from worker.learning.setup import observed, spaces_from, spaces_of
+from worker.learning.trained import find_checkpoint, load_policy
+from worker.tasks import find_task
+from worker.telemetry.rows import Rows
+from worker.telemetry.stage import Stage
+from worker.telemetry.tap import Reading, Tap
+
+if TYPE_CHECKING:
+    from worker.learning.algorithm import Policy
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Worlds on which a policy acts.
+
+    Attributes:
+        run: Whose policy.
+        checkpoint: Which one.
+        config: The task's configuration, that of the training.
+        task: The worlds.
+        policy: What acts.
+        seed: Of the worlds.
+    """
+
+    run: Run
+    checkpoint: Checkpoint
+    config: TaskConfig
+    task: Task
+    policy: Policy
+    seed: int
+
+    @classmethod
+    def of(cls, run: Run, wanted: int | str | None, worlds: int, seed: int | None = None) -> Rollout:
+        """Build the worlds and read the policy.
+
+        Args:
+            run: The run.
+            wanted: Iteration or name of the checkpoint; None: the newest.
+            worlds: How many.
+            seed: Of the worlds; by default one that is not that of the training.
+
+        Raises:
+            UserError: There is no such checkpoint, or it does not fit the task as it is now.
+        """
+        checkpoint = find_checkpoint(run, wanted)
+        facts = checkpoint.manifest
+        with user_errors("task"):
+            task_type = find_task(facts["task"])
+        config = configure(task_type, facts["train"])
+        seed = held_out_seed(facts["train"].get("seed", 0)) if seed is None else seed
+        seed_generators(seed)
+        warp.config.log_level = warp.LOG_WARNING
+        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+        with user_errors():
+            task = task_type(config, worlds, seed=seed, device=device)
+        task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
+        policy = load_policy(checkpoint, device)
+        if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
+            raise UserError(
+                f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: it had {then}, it has {now}"
+            )
+        return cls(run, checkpoint, config, task, policy, seed)
+
+    def stage(self, device: str = "cpu") -> Stage:
+        """What these worlds look like."""
+        with user_errors():
+            return Stage(type(self.task), self.config, self.task.world_count, device)
+
+    def steps(self, most: int) -> Iterator[Rows]:
+        """Act for at most ``most`` control steps from a fresh reset; after each of them its row."""
+        tap = Tap(self.task, self.task.world_count, rows=16)
+        tap.open()
+        reading = Reading(tap)
+        self.task.reset()
+        self.policy.reset()
+        observations = observed(self.task)
+        try:
+            for _ in range(most):
+                self.task.step(self.policy.act(observations))
+                self.policy.reset(self.task.dones)
+                yield reading.take()
+        finally:
+            tap.close()
+
+    def images(self) -> dict[str, np.ndarray]:
+        """The newest frame of each camera that the policy sees through: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
+        found = {}
+        for name, tensor in self.task.groups.items():
+            if tensor.ndim == 4:
+                frame = tensor.permute(0, 2, 3, 1).cpu().numpy()
+                found[name] = frame[..., :3] if frame.shape[-1] % 3 == 0 else frame[..., 0]
+        return {name: np.ascontiguousarray(frame) for name, frame in found.items()}
+
+    def facts(self) -> dict[str, str]:
+        """For the metadata of a recording."""
+        return {**facts_of(self.run, self.checkpoint.manifest), **self._own()}
+
+    def _own(self) -> dict[str, str]:
+        learner = self.checkpoint.manifest.get("files", {}).get("learner.pt", {})
+        return {
+            "checkpoint": self.checkpoint.name,
+            "iteration": str(self.checkpoint.iteration),
+            "seed": str(self.seed),
+            "policy_sha256": str(learner.get("sha256", "")),
+        }
+
+    def attachments(self) -> dict[str, bytes]:
+        """The policy's contract as the checkpoint has it, and the job that trained it."""
+        policy = {"checkpoint": self.checkpoint.name, **self._own(), **self.checkpoint.manifest["policy"]}
+        return {"policy.json": _json(policy), **job_attachment(self.run)}
+
+
+def facts_of(run: Run, known: Mapping[str, Any]) -> dict[str, str]:
+    """Run, task, algorithm and versions, for the metadata of a recording; ``known`` names task and algorithm."""
+    versions = {name: version(name) for name in ("muster", "newton", "warp-lang", "torch")}
+    return {
+        "run": run.name,
+        "task": str(known.get("task", "")),
+        "algorithm": str(known.get("algorithm", "")),
+        **{f"version_{name}": number for name, number in versions.items()},
+    }
+
+
+def job_attachment(run: Run) -> dict[str, bytes]:
+    """The YAML of the run's job as JSON; nothing where it had none."""
+    spec = (run.description() or {}).get("spec")
+    return {"job.json": _json(spec)} if spec else {}
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, indent=1).encode()

@@ -1,0 +1,197 @@
+"""What a task's worlds look like, without their physics: link frames from joint coordinates, and the shapes on the links."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from worker.simulation import robot_files
+from worker.simulation.robot_view import RobotView
+from worker.simulation.terrain import Terrain
+from worker.tasks.declared import DeclaredTask
+
+if TYPE_CHECKING:
+    from worker.tasks.config import TaskConfig
+    from worker.tasks.task import Task
+
+_GROUND = (0.6, 0.62, 0.6)
+"""Its colour."""
+
+
+class Stage:
+    """Some worlds of a task as they are seen: with the shapes that a robot's file has only for the eye.
+
+    Args:
+        task_type: The task.
+        config: Its configuration.
+        worlds: How many worlds.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+
+    Attributes:
+        model: Newton's model of all worlds.
+        state: Where the bodies are, after :meth:`pose`.
+        links: Names of the bodies of one world, in the model's order.
+        joints: Names of the joints with one degree of freedom.
+        coordinates: Their columns among the joint coordinates.
+        dofs: Their columns among the joint velocities.
+        root: The body that a picture follows.
+        robot_file: ``robot.urdf`` or ``robot.xml`` (MJCF) and the text of the robot's file; None of other kinds of files.
+
+    Raises:
+        ValueError: The robot can't be read.
+    """
+
+    def __init__(self, task_type: type[Task], config: TaskConfig, worlds: int, device: str = "cpu") -> None:
+        sketch = _seen(task_type).sketch(config)
+        template = sketch.template
+        self.worlds = worlds
+        views: list[RobotView] = list(getattr(sketch, "views", {}).values()) or [RobotView(template, "")]
+        self.joints, self.coordinates, self.dofs = [], [], []
+        for view in views:
+            own = "" if view.name in ("", "robot") else f"{view.name}/"
+            self.joints += [own + name for name in view.joint_names]
+            self.coordinates += view.coordinates
+            self.dofs += view.dofs
+        self.root = views[0].root_body
+        self.links = _link_names(template.body_label)
+        scene = newton.ModelBuilder()
+        SolverMuJoCo.register_custom_attributes(scene)
+        scene.replicate(template, worlds)
+        stands_on, first = sketch.stands_on(), len(scene.shape_color)
+        if isinstance(stands_on, Terrain):
+            stands_on.add_to(scene)
+        elif stands_on:
+            scene.add_ground_plane()
+        scene.shape_color[first:] = [_GROUND] * (len(scene.shape_color) - first)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")  # nothing collides here
+            self.model = scene.finalize(device=device)
+        self.state = self.model.state()
+        self.robot_file = _robot_file(sketch, config)
+
+    def pose(self, coordinates: np.ndarray) -> np.ndarray:
+        """Put the worlds where joint coordinates say.
+
+        Args:
+            coordinates: Shape ``(worlds, coordinates)``.
+
+        Returns:
+            Poses of the links in the world's frame: position [m], quaternion xyzw; shape ``(worlds, links, 7)``.
+        """
+        self.state.joint_q.assign(np.ascontiguousarray(coordinates, np.float32).reshape(-1))
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+        poses: np.ndarray = self.state.body_q.numpy().reshape(self.worlds, -1, 7)
+        return poses
+
+    def meshes(self) -> dict[str, bytes]:
+        """What is seen of one world, each link in its own frame, as binary glTF (y up, as glTF has it).
+
+        Returns:
+            By link; ``""`` is what a world has that is fixed to it, ``"ground"`` what no world has for itself. A plane is a square of
+            40 m.
+        """
+        import trimesh
+
+        model = self.model
+        names = self.links
+        bodies, owners, flags = (array.numpy() for array in (model.shape_body, model.shape_world, model.shape_flags))
+        kinds, sizes, places = (array.numpy() for array in (model.shape_type, model.shape_scale, model.shape_transform))
+        colors = model.shape_color.numpy()
+        scenes: dict[str, Any] = {}
+        for shape in range(model.shape_count):
+            if owners[shape] > 0 or not flags[shape] & newton.ShapeFlags.VISIBLE:
+                continue
+            name = "ground" if owners[shape] < 0 else "" if bodies[shape] < 0 else names[bodies[shape]]
+            found = _mesh(int(kinds[shape]), sizes[shape], model.shape_source[shape])
+            if found is None:
+                continue
+            vertices, faces = found
+            rotation = np.array(wp.quat_to_matrix(wp.quat(*map(float, places[shape][3:])))).reshape(3, 3)
+            x, y, z = (vertices @ rotation.T + places[shape][:3]).T
+            material = trimesh.visual.material.PBRMaterial(
+                baseColorFactor=[*(255 * np.clip(colors[shape], 0, 1)).astype(np.uint8).tolist(), 255],
+                roughnessFactor=0.8,
+                metallicFactor=0.0,
+            )
+            mesh = trimesh.Trimesh(np.stack([x, z, -y], 1), faces, process=False)
+            mesh.visual = trimesh.visual.TextureVisuals(material=material)
+            scenes.setdefault(name, trimesh.Scene()).add_geometry(mesh)
+        return {name: scene.export(file_type="glb") for name, scene in scenes.items()}
+
+
+def _seen(task_type: type[Task]) -> type[Task]:
+    """The task, with the geoms of its robots that are only seen."""
+    if not issubclass(task_type, DeclaredTask):
+        return task_type
+
+    def robot(self: Any, config: Any) -> Any:
+        return _with_visuals(task_type.robot(self, config))
+
+    def objects(self: Any, config: Any) -> Any:
+        return {name: _with_visuals(each) for name, each in task_type.objects(self, config).items()}
+
+    return type(task_type.__name__, (task_type,), {"robot": robot, "objects": objects})
+
+
+def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
+    """Name and text of the robot's file; None where it is binary, or the task has no such file."""
+    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, DeclaredTask) else None
+    if file is None:
+        return None
+    found = robot_files.read(file)
+    if found.format not in ("urdf", "mjcf"):
+        return None
+    text = found.source if found.source.lstrip().startswith("<") else Path(found.source).read_text()
+    return ("robot.urdf" if found.format == "urdf" else "robot.xml"), text
+
+
+def _with_visuals(entity: Any) -> Any:
+    return dataclasses.replace(entity, visuals=True) if hasattr(entity, "visuals") else entity
+
+
+def _link_names(labels: list[str]) -> list[str]:
+    """Short names of bodies; those of other robots and objects behind that of their owner, and the whole label of any that are alike."""
+    found = []
+    for label in labels:
+        owner, short = label.partition("/")[0], label.rpartition("/")[2]
+        found.append(short if owner in ("robot", short) or "/" not in label else f"{owner}/{short}")
+    count = Counter(found)
+    return [name if count[name] == 1 else label for name, label in zip(found, labels, strict=True)]
+
+
+def _mesh(kind: int, size: np.ndarray, source: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices [m] and triangles of a shape in its own frame; None of what has no surface."""
+    first, second, third = (float(value) for value in size)
+    kinds, plain = newton.GeoType, newton.Mesh
+    options: dict[str, Any] = {"compute_inertia": False}
+    if kind == kinds.PLANE:
+        made = plain.create_plane(first or 40.0, second or 40.0, **options)
+    elif kind == kinds.SPHERE:
+        made = plain.create_sphere(first, **options)
+    elif kind == kinds.ELLIPSOID:
+        made = plain.create_ellipsoid(first, second, third, **options)
+    elif kind == kinds.CAPSULE:
+        made = plain.create_capsule(first, second, up_axis=newton.Axis.Z, **options)
+    elif kind == kinds.CYLINDER:
+        made = plain.create_cylinder(first, second, up_axis=newton.Axis.Z, **options)
+    elif kind == kinds.CONE:
+        made = plain.create_cone(first, second, up_axis=newton.Axis.Z, **options)
+    elif kind == kinds.BOX:
+        made = plain.create_box(first, second, third, **options)
+    elif kind == kinds.HFIELD:
+        heights = source.min_z + np.asarray(source.data) * (source.max_z - source.min_z)
+        # MuJoCo's rows are those along y
+        made = plain.create_heightfield(heights.T, 2 * source.hx, 2 * source.hy, ground_z=source.min_z - 0.1, **options)
+    elif kind in (kinds.MESH, kinds.CONVEX_MESH):
+        return np.asarray(source.vertices) * size, np.asarray(source.indices).reshape(-1, 3)
+    else:
+        return None
+    return np.asarray(made.vertices), np.asarray(made.indices).reshape(-1, 3)

@@ -1,0 +1,172 @@
+"""The tap: a ring on the device that holds the last control steps of a few worlds, filled inside the graph of a step.
+
+Filling it is one launch that copies numbers and one that counts; nothing waits for the host, and nothing that the simulation reads is
+written. Body poses are not among the numbers: they follow from the joint coordinates, and whoever reads works them out
+(:class:`worker.telemetry.stage.Stage`), since kinematics in every step would cost a training more than all the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from worker.simulation.capture import on_torch_stream
+from worker.simulation.episodes import WATCHED, EpisodeArrays
+from worker.simulation.worlds import WorldArrays
+from worker.telemetry.rows import MARKS, Layout, Rows
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
+
+wp.set_module_options({"enable_backward": False})
+
+ROWS = 1024
+"""Control steps that the ring holds."""
+
+
+@wp.kernel
+def _fill(
+    ends: wp.array(dtype=wp.int32),
+    states: wp.array2d(dtype=wp.float32),
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    ended: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int64),
+    values: wp.array3d(dtype=wp.float32),
+    marks: wp.array3d(dtype=wp.int32),
+):
+    """One column of one world's row."""
+    world, column = wp.tid()
+    row = int(count[0] % wp.int64(values.shape[0]))
+    value = float(0.0)
+    if column < ends[0]:
+        value = worlds.joint_q[world, column]
+    elif column < ends[1]:
+        value = worlds.joint_qd[world, column - ends[0]]
+    elif column < ends[2]:
+        value = states[world, column - ends[1]]
+    elif column < ends[3]:
+        value = episodes.actions[world, column - ends[2]]
+    elif column < ends[4]:
+        value = episodes.terms[world, column - ends[3]]
+        episodes.terms[world, column - ends[3]] = 0.0
+    else:
+        value = episodes.rewards[world]
+        marks[row, world, 0] = ended[world]
+        marks[row, world, 1] = episodes.ages[world]
+        marks[row, world, 2] = wp.where(episodes.dones[world], 1, 0)
+        marks[row, world, 3] = wp.where(episodes.time_outs[world], 1, 0)
+    values[row, world, column] = value
+
+
+@wp.kernel
+def _count(dones: wp.array(dtype=wp.bool), ended: wp.array(dtype=wp.int32), count: wp.array(dtype=wp.int64)):
+    """A kernel of its own: the row is whole before it counts."""
+    for world in range(ended.shape[0]):
+        if dones[world]:
+            ended[world] = ended[world] + 1
+    count[0] = count[0] + wp.int64(1)
+
+
+class Tap:
+    """The ring of a task's first worlds; :meth:`open` makes the task fill it.
+
+    Args:
+        task: Whose worlds.
+        worlds: How many of them.
+        rows: Control steps that the ring holds.
+
+    Raises:
+        ValueError: ``worlds`` is not from 1 to that of the task, at most ``WATCHED``.
+    """
+
+    def __init__(self, task: Task, worlds: int, rows: int = ROWS) -> None:
+        most = min(WATCHED, task.world_count)
+        if not 1 <= worlds <= most:
+            raise ValueError(f"worlds is {worlds}; of these worlds 1 to {most} can be watched")
+        self.layout = Layout.of(task, worlds, rows)
+        self._task, self.device = task, task.device
+        with on_torch_stream(self.device):
+            self._values = wp.zeros((rows, worlds, self.layout.width), dtype=wp.float32, device=self.device)
+            self._marks = wp.zeros((rows, worlds, len(MARKS)), dtype=wp.int32, device=self.device)
+            self._ended = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+            self._counter = wp.zeros(1, dtype=wp.int64, device=self.device)
+            self._ends = wp.array(self.layout.ends, dtype=wp.int32, device=self.device)
+        self.values: torch.Tensor = wp.to_torch(self._values)
+        self.marks: torch.Tensor = wp.to_torch(self._marks)
+        self.count: torch.Tensor = wp.to_torch(self._counter)
+
+    def open(self) -> None:
+        """Have the task fill the ring from its next step on. A graph that holds the task's step has to be recorded anew."""
+        with on_torch_stream(self.device):
+            self._fill()  # loads the kernels, which a capture can't do everywhere
+            for array in (self._values, self._marks, self._ended, self._counter):
+                array.zero_()
+        self._task.watch(self._fill)
+
+    def close(self) -> None:
+        """Have the task fill it no more."""
+        self._task.watch(None)
+
+    def _fill(self) -> None:
+        episodes: Any = self._task._episodes
+        shape = (self.layout.worlds, self.layout.width)
+        inputs = [self._ends, episodes.observations, self._task.worlds.arrays, episodes]
+        outputs = [self._values, self._marks]
+        wp.launch(_fill, dim=shape, inputs=[*inputs, self._ended, self._counter], outputs=outputs, device=self.device)
+        wp.launch(_count, dim=1, inputs=[episodes.dones, self._ended, self._counter], device=self.device)
+
+
+class Reading:
+    """Brings new rows of a tap to the host, on a stream of its own; the device's other work does not wait for it.
+
+    Args:
+        tap: What is read, from the next step on.
+    """
+
+    def __init__(self, tap: Tap) -> None:
+        self._tap = tap
+        self._cuda = tap.device.startswith("cuda")
+        self._stream = torch.cuda.Stream(tap.device) if self._cuda else None
+        pinned = {"pin_memory": self._cuda}
+        self._values = torch.empty(tap.values.shape, dtype=torch.float32, **pinned)
+        self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, **pinned)
+        self._counts = torch.zeros(2, dtype=torch.int64, **pinned)
+        self.next = 0
+        """Number of the step that is read next."""
+
+    def take(self) -> Rows:
+        """The steps since the last call, as copies. Those that the device overwrote meanwhile are left out and counted as lost."""
+        size, started = self._tap.layout.rows, self.next
+        self._on_stream(lambda: self._counts[0:1].copy_(self._tap.count, non_blocking=True))
+        there = int(self._counts[0])
+        first = max(started, there - size + 1)
+        self._on_stream(lambda: self._copy(first, there))
+        # of what was copied, the device may have written over the oldest rows, and be at work on one more
+        first = min(there, max(first, int(self._counts[1]) - size + 1))
+        self.next = there
+        places = np.arange(first, there) % size
+        values, marks = self._values.numpy()[places], self._marks.numpy()[places]
+        return Rows(self._tap.layout, first, values, marks, first - started)
+
+    def _copy(self, first: int, end: int) -> None:
+        size = self._tap.layout.rows
+        while first < end:
+            start = first % size
+            count = min(end - first, size - start)
+            for target, source in ((self._values, self._tap.values), (self._marks, self._tap.marks)):
+                target[start : start + count].copy_(source[start : start + count], non_blocking=True)
+            first += count
+        self._counts[1:2].copy_(self._tap.count, non_blocking=True)
+
+    def _on_stream(self, copy: Callable[[], object]) -> None:
+        if self._stream is None:
+            copy()
+            return
+        with torch.cuda.stream(self._stream):
+            copy()
+        self._stream.synchronize()
