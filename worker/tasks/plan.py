@@ -87,19 +87,15 @@ class Driven:
 
 @dataclass
 class Told:
-    """A command: its own term and the update of each step, its columns in memory, and the bounds of its duration."""
+    """A command: its own term and the update of each step, its first column in memory, that of the control steps for which
+    it still holds, and the bounds of its duration.
+    """
 
     bound: Bound
     update: Bound | None
     first: int
+    countdown: int
     seconds: int
-
-    @property
-    def countdown(self) -> int:
-        """Column in memory of the control steps for which it still holds."""
-        term = self.bound.term
-        assert isinstance(term, Command)
-        return self.first + len(term.names) + term.hidden
 
 
 @dataclass
@@ -195,8 +191,7 @@ class Plan:
     def _reserve_commands(self) -> None:
         """Columns of all commands first, so that any term may name any of them."""
         for name, term in self.declaration.commands.items():
-            self.binder.commands[name] = self.binder.memory
-            self.binder.memory += len(term.names) + term.hidden + 1
+            self.binder.reserve_command(name, term)
 
     def _bind_actions(self) -> None:
         declared = self.declaration.actions
@@ -251,11 +246,13 @@ class Plan:
         update = None
         if term.update is not None:
             update = self._bind("commands", f"{name}.update", term.update, element=False, own=own)
+            self.binder.check_told(update, name)
         if not 0.0 < term.seconds[0] <= term.seconds[1]:
             raise ValueError(
                 f"{place}: seconds are {list(term.seconds)}; give the least and the greatest time, above 0"
             )
-        return Told(bound, update, first, self.numbers.add(f"{place}.seconds", term.seconds, 2))
+        countdown = first + self.binder.told[name] + self.binder.hidden[name]
+        return Told(bound, update, first, countdown, self.numbers.add(f"{place}.seconds", term.seconds, 2))
 
     def _bind_rewards(self) -> list[Bound]:
         weights, declared = self.config.rewards, self.declaration.rewards

@@ -11,6 +11,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,6 +77,7 @@ def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays
     worlds.controls[world, robot.actuators[joint]] = worlds.joint_q[world, robot.coordinates[joint]] + value
 
 
+@needs(ranges=True)
 @wp.func
 def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A position target between the joint's limits: ``value`` -1 is the lower, 1 the upper; clipped. The joint must have limits.
@@ -87,6 +89,7 @@ def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, j
     aim(worlds, robot, world, joint, 0.5 * (ends[0] + ends[1]) + 0.5 * share * (ends[1] - ends[0]))
 
 
+@needs(memory_each=2)
 @wp.func
 def smoothed_position_target(
     world: int,

@@ -12,6 +12,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.sensors.contact import ContactArrays, first_air, first_contact, steps_above, strongest_contact
 from worker.simulation.sensors.frames import FrameArrays
+from worker.tasks.needs import needs
 from worker.tasks.terms.commands import command_speed
 
 wp.set_module_options({"enable_backward": False})
@@ -255,6 +256,7 @@ def foot_clearance(
     return wp.abs(frames.positions[world, index][2] - height) * planar_speed(frames, world, index)
 
 
+@needs(memory_each=1)
 @wp.func
 def swing_height_error(
     world: int,

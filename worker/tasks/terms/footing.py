@@ -15,6 +15,7 @@ from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.sensors.contact import ContactArrays, first_contact
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
+from worker.tasks.needs import needs
 from worker.tasks.terms.commands import command_speed
 from worker.tasks.terms.contacts import planar_speed, touches
 
@@ -26,6 +27,7 @@ _LINE = wp.constant(1.0e-6)
 """Points are on a line where their second variance is not above this times the greatest."""
 
 
+@needs(points="points")
 @wp.func
 def frame_clearance(world: int, scan: HeightScanArrays, index: int, points: int) -> float:
     """Least height of frame ``index`` of a scan above the ground at its points, not below 0 [m], such as of a foot.
@@ -38,6 +40,7 @@ def frame_clearance(world: int, scan: HeightScanArrays, index: int, points: int)
     return wp.max(least, 0.0)
 
 
+@needs(points="points")
 @wp.func
 def swung_foot_clearance(
     world: int,
@@ -84,6 +87,7 @@ def swing_error(
     return error
 
 
+@needs(memory_each=1, points="points")
 @wp.func
 def swung_foot_height_error(
     world: int,

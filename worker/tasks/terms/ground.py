@@ -18,6 +18,7 @@ from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.simulation.terrain_arrays import TerrainArrays, ground_height, on_terrain, terrain_origin
 from worker.simulation.terrain_levels import walked_levels
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.needs import needs
 from worker.tasks.terms.commands import command_speed
 from worker.tasks.terms.contacts import planar_speed
 from worker.tasks.terms.footing import swing_error
@@ -150,6 +151,7 @@ def foot_clearance_above_ground(
     return wp.abs(error) * planar_speed(frames, world, index)
 
 
+@needs(memory_each=1)
 @wp.func
 def swing_height_error_above_ground(
     world: int,

@@ -21,6 +21,7 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.needs import needs
 from worker.tasks.terms.commands import command_rotation, command_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -226,6 +227,7 @@ def object_at_target(
     return wp.where(object_target_distance(world, worlds, episodes, robot, command) < distance, 1.0, 0.0)
 
 
+@needs(memory=1)
 @wp.func
 def object_was_at_target(
     world: int,
