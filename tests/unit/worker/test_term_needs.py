@@ -184,3 +184,24 @@ def test_a_choice_has_no_actions_to_observe() -> None:
         "rewards.change: action_rate_squared is called for each action, and a choice has none",
         actions=Choice(_choose, names=("left", "right")),
     )
+
+
+def test_a_share_of_the_effort_is_one_of_the_force_on_the_joint() -> None:
+    geared = MODEL.replace('gear="2"', 'gear="10" ctrllimited="true" ctrlrange="-1 1"').replace(
+        'gear="3"', 'gear="-4" forcelimited="true" forcerange="-0.5 0.5"'
+    )
+    task = sliders(Robot(geared), actions={"f": Action(terms.limited_effort)})(SlidersConfig(), 1, seed=1)
+    task.step(torch.tensor([[0.05, 0.5]]))
+    # the greatest forces are 10 N and 4 * 0.5 N, so 0.5 N and 1 N, each over its gear
+    assert task.worlds.arrays.controls.numpy()[0].tolist() == pytest.approx([0.05, -0.25])
+    assert task.worlds.arrays.drives.numpy()[0].tolist() == pytest.approx([0.5, 1.0])
+
+
+def _mixed_up(task: Sliders) -> torch.Tensor:
+    return torch.arange(2.0 * task.world_count).reshape(2, task.world_count)
+
+
+def test_a_torch_term_of_another_shape_is_refused() -> None:
+    wanted = r"observations.a: _mixed_up gives \(2, 3\); expected a tensor of shape \(3, 2\), as size= says$"
+    with pytest.raises(ValueError, match=wanted):
+        sliders(observations={"a": Observation(_mixed_up, size=2)})(SlidersConfig(), 3)

@@ -33,14 +33,16 @@ def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, valu
 
 @wp.func
 def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A share of the greatest force or torque of the actuator, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+    """A share of the greatest force or torque on the joint, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+
+    It is that of a <motor>: its input is the force over its gear and gain.
 
     mjlab: -. Isaac Lab: -.
     """
     greatest = robot.efforts[joint]
     if not wp.isfinite(greatest):
         greatest = 1.0
-    worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0)
+    worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0) / robot.gains[joint]
 
 
 @wp.func
@@ -103,8 +105,7 @@ def smoothed_position_target(
 ):
     """A position target that follows ``value`` slowly: t = share * value + (1 - share) * t of the step before [m, rad].
 
-    ``memory`` is twice the number of the robot's joints: a target and whether there is one. The first target of an episode is where
-    the joint is.
+    The first target of an episode is where the joint is.
 
     mjlab: -. Isaac Lab: EMAJointPositionToLimitsAction (without its scaling to the limits).
     """

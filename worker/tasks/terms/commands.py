@@ -125,7 +125,7 @@ def heading_velocity_command(
     forward_share: float = 0.0,
     least_forward: float = 0.3,
 ):
-    """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and ``hidden=6``.
+    """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and 6 hidden ones.
 
     Give it ``update=Term(terms.steer_velocity_command, ...)``: for ``heading_share`` of all commands that turns the robot to its
     heading, and for ``world_share`` it keeps the direction fixed in the world. Standing, these two and going straight ahead are drawn
@@ -286,7 +286,7 @@ def planar_pose_command(
     y: wp.vec2,
     heading: wp.vec2,
 ):
-    """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and ``hidden=3``.
+    """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and 3 hidden ones.
 
     The numbers are forward and left to the place [m] and left to the heading [rad], as the robot stands now. Give it
     ``update=Term(terms.steer_planar_pose_command)``, which calculates them again in every step.
@@ -321,7 +321,7 @@ def steer_planar_pose_command(
 @needs(numbers=True)
 @wp.func
 def command_number(world: int, episodes: EpisodeArrays, command: int, index: int) -> float:
-    """Number ``index`` of a command (``size=`` how many the policy is told) [unit of the command].
+    """Number ``index`` of a command, by default of all that the policy is told [unit of the command].
 
     mjlab: generated_commands. Isaac Lab: generated_commands.
     """

@@ -238,7 +238,7 @@ def object_was_at_target(
     memory: int,
     distance: float,
 ) -> float:
-    """1 from the step on in which an object, which ``robot=`` names, was closer to its target than ``distance`` [m]; ``memory=1``.
+    """1 from the step on in which an object, which ``robot=`` names, was closer to its target than ``distance`` [m].
 
     It holds until the episode ends, also where a new target is drawn before.
 

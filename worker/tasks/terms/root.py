@@ -67,7 +67,7 @@ def root_orientation(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp.
 @needs(size=6)
 @wp.func
 def root_orientation_element(world: int, worlds: WorldArrays, robot: RobotArrays, index: int) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the root's rotation matrix, row by row.
+    """Element ``index``, one of six, of the first two columns of the root's rotation matrix, row by row.
 
     mjlab: -. Isaac Lab: -.
     """

@@ -98,7 +98,7 @@ def frame_orientation(world: int, frames: FrameArrays, index: int) -> wp.quat:
 @needs(size=6)
 @wp.func
 def frame_orientation_element(world: int, frames: FrameArrays, index: int) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the rotation matrix of the sensor's first frame, row by row.
+    """Element ``index``, one of six, of the first two columns of the rotation matrix of the sensor's first frame, row by row.
 
     mjlab: -. Isaac Lab: -.
     """

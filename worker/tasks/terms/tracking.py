@@ -173,7 +173,7 @@ def wanted_anchor_position(
 def wanted_anchor_turn(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, index: int, command: int
 ) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the matrix that turns the motion's anchor to the robot's, row by row.
+    """Element ``index``, one of six, of the first two columns of the matrix that turns the motion's anchor to the robot's, row by row.
 
     mjlab: motion_anchor_ori_b. Isaac Lab: motion_anchor_ori_b (of BeyondMimic).
     """
@@ -184,7 +184,7 @@ def wanted_anchor_turn(
 
 @wp.func
 def followed_body_position(world: int, bodies: BodyArrays, motion: MotionArrays, index: int) -> wp.vec3:
-    """Position of body ``index`` of the motion (``size=`` their number) in the frame of the robot's anchor [m].
+    """Position of body ``index`` of the motion in the frame of the robot's anchor [m].
 
     mjlab: robot_body_pos_b. Isaac Lab: robot_body_pos_b (of BeyondMimic).
     """
@@ -196,8 +196,6 @@ def followed_body_position(world: int, bodies: BodyArrays, motion: MotionArrays,
 @wp.func
 def followed_body_turn(world: int, bodies: BodyArrays, motion: MotionArrays, index: int) -> float:
     """Element ``index % 6`` of the first two columns of the matrix of body ``index // 6`` in the frame of the robot's anchor, row by row.
-
-    ``size=`` six times the number of the motion's bodies.
 
     mjlab: robot_body_ori_b. Isaac Lab: robot_body_ori_b (of BeyondMimic).
     """
