@@ -14,7 +14,7 @@ from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks.declaration import Command, Pattern, Term
 from worker.tasks.functions import STRUCTS, WIDTHS, Signature, is_robot, is_struct, is_warp, shown_type, signature
 from worker.tasks.needs import Needs, needs_of
-from worker.tasks.numbers import EXPRESSIONS, Numbers
+from worker.tasks.numbers import EXPRESSIONS, Numbers, stays
 
 
 @dataclass
@@ -104,6 +104,10 @@ class Binder:
         Raises:
             ValueError: The function or its parameters do not fit, in one line that names the place.
         """
+        for name, least in (("size", 1), ("memory", 0), ("lasting", 0)):
+            count = getattr(term, name)
+            if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < least):
+                raise ValueError(f"{place}: {name} is {shown(count)}; give a whole number from {least} up")
         if not is_warp(term.function):
             return self._bind_torch(place, term)
         try:
@@ -270,7 +274,9 @@ class Binder:
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
         if name not in given:
             raise ValueError(f"{place}: {term.function_name} needs {name}={shown_type(kind)}")
-        first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind])
+        # what a scan's columns are divided by is part of the kernel's bounds
+        check = stays(given[name]) if name == needs_of(term.function).points else None
+        first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind], check)
         return EXPRESSIONS[kind].format(*range(first, first + WIDTHS[kind]))
 
     def reserve_command(self, name: str, term: Command) -> None:
