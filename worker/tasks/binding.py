@@ -13,8 +13,8 @@ from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks.declaration import Command, Pattern, Term
 from worker.tasks.functions import STRUCTS, WIDTHS, Signature, is_robot, is_struct, is_warp, shown_type, signature
-from worker.tasks.needs import Needs, needs_of
 from worker.tasks.numbers import EXPRESSIONS, Numbers, stays
+from worker.tasks.term_needs import Needs, needs_of
 
 
 @dataclass

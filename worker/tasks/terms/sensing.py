@@ -8,7 +8,7 @@ from worker.simulation.kinematics import turn_element, unique_quaternion
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
-from worker.tasks.needs import needs
+from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
