@@ -151,16 +151,16 @@ class Binder:
                 raise ValueError(f"{place}: say how often {found.name} is called, with size=")
             return names
         if names and not term.size <= len(names):
-            raise ValueError(f"{place}: size is {term.size}, and {what}, {len(names)}; leave size= out")
+            raise ValueError(f"{place}: size is {term.size}, more than the {len(names)} {what}; leave size= out")
         return [str(index) for index in range(term.size)]
 
     def _counted(self, place: str, found: Signature, given: Mapping[str, Any], needed: Needs) -> tuple[list[str], str]:
         """The names of all that an index may be, and what they are; none where the function does not say."""
         if needed.size:
-            return [str(index) for index in range(needed.size)], f"{found.name} has so many elements"
+            return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
             name = self._command_name(place, given.get("command"))
-            return [str(index) for index in range(self.told[name])], f"the command {name} has so many numbers"
+            return [str(index) for index in range(self.told[name])], f"numbers of the command {name}"
         counts: dict[str, int] = {}
         names: list[str] = []
         for parameter, kind in found.parameters.items():
@@ -178,8 +178,8 @@ class Binder:
             shown = " and ".join(f"{sensor} has {count}" for sensor, count in counts.items())
             raise ValueError(f"{place}: {found.name} needs as many columns of each of its sensors; {shown}")
         if needed.each > 1:
-            names = [str(index) for index in range(needed.each * len(names))]
-        return names, f"{', '.join(counts)} has so many columns"
+            return [str(index) for index in range(needed.each * len(names))], f"elements of {found.name}"
+        return names, f"{'frames' if needed.points else 'columns'} of {', '.join(counts)}"
 
     @staticmethod
     def _frames_of(place: str, sensor: str, rows: list[str], points: str, given: Mapping[str, Any]) -> list[str]:

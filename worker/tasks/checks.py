@@ -28,6 +28,9 @@ def check_arguments(kind: type[Task], config: Any, world_count: int, seed: int, 
             f"task {task} has no reward terms; give {kind.config_type.__name__} a field "
             "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
         )
+    for name in config.curriculum:
+        if "." in name and not hasattr(kind, "declare"):
+            raise ValueError(f"task {task}: curriculum: it has no number {name}; declared tasks have such")
     if world_count < 1:
         raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
     if first_world < 0:

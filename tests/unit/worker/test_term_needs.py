@@ -107,11 +107,11 @@ REFUSED = {
     ),
     "size of a scan": (
         dict(x=Observation(terms.frame_clearance, points=5, size=3)),
-        "observations.x: size is 3, and scan has so many columns, 2; leave size= out",
+        "observations.x: size is 3, more than the 2 frames of scan; leave size= out",
     ),
     "size of a command": (
         dict(x=Observation(terms.command_number, size=4)),
-        "observations.x: size is 4, and the command v has so many numbers, 3; leave size= out",
+        "observations.x: size is 4, more than the 3 numbers of the command v; leave size= out",
     ),
     "a rotation": (
         dict(x=Observation(terms.command_rotation)),
