@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -66,6 +67,12 @@ class Robot:
     passive: bool = field(default=False, kw_only=True)
     visuals: bool = field(default=True, kw_only=True)
     file_options: bool = field(default=True, kw_only=True)
+
+    def __post_init__(self) -> None:
+        check_word(self.name)
+        for name, value, count in (("position", self.position, 3), ("rotation", self.rotation, 4)):
+            if value is not None and (len(value) != count or not all(map(math.isfinite, value))):
+                raise ValueError(f"Robot {self.name}: {name} is {value!r}; give {count} finite numbers")
 
     def add_to(self, builder: newton.ModelBuilder) -> None:
         """Add the robot to a builder that holds one world.
@@ -169,10 +176,15 @@ class Robot:
                 own.shape_transform[shape] = change * wp.transform(*own.shape_transform[shape])
 
 
-def check_name(builder: newton.ModelBuilder, name: str) -> None:
-    """Refuse a name that something in the world already has, or that can't begin a label."""
+def check_word(name: str) -> None:
+    """Refuse a name that can't begin a label."""
     if not name or "/" in name:
         raise ValueError(f"the name of a robot or object is a word without slashes, not {name!r}")
+
+
+def check_name(builder: newton.ModelBuilder, name: str) -> None:
+    """Refuse a name that something in the world already has, or that can't begin a label."""
+    check_word(name)
     if any(label.startswith(f"{name}/") for label in builder.body_label):
         raise ValueError(f"two things in the world are called {name!r}; give one of them another name")
 

@@ -21,6 +21,8 @@ class RobotArrays:
         defaults: Default position of each joint [m, rad], shape ``(joints,)``.
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none, shape ``(joints,)``.
         efforts: Greatest force or torque of each joint's actuator [N, N m], infinite where it is not limited, shape ``(joints,)``.
+        gains: Force or torque on each joint for one unit of its actuator's input, gear times gain [N, N m], shape ``(joints,)``; 1 where
+            it has no actuator.
         encoder_bias: What the encoders add to each joint's position [m, rad], shape ``(worlds, joints)``.
         start: Pose of the root at the start of an episode, in the world frame.
     """
@@ -34,6 +36,7 @@ class RobotArrays:
     defaults: wp.array(dtype=wp.float32)
     ranges: wp.array(dtype=wp.vec2)
     efforts: wp.array(dtype=wp.float32)
+    gains: wp.array(dtype=wp.float32)
     encoder_bias: wp.array2d(dtype=wp.float32)
     start: wp.transform
 

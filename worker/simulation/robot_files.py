@@ -56,7 +56,7 @@ def read(file: str | Path) -> RobotFile:
             raise ValueError(
                 f"{text}: a robot's file ends in {', '.join(FORMATS)}, not in {path.suffix or 'nothing'!r}"
             )
-        kind = FORMATS[path.suffix.lower()] or _kind_of_xml(path.read_text(encoding="utf-8"), text)
+        kind = FORMATS[path.suffix.lower()] or _kind_of_xml(_text_of(path, text), text)
     shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
     hinges: dict[str, list[str]] = {}
     if kind == "mjcf":
@@ -66,6 +66,13 @@ def read(file: str | Path) -> RobotFile:
     elif kind == "urdf":
         _check_urdf_meshes(source, shown)
     return RobotFile(source, kind, hinges)
+
+
+def _text_of(path: Path, shown: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{shown}: the file is not text in UTF-8 ({error.reason} at byte {error.start})") from error
 
 
 def _path(file: str) -> Path:
@@ -142,7 +149,7 @@ def _check_mjcf_assets(spec: Any, shown: str) -> None:
 def _check_urdf_meshes(source: str, shown: str) -> None:
     """Newton warns of a mesh that it can't find, and goes on without it."""
     is_text = source.lstrip().startswith("<")
-    root = ElementTree.fromstring(source if is_text else Path(source).read_text(encoding="utf-8"))
+    root = ElementTree.fromstring(source if is_text else _text_of(Path(source), shown))
     folder = Path(source).resolve().parent if not is_text else Path()
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")

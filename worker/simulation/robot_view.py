@@ -45,6 +45,7 @@ class RobotView:
         defaults: Default position of each joint [m, rad].
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
         efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
+        gains: Force on each joint for one unit of its actuator's input, gear times gain [N, N m]; 1 where it has none.
         bodies: Column of each body in ``BodyArrays``.
         sites: Index of each site among the shapes of a world.
         site_bodies: Column of the body that each site is on; -1: it is on the world.
@@ -101,6 +102,8 @@ class RobotView:
         self.efforts = [
             _effort(template, dof, actuator) for dof, actuator in zip(self.dofs, self.actuators, strict=True)
         ]
+
+        self.gains = [_gain(template, actuator) for actuator in self.actuators]
 
     def _read_shapes(self, template: newton.ModelBuilder) -> None:
         mine = self._mine(template.shape_label)
@@ -165,7 +168,7 @@ class RobotView:
         arrays.start = self.start
         for name in ("coordinates", "dofs", "actuators"):
             setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.int32, device=device))
-        for name in ("defaults", "efforts"):
+        for name in ("defaults", "efforts", "gains"):
             setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.float32, device=device))
         ranges = np.array(self.ranges, np.float32).reshape(-1, 2)
         arrays.ranges = wp.array(ranges, dtype=wp.vec2, device=device)
@@ -232,6 +235,14 @@ def _effort(template: newton.ModelBuilder, dof: int, actuator: int) -> float:
             gain = abs(float(actuator_value(template, "actuator_gainprm", actuator)[0]))
             limits.append(gear * gain * max(map(abs, actuator_value(template, "actuator_ctrlrange", actuator))))
     return float(min(limits))
+
+
+def _gain(template: newton.ModelBuilder, actuator: int) -> float:
+    """Force on the joint for one unit of input; 1 where nothing acts."""
+    if actuator < 0:
+        return 1.0
+    gear = float(actuator_value(template, "actuator_gear", actuator)[0])
+    return gear * float(actuator_value(template, "actuator_gainprm", actuator)[0]) or 1.0
 
 
 def _is_limited(template: newton.ModelBuilder, what: str, actuator: int) -> bool:

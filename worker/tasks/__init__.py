@@ -39,6 +39,7 @@ _PUBLIC = {
     "worker.tasks.declared": ("DeclaredTask",),
     "worker.tasks.randomize": ("Randomize",),
     "worker.tasks.task": ("Task",),
+    "worker.tasks.term_needs": ("needs",),
     "worker.simulation.actuators": (
         *("DCMotorActuator", "EffortActuator", "ExplicitPDActuator", "PositionActuator", "VelocityActuator"),
     ),

@@ -6,11 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from shared_store.wording import nearest
+import warp as wp
+
+from shared_store.wording import nearest, shown
 from worker.simulation.robot_view import RobotView
-from worker.tasks.declaration import Pattern, Term
+from worker.simulation.sensors.height_scan import HeightScanArrays
+from worker.tasks.declaration import Command, Pattern, Term
 from worker.tasks.functions import STRUCTS, WIDTHS, Signature, is_robot, is_struct, is_warp, shown_type, signature
-from worker.tasks.numbers import EXPRESSIONS, Numbers
+from worker.tasks.numbers import EXPRESSIONS, Numbers, stays
+from worker.tasks.term_needs import Needs, needs_of
 
 
 @dataclass
@@ -67,6 +71,8 @@ class Binder:
         numbers: All numbers of the bound terms.
         structs: Variables of structs in the kernels, and their types.
         commands: First column in memory of each command, by name.
+        told: How many numbers of each command the policy is told.
+        hidden: How many numbers of each command are behind those.
         memory: Columns of ``episodes.memory`` that are given away.
         lasting: Columns of ``episodes.lasting`` that are given away.
         external: Columns of torch terms.
@@ -78,6 +84,8 @@ class Binder:
         self.numbers = Numbers()
         self.structs: dict[str, Any] = {}
         self.commands: dict[str, int] = {}
+        self.told: dict[str, int] = {}
+        self.hidden: dict[str, int] = {}
         self.actions: list[str] = []
         self.indices: list[int] = []
         self.memory = 0
@@ -96,6 +104,10 @@ class Binder:
         Raises:
             ValueError: The function or its parameters do not fit, in one line that names the place.
         """
+        for name, least in (("size", 1), ("memory", 0), ("lasting", 0)):
+            count = getattr(term, name)
+            if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < least):
+                raise ValueError(f"{place}: {name} is {shown(count)}; give a whole number from {least} up")
         if not is_warp(term.function):
             return self._bind_torch(place, term)
         try:
@@ -103,13 +115,14 @@ class Binder:
         except ValueError as error:
             raise ValueError(f"{place}: {error}") from error
         bound = Bound(place, term, found, width=max(found.width, 1))
+        given = dict(found.defaults) | term.parameters
         if found.element:
             if not element:
                 raise ValueError(
                     f"{place}: {found.name} has a parameter {found.element}, which there is nothing for here"
                 )
-            bound.elements, bound.element_names = self._elements(place, term, found)
-        given = dict(found.defaults) | term.parameters
+            bound.elements, bound.element_names = self._elements(place, term, found, given)
+        self._check_limits(bound)
         known = [name for name, kind in found.parameters.items() if is_named(name, kind, found)]
         for name in term.parameters:
             if name not in known:
@@ -129,22 +142,101 @@ class Binder:
         self.external += bound.width
         return bound
 
-    def _rows(self, place: str, term: Term, found: Signature) -> list[str]:
-        """The columns of the first sensor that a term reads; one without a sensor is called once."""
-        for name, kind in found.parameters.items():
-            if is_struct(kind) and kind not in STRUCTS and not is_robot(kind) and shown_type(kind) != "TerrainArrays":
-                sensor = self._sensor(place, name, kind, term.parameters.get(name))
-                rows: list[str] = self.sensors[sensor].rows(self.views)
-                return rows
-        return ["0"]
+    def _indices(self, place: str, term: Term, found: Signature, given: Mapping[str, Any]) -> list[str]:
+        """What a parameter ``index`` counts, by name: columns of sensors, numbers of a command, or what ``size`` says."""
+        needed = needs_of(term.function)
+        names, what = self._counted(place, found, given, needed)
+        if term.size is None:
+            if not names:
+                raise ValueError(f"{place}: say how often {found.name} is called, with size=")
+            return names
+        if names and not term.size <= len(names):
+            raise ValueError(f"{place}: size is {term.size}, more than the {len(names)} {what}; leave size= out")
+        return [str(index) for index in range(term.size)]
 
-    def _elements(self, place: str, term: Term, found: Signature) -> tuple[list[int], list[str]]:
+    def _counted(self, place: str, found: Signature, given: Mapping[str, Any], needed: Needs) -> tuple[list[str], str]:
+        """The names of all that an index may be, and what they are; none where the function does not say."""
+        if needed.size:
+            return [str(index) for index in range(needed.size)], f"elements of {found.name}"
+        if needed.numbers:
+            name = self._command_name(place, given.get("command"))
+            return [str(index) for index in range(self.told[name])], f"numbers of the command {name}"
+        counts: dict[str, int] = {}
+        names: list[str] = []
+        for parameter, kind in found.parameters.items():
+            if not _is_sensor(kind) or not _has_columns(kind):
+                continue
+            if needed.columns is not None and parameter not in needed.columns:
+                continue
+            sensor = self._sensor(place, parameter, kind, given.get(parameter))
+            rows: list[str] = self.sensors[sensor].rows(self.views)
+            if needed.points and kind is HeightScanArrays:
+                rows = self._frames_of(place, sensor, rows, needed.points, given)
+            counts[sensor] = len(rows)
+            names = names or rows
+        if len(set(counts.values())) > 1:
+            shown = " and ".join(f"{sensor} has {count}" for sensor, count in counts.items())
+            raise ValueError(f"{place}: {found.name} needs as many columns of each of its sensors; {shown}")
+        if needed.each > 1:
+            return [str(index) for index in range(needed.each * len(names))], f"elements of {found.name}"
+        return names, f"{'frames' if needed.points else 'columns'} of {', '.join(counts)}"
+
+    @staticmethod
+    def _frames_of(place: str, sensor: str, rows: list[str], points: str, given: Mapping[str, Any]) -> list[str]:
+        """The frames of a height scan, of which each has as many columns as the number ``points`` says."""
+        count = given.get(points)
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1 or len(rows) % count:
+            raise ValueError(
+                f"{place}: {points} is {shown(count)}, and the scan {sensor} has {len(rows)} columns; "
+                "give the number of its points for each frame"
+            )
+        return [str(frame) for frame in range(len(rows) // count)]
+
+    def _check_limits(self, bound: Bound) -> None:
+        """Refuse joints without the limits that a function needs."""
+        needed, view = needs_of(bound.term.function), self.views.get(bound.term.robot)
+        if view is None or bound.elements is None:
+            return
+        purpose = f"{bound.place}: {bound.term.function_name}"
+        if needed.ranges:
+            view.need_ranges(bound.elements, purpose)
+        if needed.efforts:
+            view.need_efforts(bound.elements, purpose)
+
+    def _memory(self, bound: Bound) -> int:
+        """How many numbers of its own a term keeps.
+
+        Raises:
+            ValueError: Nobody says how many, or the declaration says too few.
+        """
+        needed, term = needs_of(bound.term.function), bound.term
+        count = needed.memory
+        if needed.memory_each:
+            joints = bound.takes("joint")
+            values = len(self.views[term.robot].joint_names) if joints else 1 + max(bound.elements or [-1])
+            count += needed.memory_each * values
+        if not count and term.memory < 1:
+            raise ValueError(f"{bound.place}: {term.function_name} keeps numbers; say how many with memory=")
+        if 0 < term.memory < count:
+            raise ValueError(
+                f"{bound.place}: {term.function_name} keeps {count} numbers, and memory is {term.memory}; leave memory= out"
+            )
+        return max(count, term.memory)
+
+    def _elements(
+        self, place: str, term: Term, found: Signature, given: Mapping[str, Any]
+    ) -> tuple[list[int], list[str]]:
         element = found.element
         assert element is not None
         if element == "index":
-            names = self._rows(place, term, found) if term.size is None else [str(index) for index in range(term.size)]
+            names = self._indices(place, term, found, given)
             return list(range(len(names))), names
         if element == "action":
+            if not self.actions:
+                raise ValueError(
+                    f"{place}: {found.name} is called for each action, and a choice has none; read "
+                    "episodes.last_actions[world, 0] in a function of your own"
+                )
             return list(range(len(self.actions))), list(self.actions)
         view = self._view(place, term.robot)
         return find(
@@ -165,9 +257,7 @@ class Binder:
         if name == "seconds":
             return "seconds"
         if name == "memory":
-            if term.memory < 1:
-                raise ValueError(f"{place}: {term.function_name} keeps numbers; say how many with memory=")
-            bound.memory, self.memory = self.memory, self.memory + term.memory
+            bound.memory, self.memory = self.memory, self.memory + self._memory(bound)
             return str(bound.memory)
         if name == "lasting":
             if term.lasting < 1:
@@ -175,7 +265,7 @@ class Binder:
             first, self.lasting = self.lasting, self.lasting + term.lasting
             return str(first)
         if name == "command":
-            return str(self._command(place, given.get("command")))
+            return str(self._command(bound, given.get("command")))
         if is_struct(kind):
             return self._struct(bound, name, kind, given)
         if kind not in WIDTHS:
@@ -184,17 +274,54 @@ class Binder:
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
         if name not in given:
             raise ValueError(f"{place}: {term.function_name} needs {name}={shown_type(kind)}")
-        first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind])
+        # what a scan's columns are divided by is part of the kernel's bounds
+        check = stays(given[name]) if name == needs_of(term.function).points else None
+        first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind], check)
         return EXPRESSIONS[kind].format(*range(first, first + WIDTHS[kind]))
 
-    def _command(self, place: str, name: Any) -> int:
+    def reserve_command(self, name: str, term: Command) -> None:
+        """Give a command its columns in memory: what the policy is told, what is hidden, and its countdown.
+
+        Raises:
+            ValueError: Its function draws another count of numbers, or keeps more of them hidden.
+        """
+        drawn, place = needs_of(term.function), f"commands.{name}"
+        if drawn.command and drawn.command != len(term.names):
+            raise ValueError(
+                f"{place}: {term.function_name} draws {drawn.command} numbers; names= has {len(term.names)}"
+            )
+        if 0 < term.hidden < drawn.hidden:
+            raise ValueError(
+                f"{place}: {term.function_name} hides {drawn.hidden} numbers, and hidden is {term.hidden}; leave hidden= out"
+            )
+        steering = needs_of(term.update.function) if term.update else drawn
+        self.commands[name], self.told[name] = self.memory, len(term.names)
+        self.hidden[name] = max(term.hidden, drawn.hidden, steering.hidden)
+        self.memory += len(term.names) + self.hidden[name] + 1
+
+    def _command_name(self, place: str, name: Any) -> str:
         if name is None and len(self.commands) == 1:
-            return next(iter(self.commands.values()))
+            return next(iter(self.commands))
         if name not in self.commands:
             known = nearest(str(name), list(self.commands)) if self.commands else "the task declares none"
             wanted = "say which command it is of, with command=" if name is None else f"there is no command {name!r}"
             raise ValueError(f"{place}: {wanted}; {known}")
-        return self.commands[name]
+        return str(name)
+
+    def _command(self, bound: Bound, name: Any) -> int:
+        found = self._command_name(bound.place, name)
+        self.check_told(bound, found)
+        return self.commands[found]
+
+    def check_told(self, bound: Bound, command: str) -> None:
+        """Refuse a term that reads or writes more numbers than its command has."""
+        needed = needs_of(bound.term.function)
+        if needed.command > self.told[command] or needed.hidden > self.hidden[command]:
+            wanted = f"{needed.command} numbers" + (f" and {needed.hidden} hidden ones" if needed.hidden else "")
+            there = f"{self.told[command]}" + (f" and {self.hidden[command]}" if needed.hidden else "")
+            raise ValueError(
+                f"{bound.place}: {bound.term.function_name} needs a command of {wanted}; {command} has {there}"
+            )
 
     def _struct(self, bound: Bound, name: str, kind: Any, given: Mapping[str, Any]) -> str:
         place = bound.place
@@ -259,3 +386,13 @@ def is_named(name: str, kind: Any, found: Signature) -> bool:
     if is_struct(kind):
         return kind not in STRUCTS
     return name in found.numbers()
+
+
+def _is_sensor(kind: Any) -> bool:
+    """Whether a parameter wants what a sensor measured."""
+    return is_struct(kind) and kind not in STRUCTS and not is_robot(kind) and shown_type(kind) != "TerrainArrays"
+
+
+def _has_columns(kind: Any) -> bool:
+    """Whether a sensor's struct has a column for each of what it measures, besides the row of each world."""
+    return any(isinstance(each.type, wp.array) and each.type.ndim > 1 for each in kind.vars.values())

@@ -1,13 +1,17 @@
-"""Whether the arguments of a task, and what it says of itself, can be right."""
+"""Whether the arguments of a task, and what it says of itself and declares, can be right."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from shared_store.wording import nearest, shown
 from worker.tasks.interface import Interface, Observation
+from worker.tasks.numbers import flat
 
 if TYPE_CHECKING:
+    from worker.tasks import declaration
+    from worker.tasks.randomize import Randomize
     from worker.tasks.task import Task
 
 
@@ -24,6 +28,9 @@ def check_arguments(kind: type[Task], config: Any, world_count: int, seed: int, 
             f"task {task} has no reward terms; give {kind.config_type.__name__} a field "
             "`rewards: Mapping[str, float] = reward_weights(name=weight, ...)`"
         )
+    for name in config.curriculum:
+        if "." in name and not hasattr(kind, "declare"):
+            raise ValueError(f"task {task}: curriculum: it has no number {name}; declared tasks have such")
     if world_count < 1:
         raise ValueError(f"task {task} was asked for {world_count} worlds; ask for at least 1")
     if first_world < 0:
@@ -63,3 +70,70 @@ def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:
     if task.rewards.isnan().any():
         raise RuntimeError(f"the captured step of task {type(task).__name__} does not replay on {task.device}")
     return True
+
+
+def check_observation(place: str, term: declaration.Observation, columns: int) -> None:
+    """Raise ValueError for options of an observation that are none, or do not fit its columns."""
+    if term.noise_kind not in ("uniform", "normal") or not _is_number(term.noise) or term.noise < 0:
+        found = term.noise if term.noise_kind == "uniform" else (term.noise_kind, term.noise)
+        raise ValueError(
+            f'{place}: noise is {shown(found)}; give half the width, 0 or more, or ("normal", standard deviation)'
+        )
+    delay = term.delay
+    if not _is_pair(delay) or not all(map(_is_whole, delay)) or not 0 <= delay[0] <= delay[1]:
+        raise ValueError(
+            f"{place}: delay is {shown(delay)}; give whole control steps, from 0 up, or two, the lesser first"
+        )
+    if not _is_whole(term.history) or term.history < 1:
+        raise ValueError(f"{place}: history is {shown(term.history)}; it counts the present step, so it is 1 or more")
+    if not isinstance(term.unit, str) and len(term.unit) != columns:
+        raise ValueError(f"{place}: {len(term.unit)} units for {columns} columns; give one for all, or one for each")
+
+
+def check_command(place: str, term: declaration.Command) -> None:
+    """Raise ValueError for names or units of a command that can't be."""
+    if not term.names or not all(isinstance(name, str) for name in term.names):
+        raise ValueError(f"{place}: names are {shown(term.names)}; name each number that the policy is told")
+    if len(term.units) != len(term.names):
+        raise ValueError(f"{place}: {len(term.units)} units for {len(term.names)} numbers; give one for each")
+    if not _is_whole(term.hidden) or term.hidden < 0:
+        raise ValueError(f"{place}: hidden is {shown(term.hidden)}; give how many numbers, from 0 up")
+
+
+def check_randomized(
+    entries: Mapping[str, Randomize], place: str, value: Any, where: str, *, fill: bool = False
+) -> None:
+    """Refuse numbers that a job gives a place of ``randomize``.
+
+    Args:
+        entries: As declared.
+        place: Such as ``randomize.mass.range``.
+        value: The numbers.
+        where: What gives them, for the error.
+        fill: Whether all numbers of the place become ``value``.
+
+    Raises:
+        ValueError: There is no such place, or the entry can't have these numbers.
+    """
+    name, _, own = place.removeprefix("randomize.").partition(".")
+    known = [f"randomize.{key}.{each}" for key, entry in entries.items() for each in entry.places]
+    if place not in known:
+        raise ValueError(f"{where}: the task has no number {shown(place)}; {nearest(place, known) or 'it has none'}")
+    count = entries[name].places[own]
+    numbers = flat(f"{where}.{place}", [value] * count if fill else value, count)
+    try:
+        entries[name].check_numbers(own, numbers)
+    except ValueError as error:
+        raise ValueError(f"{where}.{place}: {error}") from error
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from worker.tasks.randomize import Randomize
+
 Pattern = str | Sequence[str]
 """Names of joints, bodies or sites: one or several, with ``*`` for any letters, in the order of the model."""
 
@@ -123,10 +125,10 @@ class Command(Term):
         **options: Any,
     ) -> None:
         super().__init__(function, **options)
-        self.names = tuple(names)
-        self.units = tuple(units) if units is not None else ("1",) * len(self.names)
+        self.names = _several(names)
+        self.units = _several(units) if units is not None else ("1",) * len(self.names)
         self.ranges = dict(ranges or {})
-        self.seconds = (float(seconds), float(seconds)) if isinstance(seconds, int | float) else tuple(seconds)
+        self.seconds = (float(seconds), float(seconds)) if isinstance(seconds, int | float) else seconds
         self.update = update
         self.hidden = hidden
 
@@ -244,9 +246,10 @@ class Observation(Term):
     ) -> None:
         super().__init__(function, **options)
         self.scale, self.offset = scale, offset
-        self.noise_kind, self.noise = ("uniform", noise) if isinstance(noise, int | float) else noise
+        is_pair = isinstance(noise, tuple | list) and len(noise) == 2
+        self.noise_kind, self.noise = noise if is_pair else ("uniform", noise)  # type: ignore[misc]
         self.clip = clip
-        self.delay = (0, delay) if isinstance(delay, int) else tuple(delay)
+        self.delay = (0, delay) if isinstance(delay, int) else delay
         self.history = history
         self.names = tuple(names) if names is not None else None
         self.unit, self.kind = unit, kind
@@ -363,6 +366,18 @@ class Declaration:
                         continue
                     if not isinstance(term, kind):
                         raise ValueError(f"{where}: expected {_a(kind.__name__)}, found {_a(type(term).__name__)}")
+        for name, entry in self.randomize.items():
+            if not isinstance(entry, Randomize):
+                raise ValueError(f"randomize.{name}: expected a Randomize, found {_a(type(entry).__name__)}")
+        for name, sensor in self.sensors.items():
+            if not isinstance(name, str) or not NAME.fullmatch(name):
+                raise ValueError(
+                    f"sensors.{name}: a name has small letters, digits and underscores, and begins with a letter"
+                )
+            if not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
+                raise ValueError(
+                    f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {_a(type(sensor).__name__)}"
+                )
         if "policy" not in self.groups:
             there = ", ".join(self.observations)
             if "policy" in self.images:
@@ -407,6 +422,11 @@ SECTIONS: Mapping[str, type[Term]] = {
 """The sections of a declaration and what their terms are."""
 
 TorchFunction = Callable[..., Any]
+
+
+def _several(names: Any) -> tuple[Any, ...]:
+    """Names as a tuple; one that stands alone is one."""
+    return tuple(names) if isinstance(names, Sequence) and not isinstance(names, str) else (names,)
 
 
 def _a(name: str) -> str:

@@ -6,10 +6,11 @@ A term's function is a ``@wp.func`` whose parameters and result are annotated. I
 - by type: ``WorldArrays``, ``EpisodeArrays``, ``BodyArrays``, ``TerrainArrays``, ``RobotArrays`` (of the term's robot; further
   ones are named by a keyword of the parameter's own name), and the structs of sensors (named the same way);
 - ``joint``, ``body``, ``site``, ``index`` (int): it is called for each element of the term's selection;
-- ``action: int``: it is called for each action, or for those of the term's ``actions``;
+- ``action: int``: it is called for each action;
 - ``stream: wp.uint32``: a random generator of its own;
 - ``command: int``: the first column of the command that the keyword ``command`` names (of a command's own function: its own);
-- ``memory: int``, ``lasting: int``: the first column of the term's own numbers in ``episodes.memory`` and ``episodes.lasting``;
+- ``memory: int``, ``lasting: int``: the first column of the term's own numbers in ``episodes.memory`` and ``episodes.lasting``
+  (how many, :func:`worker.tasks.term_needs.needs` says beside the function, or the term's ``memory=``, ``lasting=``);
 - ``value: float`` (actions): offset + scale * action; ``choice: int`` (choices): number of the choice;
 - ``terminated: bool`` (rewards, metrics): whether a termination ended the episode in this step;
 - ``seconds: float``: the length of a control step;

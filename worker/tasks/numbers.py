@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import warp as wp
@@ -26,6 +26,34 @@ EXPRESSIONS: Mapping[Any, str] = {
 """How a kernel reads a value of each type from the array."""
 
 
+Check = Callable[[list[float]], str | None]
+"""What is wrong with the numbers of a place, in a few words; None where nothing is."""
+
+
+def in_order(ends: list[float]) -> str | None:
+    """Least and greatest value."""
+    return None if ends[0] <= ends[1] else f"expected the lesser number first, found {ends}"
+
+
+def are_times(ends: list[float]) -> str | None:
+    """Least and greatest time [s]."""
+    if 0.0 < ends[0] <= ends[1] < math.inf:
+        return None
+    return f"expected the least and the greatest time, above 0 and finite, found {ends}"
+
+
+def is_amount(values: list[float]) -> str | None:
+    """Numbers from 0 up."""
+    return None if min(values) >= 0.0 and max(values) < math.inf else f"expected 0 or more, found {values}"
+
+
+def stays(declared: float) -> Check:
+    """The number that the declaration gave, and no other."""
+    return lambda values: (
+        None if values == [float(declared)] else f"the declaration alone can change it from {declared}"
+    )
+
+
 class Numbers:
     """All numbers of a task, in the order in which they are added.
 
@@ -37,26 +65,47 @@ class Numbers:
     def __init__(self) -> None:
         self.values: list[float] = []
         self.places: dict[str, tuple[int, int]] = {}
+        self._checks: dict[str, Check] = {}
 
-    def add(self, place: str, value: Any, count: int) -> int:
+    def add(self, place: str, value: Any, count: int, check: Check | None = None) -> int:
         """Add the ``count`` numbers of a place; returns the index of the first.
 
+        Args:
+            place: Of the numbers.
+            value: As declared.
+            count: How many there must be.
+            check: What else they must be, now and whenever a job changes them.
+
         Raises:
-            ValueError: The value is not that many numbers.
+            ValueError: The value is not that many numbers, or ``check`` refuses them.
         """
         first = len(self.values)
-        self.values += flat(place, value, count)
+        if check is not None:
+            self._checks[place] = check
+        self.values += self._checked(place, place, value, count)
         self.places[place] = (first, count)
         return first
+
+    def _checked(self, shown_place: str, place: str, value: Any, count: int) -> list[float]:
+        numbers = flat(shown_place, value, count)
+        complaint = self._checks[place](numbers) if place in self._checks else None
+        if complaint:
+            raise ValueError(f"{shown_place}: {complaint}")
+        return numbers
 
     def set(self, place: str, value: Any, where: str) -> None:
         """Change the numbers of a place, as ``config.numbers`` says under ``where``.
 
         Raises:
-            ValueError: There is no such place, or the value is not as many numbers.
+            ValueError: There is no such place, or the value is not as many numbers, or not such as the place can have.
         """
         first, count = self.find(place, where)
-        self.values[first : first + count] = flat(f"{where}.{place}", value, count)
+        self.values[first : first + count] = self._checked(f"{where}.{place}", place, value, count)
+
+    def check_filled(self, place: str, value: float, where: str) -> None:
+        """Refuse a value that all numbers of a place are to have in the course of training. Raises ValueError."""
+        _, count = self.find(place, where)
+        self._checked(f"{where}.{place}", place, [value] * count, count)
 
     def find(self, place: str, where: str) -> tuple[int, int]:
         """First index and count of a place.

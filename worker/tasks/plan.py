@@ -11,12 +11,13 @@ from shared_store.wording import nearest
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView
 from worker.tasks.binding import Binder, Bound
+from worker.tasks.checks import check_command, check_observation, check_randomized
 from worker.tasks.config import TaskConfig
 from worker.tasks.contract import described
 from worker.tasks.declaration import Adaptive, Choice, Command, Curriculum, Declaration, Event, Observation, Term
 from worker.tasks.images import cameras
 from worker.tasks.interface import deviations
-from worker.tasks.numbers import flat
+from worker.tasks.numbers import are_times, flat, in_order, is_amount
 
 JUDGED = {"terminated": "terminated"}
 DRAWN = {"stream": "stream"}
@@ -87,19 +88,15 @@ class Driven:
 
 @dataclass
 class Told:
-    """A command: its own term and the update of each step, its columns in memory, and the bounds of its duration."""
+    """A command: its own term and the update of each step, its first column in memory, that of the control steps for which
+    it still holds, and the bounds of its duration.
+    """
 
     bound: Bound
     update: Bound | None
     first: int
+    countdown: int
     seconds: int
-
-    @property
-    def countdown(self) -> int:
-        """Column in memory of the control steps for which it still holds."""
-        term = self.bound.term
-        assert isinstance(term, Command)
-        return self.first + len(term.names) + term.hidden
 
 
 @dataclass
@@ -155,12 +152,15 @@ class Plan:
         self.groups = {name: self._group(name, terms) for name, terms in declaration.groups.items()}
         self.images = cameras(declaration, config, sensors, views)
         for place, value in config.numbers.items():
-            if place.startswith("randomize."):
-                continue  # the randomisation's own, which only the built task has
-            self.numbers.set(place, value, "config.numbers")
+            if place.startswith("randomize."):  # the built task sets it
+                check_randomized(declaration.randomize, place, value, "config.numbers")
+            else:
+                self.numbers.set(place, value, "config.numbers")
+        for place, points in config.curriculum.items():
+            if "." in place:  # else a reward's weight, or the level
+                self._check_course(place, [value for _, value in points], "config.curriculum")
         for name, rule in self.adaptive.items():
-            if not rule.place.startswith("randomize."):
-                self.numbers.find(rule.place, f"curricula.{name}")
+            self._check_course(rule.place, [rule.start, rule.end], f"curricula.{name}")
         self._blur(config.randomize.observation_noise)
         if critic := self._exact():
             self.groups["critic"] = critic
@@ -204,11 +204,19 @@ class Plan:
             return f"ended_{ends.index(name)}"
         raise ValueError(f"success: no metric and no termination is called {name}; {nearest(name, [*metrics, *ends])}")
 
+    def _check_course(self, place: str, values: list[float], where: str) -> None:
+        """Refuse a place that is none, or a value that all its numbers can't have in the course of training."""
+        for value in values:
+            if place.startswith("randomize."):
+                check_randomized(self.declaration.randomize, place, value, where, fill=True)
+            else:
+                self.numbers.check_filled(place, value, where)
+
     def _reserve_commands(self) -> None:
         """Columns of all commands first, so that any term may name any of them."""
         for name, term in self.declaration.commands.items():
-            self.binder.commands[name] = self.binder.memory
-            self.binder.memory += len(term.names) + term.hidden + 1
+            check_command(f"commands.{name}", term)
+            self.binder.reserve_command(name, term)
 
     def _bind_actions(self) -> None:
         declared = self.declaration.actions
@@ -231,7 +239,7 @@ class Plan:
                 )
             self.binder.actions += bound.element_names
             offset = self._default(place, bound) if term.offset == "default" else term.offset
-            clip = self.numbers.add(f"{place}.clip", term.clip, 2) if term.clip is not None else None
+            clip = self.numbers.add(f"{place}.clip", term.clip, 2, in_order) if term.clip is not None else None
             scale = self._columns(f"{place}.scale", term.scale, bound.element_names)
             self.driven.append(
                 Driven(bound, first, scale, self._columns(f"{place}.offset", offset, bound.element_names), clip)
@@ -263,11 +271,10 @@ class Plan:
         update = None
         if term.update is not None:
             update = self._bind("commands", f"{name}.update", term.update, element=False, own=own)
-        if not 0.0 < term.seconds[0] <= term.seconds[1]:
-            raise ValueError(
-                f"{place}: seconds are {list(term.seconds)}; give the least and the greatest time, above 0"
-            )
-        return Told(bound, update, first, self.numbers.add(f"{place}.seconds", term.seconds, 2))
+            self.binder.check_told(update, name)
+        countdown = first + self.binder.told[name] + self.binder.hidden[name]
+        seconds = self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times)
+        return Told(bound, update, first, countdown, seconds)
 
     def _bind_rewards(self) -> list[Bound]:
         weights, declared = self.config.rewards, self.declaration.rewards
@@ -289,10 +296,10 @@ class Plan:
             raise ValueError(f"{place}: when is {term.when!r}; it is reset, interval or startup")
         if term.when != "interval":
             return Happening(bound)
-        if term.seconds is None or not 0.0 < term.seconds[0] <= term.seconds[1]:
+        if term.seconds is None:
             raise ValueError(f"{place}: an interval needs seconds=(least, greatest), above 0")
         column, self.binder.memory = self.binder.memory, self.binder.memory + 1
-        return Happening(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2))
+        return Happening(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times))
 
     def _group(self, group: str, terms: Mapping[str, Observation]) -> list[Seen]:
         if not terms:
@@ -313,11 +320,8 @@ class Plan:
         place = f"{section}.{name}"
         bound = self._bind(section, name, term, own=DRAWN)
         names = column_names(place, name, term, bound)
-        least, greatest = term.delay
-        if not 0 <= least <= greatest:
-            raise ValueError(f"{place}: delay is {list(term.delay)}; give control steps, from 0 up")
-        if term.history < 1:
-            raise ValueError(f"{place}: history is {term.history}; it counts the present step, so it is 1 or more")
+        check_observation(place, term, len(names))
+        greatest = term.delay[1]
         past = -1
         if greatest:
             past, self.past = self.past, self.past + 1 + greatest * len(names)
@@ -326,8 +330,10 @@ class Plan:
         offset = (
             self._columns(f"{place}.offset", value, names) if isinstance(value, list | tuple) or value != 0.0 else None
         )
-        noise = self._columns(f"{place}.noise", term.noise, names) if noisy and term.noise != 0.0 else None
-        clip = self.numbers.add(f"{place}.clip", term.clip, 2) if term.clip is not None else None
+        noise = None
+        if noisy and term.noise != 0.0:
+            noise = Column(self.numbers.add(f"{place}.noise", term.noise, 1, is_amount), False)
+        clip = self.numbers.add(f"{place}.clip", term.clip, 2, in_order) if term.clip is not None else None
         return Seen(bound, names, first, scale, offset, noise, clip, term.noise_kind == "normal", past)
 
     def _blur(self, noise: float | Mapping[str, float]) -> None:

@@ -9,8 +9,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
@@ -179,6 +180,23 @@ class Randomize:
         if isinstance(self.range, Mapping):
             return tuple(self.range[axis] for axis in self.drawn_axes)
         return (self.range,) * max(1, len(self.drawn_axes))
+
+    @property
+    def places(self) -> dict[str, int]:
+        """Places of its numbers, such as ``range``, ``range.x`` and ``seconds``, and how many each has."""
+        if isinstance(self.range, Mapping):
+            found = {f"range.{axis}": 2 for axis in self.drawn_axes}
+        else:
+            found = {"range": 2 * len(self.ends)}
+        return found | ({"seconds": 2} if self.when == "interval" else {})
+
+    def check_numbers(self, place: str, values: Sequence[float]) -> None:
+        """Refuse numbers that a job gives one of :attr:`places`, as if they were declared. Raises ValueError."""
+        for pair in zip(values[::2], values[1::2], strict=True):
+            if place == "seconds":
+                dataclasses.replace(self, seconds=pair)
+            else:
+                self._check_range(pair)
 
     @property
     def _where(self) -> str:

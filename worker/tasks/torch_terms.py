@@ -51,7 +51,8 @@ class TorchTerms:
         parameters: dict[str, Any] = bound.term.parameters
         given = bound.term.function(self._task, **parameters)
         worlds = self._task.world_count
-        if not isinstance(given, torch.Tensor) or given.numel() != worlds * bound.width:
+        fitting = [(worlds, bound.width)] + ([(worlds,)] if bound.width == 1 else [])
+        if not isinstance(given, torch.Tensor) or tuple(given.shape) not in fitting:
             found = tuple(given.shape) if isinstance(given, torch.Tensor) else type(given).__name__
             raise ValueError(
                 f"task {type(self._task).__name__}: {bound.place}: {bound.term.function_name} gives {found}; "

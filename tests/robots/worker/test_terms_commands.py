@@ -83,12 +83,13 @@ def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
     columns, coordinates = rig.robot.actuators.numpy(), rig.robot.coordinates.numpy()
     for joint in range(JOINTS - 1):
         bias, effort = rig.robot.encoder_bias.numpy()[:, joint], rig.robot.efforts.numpy()[joint]
+        gain = rig.robot.gains.numpy()[joint]
         low, high = rig.robot.ranges.numpy()[joint]
         here = rig.q[:, coordinates[joint]]
         for name, numbers, wanted in (
             ("effort", {"value": 1.7}, 1.7),
-            ("limited_effort", {"value": 0.4}, 0.4 * effort),
-            ("limited_effort", {"value": -7.0}, -effort),
+            ("limited_effort", {"value": 0.4}, 0.4 * effort / gain),
+            ("limited_effort", {"value": -7.0}, -effort / gain),
             ("position_target", {"value": 0.3}, 0.3 - bias),
             ("limited_position_target", {"value": 9.0, "soft_factor": 0.8}, high - 0.1 * (high - low) - bias),
             ("relative_position_target", {"value": 0.2}, here + 0.2),

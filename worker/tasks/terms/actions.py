@@ -11,6 +11,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,14 +33,16 @@ def effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, valu
 
 @wp.func
 def limited_effort(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A share of the greatest force or torque of the actuator, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+    """A share of the greatest force or torque on the joint, ``value`` in [-1, 1]; of one without a limit ``value`` itself [N, N m].
+
+    It is that of a <motor>: its input is the force over its gear and gain.
 
     mjlab: -. Isaac Lab: -.
     """
     greatest = robot.efforts[joint]
     if not wp.isfinite(greatest):
         greatest = 1.0
-    worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0)
+    worlds.controls[world, robot.actuators[joint]] = greatest * wp.clamp(value, -1.0, 1.0) / robot.gains[joint]
 
 
 @wp.func
@@ -76,6 +79,7 @@ def relative_position_target(world: int, worlds: WorldArrays, robot: RobotArrays
     worlds.controls[world, robot.actuators[joint]] = worlds.joint_q[world, robot.coordinates[joint]] + value
 
 
+@needs(ranges=True)
 @wp.func
 def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
     """A position target between the joint's limits: ``value`` -1 is the lower, 1 the upper; clipped. The joint must have limits.
@@ -87,6 +91,7 @@ def share_of_range_target(world: int, worlds: WorldArrays, robot: RobotArrays, j
     aim(worlds, robot, world, joint, 0.5 * (ends[0] + ends[1]) + 0.5 * share * (ends[1] - ends[0]))
 
 
+@needs(memory_each=2)
 @wp.func
 def smoothed_position_target(
     world: int,
@@ -100,8 +105,7 @@ def smoothed_position_target(
 ):
     """A position target that follows ``value`` slowly: t = share * value + (1 - share) * t of the step before [m, rad].
 
-    ``memory`` is twice the number of the robot's joints: a target and whether there is one. The first target of an episode is where
-    the joint is.
+    The first target of an episode is where the joint is.
 
     mjlab: -. Isaac Lab: EMAJointPositionToLimitsAction (without its scaling to the limits).
     """

@@ -101,8 +101,10 @@ def _shown(parameter: inspect.Parameter) -> str:
         return {"joint": "`joints`", "body": "`bodies`", "site": "`sites`"}[name]
     if name == "index":
         return "`size`"
-    if name in ("action", "memory", "command"):
-        return "" if name == "action" else f"`{name}`"
+    if name in ("action", "memory"):
+        return ""
+    if name == "command":
+        return "`command`"
     if parameter.default is inspect.Parameter.empty:
         return f"`{name}`: {kind}"
     return f"`{name}`: {kind} = {_default(parameter.default)}"
@@ -122,8 +124,8 @@ The functions of `worker.tasks.terms`. A declared task names them, such as
 terms each stands for. This page is written by `python -m worker.tasks.terms` from the functions' docstrings.
 
 - **Given** is what a declaration says: `joints`, `bodies`, `sites` are patterns, and the function is called for each that fits;
-  `size` is how often it is called, with `index` from 0; `command` names a command, `memory` is how many numbers of its
-  own the function keeps. A parameter with a type of `...Arrays` is given by the name of a sensor or, for `RobotArrays`, of a robot or
+  `size` is how often it is called, with `index` from 0, by default for each column of its sensor; `command` names a command.
+  A parameter with a type of `...Arrays` is given by the name of a sensor or, for `RobotArrays`, of a robot or
   object; one that fits alone needs no name. All others are numbers in the unit that the meaning says; those with `=` have a default.
 - `robot=` names the robot or object that a function is about, `"robot"` by default.
 - A function that is called for several elements gives the sum over them as a reward or metric, one column after the other as

@@ -20,6 +20,7 @@ from worker.simulation.kinematics import (
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.placing import between
 
 wp.set_module_options({"enable_backward": False})
@@ -34,6 +35,7 @@ TARGET = wp.constant(3)
 """First of three hidden columns of :func:`planar_pose_command`, counted from the command's first."""
 
 
+@needs(command=3)
 @wp.func
 def velocity_command(
     world: int,
@@ -74,6 +76,7 @@ def velocity_command(
         episodes.memory[world, command + axis] = velocity[axis]
 
 
+@needs(command=3)
 @wp.func
 def moving_velocity_command(
     world: int,
@@ -105,6 +108,7 @@ def moving_velocity_command(
         )
 
 
+@needs(command=3, hidden=6)
 @wp.func
 def heading_velocity_command(
     world: int,
@@ -121,7 +125,7 @@ def heading_velocity_command(
     forward_share: float = 0.0,
     least_forward: float = 0.3,
 ):
-    """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and ``hidden=6``.
+    """Draw velocities as :func:`velocity_command`, and a heading in the world [rad]; 3 numbers and 6 hidden ones.
 
     Give it ``update=Term(terms.steer_velocity_command, ...)``: for ``heading_share`` of all commands that turns the robot to its
     heading, and for ``world_share`` it keeps the direction fixed in the world. Standing, these two and going straight ahead are drawn
@@ -147,6 +151,7 @@ def heading_velocity_command(
         episodes.memory[world, command + axis] = velocity[axis]
 
 
+@needs(command=3, hidden=6)
 @wp.func
 def steer_velocity_command(
     world: int,
@@ -178,6 +183,7 @@ def steer_velocity_command(
         episodes.memory[world, command + 1] = wp.cos(yaw) * along_y - wp.sin(yaw) * along_x
 
 
+@needs(command=1)
 @wp.func
 def number_command(world: int, episodes: EpisodeArrays, command: int, stream: wp.uint32, bounds: wp.vec2):
     """Draw one number evenly from ``bounds``, such as a height to stand at.
@@ -187,6 +193,7 @@ def number_command(world: int, episodes: EpisodeArrays, command: int, stream: wp
     episodes.memory[world, command] = wp.randf(stream, bounds[0], bounds[1])
 
 
+@needs(command=3)
 @wp.func
 def position_command(
     world: int, episodes: EpisodeArrays, command: int, stream: wp.uint32, x: wp.vec2, y: wp.vec2, z: wp.vec2
@@ -200,6 +207,7 @@ def position_command(
     episodes.memory[world, command + 2] = wp.randf(stream, z[0], z[1])
 
 
+@needs(command=3)
 @wp.func
 def lift_command(
     world: int,
@@ -236,6 +244,7 @@ def lift_command(
         worlds.joint_qd[world, robot.root_dof + axis] = 0.0
 
 
+@needs(command=7)
 @wp.func
 def pose_command(
     world: int,
@@ -264,6 +273,7 @@ def pose_command(
         episodes.memory[world, command + 3 + axis] = rotation[axis]
 
 
+@needs(command=3, hidden=3)
 @wp.func
 def planar_pose_command(
     world: int,
@@ -276,7 +286,7 @@ def planar_pose_command(
     y: wp.vec2,
     heading: wp.vec2,
 ):
-    """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and ``hidden=3``.
+    """Draw a place on the ground around the robot's start [m] and a heading there [rad]; 3 numbers and 3 hidden ones.
 
     The numbers are forward and left to the place [m] and left to the heading [rad], as the robot stands now. Give it
     ``update=Term(terms.steer_planar_pose_command)``, which calculates them again in every step.
@@ -290,6 +300,7 @@ def planar_pose_command(
     steer_planar_pose_command(world, worlds, episodes, robot, command)
 
 
+@needs(command=3, hidden=3)
 @wp.func
 def steer_planar_pose_command(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, command: int
@@ -307,15 +318,17 @@ def steer_planar_pose_command(
     episodes.memory[world, command + 2] = wrapped_angle(episodes.memory[world, command + TARGET + 2] - yaw)
 
 
+@needs(numbers=True)
 @wp.func
 def command_number(world: int, episodes: EpisodeArrays, command: int, index: int) -> float:
-    """Number ``index`` of a command (``size=`` how many the policy is told) [unit of the command].
+    """Number ``index`` of a command, by default of all that the policy is told [unit of the command].
 
     mjlab: generated_commands. Isaac Lab: generated_commands.
     """
     return episodes.memory[world, command + index]
 
 
+@needs(command=3)
 @wp.func
 def command_vector(world: int, episodes: EpisodeArrays, command: int) -> wp.vec3:
     """The first three numbers of a command, such as velocities or a position [unit of the command].
@@ -327,6 +340,7 @@ def command_vector(world: int, episodes: EpisodeArrays, command: int) -> wp.vec3
     )
 
 
+@needs(command=7)
 @wp.func
 def command_rotation(world: int, episodes: EpisodeArrays, command: int) -> wp.quat:
     """The rotation of a pose command, its numbers 3 to 6, a quaternion xyzw.
@@ -341,6 +355,7 @@ def command_rotation(world: int, episodes: EpisodeArrays, command: int) -> wp.qu
     )
 
 
+@needs(command=3)
 @wp.func
 def command_speed(world: int, episodes: EpisodeArrays, command: int) -> float:
     """How much a velocity command asks for: speed [m/s] + magnitude of the turning velocity [rad/s].

@@ -1,6 +1,6 @@
 """Contacts: what a contact sensor measured, and rewards of feet.
 
-Each function is called with ``index``, a column of the sensor (``size=`` how many it has). Where it takes frames as well, column
+Each function is called with ``index``, a column of the sensor, by default each. Where it takes frames as well, column
 ``index`` of both sensors must be the same foot: name feet in the same order in both. A term with a velocity command counts only
 while the command asks for more than its ``threshold``, speed [m/s] + turning velocity [rad/s].
 """
@@ -12,6 +12,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.sensors.contact import ContactArrays, first_air, first_contact, steps_above, strongest_contact
 from worker.simulation.sensors.frames import FrameArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.commands import command_speed
 
 wp.set_module_options({"enable_backward": False})
@@ -256,6 +257,32 @@ def foot_clearance(
 
 
 @wp.func
+def swing_error(
+    world: int,
+    episodes: EpisodeArrays,
+    contacts: ContactArrays,
+    index: int,
+    command: int,
+    memory: int,
+    clearance: float,
+    height: float,
+    threshold: float,
+) -> float:
+    """At touchdown (p / height - 1)^2, p the greatest ``clearance`` of the foot in its swing [m], else 0; it remembers p."""
+    peak = episodes.memory[world, memory + index]
+    if not touches(contacts, world, index):
+        peak = wp.max(peak, clearance)
+    error = float(0.0)
+    if first_contact(contacts, world, index):
+        if command_speed(world, episodes, command) > threshold:
+            error = (peak / height - 1.0) * (peak / height - 1.0)
+        peak = 0.0
+    episodes.memory[world, memory + index] = peak
+    return error
+
+
+@needs(memory_each=1)
+@wp.func
 def swing_height_error(
     world: int,
     episodes: EpisodeArrays,
@@ -269,20 +296,12 @@ def swing_height_error(
 ) -> float:
     """At touchdown (p / height - 1)^2, p the greatest height of the foot above z = 0 in its swing [m], else 0.
 
-    It counts while the command asks for more than ``threshold``. ``memory`` is the number of feet.
+    It counts while the command asks for more than ``threshold``.
 
     mjlab: feet_swing_height (on flat ground). Isaac Lab: -.
     """
-    peak = episodes.memory[world, memory + index]
-    if not touches(contacts, world, index):
-        peak = wp.max(peak, frames.positions[world, index][2])
-    error = float(0.0)
-    if first_contact(contacts, world, index):
-        if command_speed(world, episodes, command) > threshold:
-            error = (peak / height - 1.0) * (peak / height - 1.0)
-        peak = 0.0
-    episodes.memory[world, memory + index] = peak
-    return error
+    clearance = frames.positions[world, index][2]
+    return swing_error(world, episodes, contacts, index, command, memory, clearance, height, threshold)
 
 
 @wp.func

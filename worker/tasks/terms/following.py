@@ -204,7 +204,7 @@ def followed_body_too_far(
     command: int,
     limit: float,
 ) -> bool:
-    """Whether body ``index`` of the motion (``size=`` their number) is more than ``limit`` from its relative reference [m].
+    """Whether body ``index`` of the motion is more than ``limit`` from its relative reference [m].
 
     mjlab: bad_motion_body_pos. Isaac Lab: bad_motion_body_pos (of BeyondMimic).
     """
@@ -221,7 +221,7 @@ def followed_body_height_off(
     command: int,
     limit: float,
 ) -> bool:
-    """Whether body ``index`` of the motion (``size=`` their number) is more than ``limit`` above or below its relative reference [m].
+    """Whether body ``index`` of the motion is more than ``limit`` above or below its relative reference [m].
 
     mjlab: bad_motion_body_pos_z_only. Isaac Lab: bad_motion_body_pos_z_only (of BeyondMimic).
     """

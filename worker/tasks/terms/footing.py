@@ -12,11 +12,12 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.kinematics import body_rotation_of
 from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.sensors.contact import ContactArrays, first_contact
+from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.commands import command_speed
-from worker.tasks.terms.contacts import planar_speed, touches
+from worker.tasks.terms.contacts import planar_speed, swing_error
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,6 +27,7 @@ _LINE = wp.constant(1.0e-6)
 """Points are on a line where their second variance is not above this times the greatest."""
 
 
+@needs(points="points")
 @wp.func
 def frame_clearance(world: int, scan: HeightScanArrays, index: int, points: int) -> float:
     """Least height of frame ``index`` of a scan above the ground at its points, not below 0 [m], such as of a foot.
@@ -38,6 +40,7 @@ def frame_clearance(world: int, scan: HeightScanArrays, index: int, points: int)
     return wp.max(least, 0.0)
 
 
+@needs(points="points")
 @wp.func
 def swung_foot_clearance(
     world: int,
@@ -59,31 +62,7 @@ def swung_foot_clearance(
     return wp.abs(frame_clearance(world, scan, index, points) - height) * planar_speed(frames, world, index)
 
 
-@wp.func
-def swing_error(
-    world: int,
-    episodes: EpisodeArrays,
-    contacts: ContactArrays,
-    index: int,
-    command: int,
-    memory: int,
-    clearance: float,
-    height: float,
-    threshold: float,
-) -> float:
-    """At touchdown (p / height - 1)^2, p the greatest ``clearance`` of the foot in its swing [m], else 0; it remembers p."""
-    peak = episodes.memory[world, memory + index]
-    if not touches(contacts, world, index):
-        peak = wp.max(peak, clearance)
-    error = float(0.0)
-    if first_contact(contacts, world, index):
-        if command_speed(world, episodes, command) > threshold:
-            error = (peak / height - 1.0) * (peak / height - 1.0)
-        peak = 0.0
-    episodes.memory[world, memory + index] = peak
-    return error
-
-
+@needs(memory_each=1, points="points")
 @wp.func
 def swung_foot_height_error(
     world: int,
@@ -99,7 +78,7 @@ def swung_foot_height_error(
 ) -> float:
     """At touchdown (p / height - 1)^2, p the greatest :func:`frame_clearance` of the foot in its swing [m], else 0.
 
-    It counts while the command asks for more than ``threshold``. ``memory`` is the number of feet.
+    It counts while the command asks for more than ``threshold``.
 
     mjlab: feet_swing_height. Isaac Lab: -.
     """

@@ -18,9 +18,9 @@ from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.simulation.terrain_arrays import TerrainArrays, ground_height, on_terrain, terrain_origin
 from worker.simulation.terrain_levels import walked_levels
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.commands import command_speed
-from worker.tasks.terms.contacts import planar_speed
-from worker.tasks.terms.footing import swing_error
+from worker.tasks.terms.contacts import planar_speed, swing_error
 from worker.tasks.terms.placing import NONE, between, place_root
 
 wp.set_module_options({"enable_backward": False})
@@ -150,6 +150,7 @@ def foot_clearance_above_ground(
     return wp.abs(error) * planar_speed(frames, world, index)
 
 
+@needs(memory_each=1)
 @wp.func
 def swing_height_error_above_ground(
     world: int,
@@ -165,7 +166,7 @@ def swing_height_error_above_ground(
 ) -> float:
     """At touchdown (p / height - 1)^2, p the greatest height of the foot above the ground in its swing [m], else 0.
 
-    It counts while the command asks for more than ``threshold``. ``memory`` is the number of feet.
+    It counts while the command asks for more than ``threshold``.
 
     mjlab: feet_swing_height. Isaac Lab: -.
     """

@@ -10,6 +10,7 @@ import warp as wp
 from worker.simulation.kinematics import wrapped_angle
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -194,6 +195,7 @@ def joint_effort_magnitude(world: int, worlds: WorldArrays, robot: RobotArrays, 
     return wp.abs(joint_effort(world, worlds, robot, joint))
 
 
+@needs(efforts=True)
 @wp.func
 def joint_effort_excess(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 0.9
@@ -283,6 +285,7 @@ def joint_too_fast(world: int, worlds: WorldArrays, robot: RobotArrays, joint: i
     return wp.abs(joint_velocity(world, worlds, robot, joint)) > limit
 
 
+@needs(efforts=True)
 @wp.func
 def joint_effort_at_limit(
     world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, soft_factor: float = 1.0

@@ -21,6 +21,7 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.commands import command_rotation, command_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -226,6 +227,7 @@ def object_at_target(
     return wp.where(object_target_distance(world, worlds, episodes, robot, command) < distance, 1.0, 0.0)
 
 
+@needs(memory=1)
 @wp.func
 def object_was_at_target(
     world: int,
@@ -236,7 +238,7 @@ def object_was_at_target(
     memory: int,
     distance: float,
 ) -> float:
-    """1 from the step on in which an object, which ``robot=`` names, was closer to its target than ``distance`` [m]; ``memory=1``.
+    """1 from the step on in which an object, which ``robot=`` names, was closer to its target than ``distance`` [m].
 
     It holds until the episode ends, also where a new target is drawn before.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -11,7 +11,10 @@ import numpy as np
 import torch
 import warp as wp
 
+from worker.simulation.sensors.places import place_names
+
 if TYPE_CHECKING:
+    from worker.simulation.robot_view import RobotView
     from worker.simulation.sensors.sensor import SensorContext
 
 wp.set_module_options({"enable_backward": False})
@@ -78,6 +81,10 @@ class Motion:
     bodies: str | Sequence[str]
     anchor: str
     robot: str = "robot"
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each body that is followed. Raises ValueError where a pattern or a name matches nothing."""
+        return place_names(views, "Motion", self.robot, bodies=self.bodies)
 
     def build(self, context: SensorContext) -> RecordedMotion:
         """The motion on the device of these worlds.

@@ -23,6 +23,7 @@ from worker.simulation.kinematics import (
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,9 +64,10 @@ def root_orientation(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp.
     return unique_quaternion(root_rotation_of(worlds, robot, world))
 
 
+@needs(size=6)
 @wp.func
 def root_orientation_element(world: int, worlds: WorldArrays, robot: RobotArrays, index: int) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the root's rotation matrix, row by row.
+    """Element ``index``, one of six, of the first two columns of the root's rotation matrix, row by row.
 
     mjlab: -. Isaac Lab: -.
     """

@@ -8,6 +8,7 @@ from worker.simulation.kinematics import turn_element, unique_quaternion
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
+from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -94,9 +95,10 @@ def frame_orientation(world: int, frames: FrameArrays, index: int) -> wp.quat:
     return unique_quaternion(frames.rotations[world, index])
 
 
+@needs(size=6)
 @wp.func
 def frame_orientation_element(world: int, frames: FrameArrays, index: int) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the rotation matrix of the sensor's first frame, row by row.
+    """Element ``index``, one of six, of the first two columns of the rotation matrix of the sensor's first frame, row by row.
 
     mjlab: -. Isaac Lab: -.
     """

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 import warp as wp
 
+from shared_store.wording import nearest
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_arrays import RobotArrays
@@ -22,6 +23,7 @@ from worker.tasks.terms.commands import command_speed
 from worker.tasks.terms.joints import joint_offset
 
 if TYPE_CHECKING:
+    from worker.simulation.robot_view import RobotView
     from worker.simulation.sensors.sensor import SensorContext
 
 wp.set_module_options({"enable_backward": False})
@@ -110,6 +112,12 @@ class Tolerances:
     walking: Mapping[str, float] | float | None = None
     running: Mapping[str, float] | float | None = None
     robot: str = "robot"
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each joint that has a tolerance. Raises ValueError where a pattern or a name matches nothing."""
+        if self.robot not in views:
+            raise ValueError(f"Tolerances.robot: there is no robot {self.robot!r}; {nearest(self.robot, list(views))}")
+        return list(_by_joint("Tolerances.standing", self.standing, views[self.robot].joint_names))
 
     def build(self, context: SensorContext) -> JointTolerances:
         """The tolerances on the device of these worlds.

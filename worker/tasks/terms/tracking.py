@@ -21,6 +21,7 @@ from worker.simulation.kinematics import (
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
 from worker.tasks.terms.motion import MotionArrays
 from worker.tasks.terms.placing import between, set_joint, within_limits
 
@@ -71,6 +72,7 @@ def sampled(stream: wp.uint32, first: int, half: wp.vec3) -> wp.vec3:
     )
 
 
+@needs(command=1)
 @wp.func
 def motion_command(
     world: int,
@@ -115,6 +117,7 @@ def motion_command(
         set_joint(worlds, robot, world, joint, there, motion.joint_velocities[frame, joint])
 
 
+@needs(command=1)
 @wp.func
 def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int):
     """Go on by the frames of one control step; behind the last frame :func:`motion_over` is true.
@@ -165,11 +168,12 @@ def wanted_anchor_position(
     )
 
 
+@needs(size=6)
 @wp.func
 def wanted_anchor_turn(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, index: int, command: int
 ) -> float:
-    """Element ``index`` (``size=6``) of the first two columns of the matrix that turns the motion's anchor to the robot's, row by row.
+    """Element ``index``, one of six, of the first two columns of the matrix that turns the motion's anchor to the robot's, row by row.
 
     mjlab: motion_anchor_ori_b. Isaac Lab: motion_anchor_ori_b (of BeyondMimic).
     """
@@ -180,7 +184,7 @@ def wanted_anchor_turn(
 
 @wp.func
 def followed_body_position(world: int, bodies: BodyArrays, motion: MotionArrays, index: int) -> wp.vec3:
-    """Position of body ``index`` of the motion (``size=`` their number) in the frame of the robot's anchor [m].
+    """Position of body ``index`` of the motion in the frame of the robot's anchor [m].
 
     mjlab: robot_body_pos_b. Isaac Lab: robot_body_pos_b (of BeyondMimic).
     """
@@ -188,11 +192,10 @@ def followed_body_position(world: int, bodies: BodyArrays, motion: MotionArrays,
     return wp.transform_point(wp.transform_inverse(anchor_pose(bodies, motion, world)), here)
 
 
+@needs(each=6)
 @wp.func
 def followed_body_turn(world: int, bodies: BodyArrays, motion: MotionArrays, index: int) -> float:
     """Element ``index % 6`` of the first two columns of the matrix of body ``index // 6`` in the frame of the robot's anchor, row by row.
-
-    ``size=`` six times the number of the motion's bodies.
 
     mjlab: robot_body_ori_b. Isaac Lab: robot_body_ori_b (of BeyondMimic).
     """

@@ -1,0 +1,145 @@
+"""What a declaration or a job gives a task and can't be: one line each, before any world is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, kick, target
+from worker.simulation.sensors.height_scan import HeightScan, RingPattern
+from worker.tasks import Action, Adaptive, Command, Event, Observation, Robot, terms
+
+
+def refusal(config: SlidersConfig | None = None, **changed: Any) -> str:
+    """The line with which sliders of other sections are refused."""
+
+    class Wrong(Sliders):
+        def sections(self) -> dict[str, Any]:
+            return {**super().sections(), **changed}
+
+    with pytest.raises(ValueError) as refused:
+        Wrong.sketch(config or SlidersConfig())
+    assert "\n" not in str(refused.value)
+    return str(refused.value).removeprefix("task Wrong: ")
+
+
+OBSERVATIONS: Mapping[str, tuple[dict[str, Any], str]] = {
+    "noise of one": (dict(noise=("normal",)), "noise is ('normal',); give half the width, 0 or more, or (\"normal\", "),
+    "noise by pattern": (
+        dict(noise={"*": 0.1}),
+        "noise is {'*': 0.1}; give half the width, 0 or more, or (\"normal\", ",
+    ),
+    "unknown noise": (dict(noise=("gauss", 0.1)), "noise is ('gauss', 0.1); give half the width"),
+    "negative noise": (dict(noise=-0.1), "noise is -0.1; give half the width, 0 or more"),
+    "half a step": (dict(delay=1.5), "delay is 1.5; give whole control steps, from 0 up, or two, the lesser first"),
+    "one of two delays": (dict(delay=(1,)), "delay is (1,); give whole control steps"),
+    "delays the wrong way": (dict(delay=(2, 1)), "delay is (2, 1); give whole control steps"),
+    "history": (dict(history=2.0), "history is 2.0; it counts the present step, so it is 1 or more"),
+    "units": (dict(unit=("m",)), "1 units for 2 columns; give one for all, or one for each"),
+    "memory": (dict(memory=-2), "memory is -2; give a whole number from 0 up"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), OBSERVATIONS.values(), ids=list(OBSERVATIONS))
+def test_options_of_an_observation(options: dict[str, Any], message: str) -> None:
+    found = refusal(observations={"a": Observation(terms.joint_position, **options)})
+    assert found.startswith(f"observations.a: {message}")
+
+
+def test_ends_the_wrong_way_round() -> None:
+    wrong = ".clip: expected the lesser number first, found [1.0, -1.0]"
+    observed = Observation(terms.joint_position, clip=(1.0, -1.0))
+    assert refusal(observations={"a": observed}) == f"observations.a{wrong}"
+    assert refusal(actions={"force": Action(terms.effort, clip=(1.0, -1.0))}) == f"actions.force{wrong}"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(seconds="a"), "commands.target.seconds: expected 2 numbers, found 'a'"),
+        (dict(seconds=(0.0, 1.0)), "commands.target.seconds: expected the least and the greatest time, above 0"),
+        (dict(units=("m", "s")), "commands.target: 2 units for 1 numbers; give one for each"),
+        (dict(names=()), "commands.target: names are (); name each number that the policy is told"),
+        (dict(names=3), "commands.target: names are (3,); name each number that the policy is told"),
+        (dict(hidden=-1), "commands.target: hidden is -1; give how many numbers, from 0 up"),
+    ],
+)
+def test_options_of_a_command(options: dict[str, Any], message: str) -> None:
+    command = Command(target, **{"names": ("place",), "place": (-1.0, 1.0), **options})
+    assert refusal(commands={"target": command}).startswith(message)
+
+
+@pytest.mark.parametrize("seconds", [2.0, (2.0,)])
+def test_an_interval_has_two_times(seconds: Any) -> None:
+    event = Event(kick, speed=1.0, when="interval", seconds=seconds)
+    assert refusal(events={"e": event}, curricula={}).startswith("events.e.seconds: expected 2 numbers, found ")
+
+
+def test_sections_hold_what_they_are_for() -> None:
+    assert refusal(randomize={"m": "mass"}) == "randomize.m: expected a Randomize, found a str"
+    assert refusal(sensors={"m": "mass"}) == "sensors.m: expected a sensor, such as ContactSensor(...), found a str"
+
+
+NUMBERS: Mapping[str, tuple[str, Any, str]] = {
+    "mass": ("randomize.mass.range", [-3.0, -2.0], "randomize mass: the range (-3.0, -2.0) would make mass negative"),
+    "no entry": ("randomize.mas.range", [1.0, 2.0], "the task has no number 'randomize.mas.range'; did you mean"),
+    "seconds": ("commands.target.seconds", [-3.0, -2.0], "expected the least and the greatest time, above 0"),
+    "interval": ("events.kick.seconds", [2.0, 1.0], "expected the least and the greatest time, above 0"),
+    "clip": ("actions.force.clip", [1.0, -1.0], "expected the lesser number first"),
+    "noise": ("observations.noisy.noise", -1.0, "expected 0 or more, found [-1.0]"),
+}
+
+
+@pytest.mark.parametrize(("place", "value", "message"), NUMBERS.values(), ids=list(NUMBERS))
+def test_numbers_of_a_job_are_checked_as_those_of_the_declaration(place: str, value: Any, message: str) -> None:
+    found = refusal(SlidersConfig(numbers={place: value}))
+    where = "config.numbers" if "no number" in message else f"config.numbers.{place}"
+    assert found.startswith(f"{where}: {message}")
+
+
+def test_a_curriculum_is_checked_when_the_task_is_built() -> None:
+    def course(place: str, *values: float) -> str:
+        return refusal(SlidersConfig(curriculum={place: tuple(enumerate(values))}))
+
+    assert course("rewards.plce.x", 1.0).startswith("config.curriculum: the task has no number 'rewards.plce.x'")
+    assert course("randomize.mas.range", 1.0).startswith("config.curriculum: the task has no number 'randomize.mas.")
+    assert course("events.kick.seconds", 1.0, -1.0).startswith("config.curriculum.events.kick.seconds: expected the")
+    assert course("randomize.mass.range", 1.0, -1.0).startswith("config.curriculum.randomize.mass.range: randomize")
+    adaptive = Adaptive("randomize.mass.range", 1.0, 0.0)
+    assert refusal(curricula={"heavy": adaptive}).startswith("curricula.heavy.randomize.mass.range: randomize mass")
+
+
+def test_the_points_of_a_scan_are_the_declarations_alone() -> None:
+    scan = HeightScan(bodies=("near", "far"), pattern=RingPattern(radius=0.04, count=4, center=True))
+    sections = {"sensors": {"scan": scan}, "observations": {"a": Observation(terms.frame_clearance, points=5)}}
+    found = refusal(SlidersConfig(numbers={"observations.a.points": 50.0}), **sections)
+    assert found == "config.numbers.observations.a.points: the declaration alone can change it from 5"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Robot(MODEL, position=(0.0, 0.0)), "Robot robot: position is (0.0, 0.0); give 3 finite numbers"),
+        (lambda: Robot(MODEL, rotation=(1.0,)), "Robot robot: rotation is (1.0,); give 4 finite numbers"),
+        (lambda: Robot(MODEL, name="a/b"), "the name of a robot or object is a word without slashes, not 'a/b'"),
+    ],
+)
+def test_robots_that_can_not_be_placed_or_called(make: Callable[[], Robot], message: str) -> None:
+    with pytest.raises(ValueError) as refused:
+        make()
+    assert str(refused.value) == message
+
+
+@pytest.mark.parametrize("name", ["bytes.xml", "bytes.urdf"])
+def test_a_robots_file_that_is_no_text_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(bytes(range(256)))
+
+    class Unreadable(Sliders):
+        def robot(self, config: SlidersConfig) -> Robot:
+            return Robot(tmp_path / name)
+
+    with pytest.raises(ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\)$"):
+        Unreadable.sketch(SlidersConfig())

@@ -1,0 +1,72 @@
+"""What a term's function needs that its parameters' types do not tell: declared beside the function, and so known wherever it is used.
+
+>>> @needs(memory_each=1)
+... @wp.func
+... def greatest(world: int, episodes: EpisodeArrays, robot: RobotArrays, joint: int, memory: int) -> float: ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+_Function = TypeVar("_Function")
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a function needs.
+
+    Attributes:
+        memory: Numbers of its own in ``episodes.memory``.
+        memory_each: Further ones for each value that its element may have: each joint of the robot, or each ``index``.
+        command: Numbers of its command that the policy is told; a function that draws a command writes exactly so many.
+        hidden: Numbers of its command behind those.
+        size: How many values ``index`` has, where it counts something of the function's own.
+        each: How many values ``index`` has for each column of the sensors.
+        columns: The parameters whose sensors have a column for each ``index``; None: all that have columns.
+        points: The number that says how many columns of its height scan belong to one ``index``; empty: one column each.
+        numbers: Whether ``index`` counts the numbers of the command.
+        ranges: Whether the joints must have limits of their positions.
+        efforts: Whether the joints must have actuators with limits of their forces.
+    """
+
+    memory: int = 0
+    memory_each: int = 0
+    command: int = 0
+    hidden: int = 0
+    size: int = 0
+    each: int = 1
+    columns: tuple[str, ...] | None = None
+    points: str = ""
+    numbers: bool = False
+    ranges: bool = False
+    efforts: bool = False
+
+
+NOTHING = Needs()
+_NEEDS: dict[Any, Needs] = {}
+
+
+def needs(**options: Any) -> Callable[[_Function], _Function]:
+    """Declare what a term's function needs; it stands above ``@wp.func``.
+
+    Args:
+        **options: As for :class:`Needs`.
+    """
+    declared = Needs(**options)
+
+    def note(function: _Function) -> _Function:
+        _NEEDS[function] = declared
+        return function
+
+    return note
+
+
+def needs_of(function: Any) -> Needs:
+    """What a function was declared to need; :data:`NOTHING` of one that declares nothing."""
+    try:
+        return _NEEDS.get(function, NOTHING)
+    except TypeError:  # whatever it is, it can't be a key and so is no function
+        return NOTHING
