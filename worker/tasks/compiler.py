@@ -318,9 +318,12 @@ def wait(countdown: str, seconds: int) -> list[str]:
 
 
 def reset(source: Source) -> list[str]:
-    """Begin an episode: events, then commands, then the first waits."""
+    """Begin an episode: events, then commands, then the first waits.
+
+    What no event places is where the model has it: a world whose physics failed would otherwise fail for ever.
+    """
     plan = source.plan
-    lines = ["begin_episode(episodes, world)"]
+    lines = ["begin_episode(episodes, world)", "restore_start(worlds, world)"]
     lines += ["for k in range(episodes.actions.shape[1]):"]
     lines += ["    episodes.earlier_actions[world, k] = 0.0", "    episodes.last_actions[world, k] = 0.0"]
     lines += each(source, happening(plan, "reset"))

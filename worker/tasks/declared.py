@@ -52,7 +52,8 @@ class DeclaredTask(Task):
     4. The end of the step: clock, sums, statistics; which worlds begin a new episode.
     5. Of an episode that ended, the last observation, then ``curricula``.
     6. In a world that goes on: ``commands`` whose time is over are drawn anew, ``events`` at intervals.
-    7. In a world that begins: memory and solver forget the old episode; ``events`` at a reset place it, then ``commands`` are drawn.
+    7. In a world that begins: memory and solver forget the old episode, and every joint is where the model has it; ``events`` at a
+       reset place it, then ``commands`` are drawn.
     8. ``observations`` of every world, with noise, clip, scale, delay and history.
 
     Attributes:
