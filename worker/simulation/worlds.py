@@ -243,6 +243,7 @@ class Worlds:
             self.solver.before_substep = [self.drives.launch]
         self.arrays.drives = self.solver.mjw_data.qfrc_actuator
         self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
+        self.arrays.activations = self.solver.mjw_data.act
         self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
 
     def simulate(self) -> None:
@@ -278,6 +279,7 @@ class Worlds:
         if self.drives is not None:
             self.drives.forget()
         self.arrays.warm_start.zero_()
+        self.arrays.activations.zero_()
         self.arrays.overflow.zero_()
 
     def update_bodies(self) -> None:

@@ -330,6 +330,7 @@ class Task:
 
         self._episodes = EpisodeArrays()
         self._episodes.warm_start = self.worlds.arrays.warm_start
+        self._episodes.activations = self.worlds.arrays.activations
         self.actions = buffer("actions", (count, 1 if self.discrete else self.action_size), wp.float32)
         states = len(self.observation_names)
         self.states = self.observations = buffer("observations", (count, states), wp.float32)
@@ -372,9 +373,11 @@ class Task:
         arrays = self.worlds.arrays
         memory = {"memory": self._memory} if self.memory_size else {}
         images = {"images": self._camera.images} if self._camera else {}
+        activations = {"activations": wp.to_torch(arrays.activations)} if arrays.activations.size else {}
         return {
             **memory,
             **images,
+            **activations,
             **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import pytest
 import torch
 import warp as wp
 
-from tests.support.worker.declared import Sliders, SlidersConfig
+from tests.support.worker.declared import MODEL, Sliders, SlidersConfig
 from tests.support.worker.tasks import observe, put, statistics
 from worker.simulation.objects import Box
+from worker.tasks import Action, Robot, terms
 
 
 class BesideACube(Sliders):
@@ -32,3 +36,35 @@ def test_a_world_that_failed_in_what_no_event_places_begins_where_the_model_has_
     for _ in range(3):
         task.step(torch.zeros_like(task.actions))
     assert statistics(task)["nan_worlds"] == 1.0
+
+
+class Filtered(Sliders):
+    """The first slider's force follows its control as a low-pass filter of 0.5 s does."""
+
+    def robot(self, config: SlidersConfig) -> Robot:
+        motor = '<motor joint="first" gear="2"/>'
+        filtered = '<general joint="first" dyntype="filter" dynprm="0.5" gainprm="10"/>'
+        return Robot(MODEL.replace(motor, filtered))
+
+    def sections(self) -> dict[str, Any]:
+        return super().sections() | {"actions": {"force": Action(terms.effort)}, "randomize": {}}
+
+
+def test_activations_of_actuators_are_part_of_the_state_and_cleared_at_a_reset() -> None:
+    task, other = Filtered(SlidersConfig(), 2, seed=1), Filtered(SlidersConfig(), 2, seed=1)
+    activations = wp.to_torch(task.worlds.solver.mjw_data.act)
+    assert not activations.any(), "the step that tries out the graph leaves nothing"
+    task.step(torch.ones_like(task.actions))
+    # one explicit step of 0.1 s: 0 + 0.1 * (1 - 0) / 0.5
+    assert activations.flatten().tolist() == pytest.approx([0.2, 0.2])
+    other.load_state_dict(task.state_dict())
+    assert torch.equal(wp.to_torch(other.worlds.solver.mjw_data.act), activations)
+    for each in (task, other):
+        each.step(torch.ones_like(each.actions))
+    assert torch.equal(task.observations, other.observations)
+    older = {name: tensor for name, tensor in task.state_dict().items() if name != "activations"}
+    other.load_state_dict(older)
+    assert not wp.to_torch(other.worlds.solver.mjw_data.act).any()
+    task.reset()
+    assert not activations.any()
+    assert "activations" not in BesideACube(SlidersConfig(), 1).state_dict(), "where no actuator has any"
