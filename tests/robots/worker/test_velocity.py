@@ -257,6 +257,18 @@ def test_commands_grow_with_the_iterations(tasks: dict[str, Velocity]) -> None:
             assert task.numbers(place).tolist() == pytest.approx(list(turn))
 
 
+@pytest.mark.parametrize(
+    ("place", "field"),
+    [("commands.twist.forward", "command_forward"), ("commands.twist.update.turn", "command_turn")],
+)
+def test_a_number_that_the_stages_of_a_command_set_is_refused(place: str, field: str) -> None:
+    task = find_task("Go1Flat")
+    with pytest.raises(ValueError, match=rf"the stages of {field} set {place} before every iteration; use {field}$"):
+        task.sketch(task.config_type(numbers={place: [2.0, 3.0]}))
+    other = "commands.twist.least_forward"
+    assert task.sketch(task.config_type(numbers={other: 0.25})).plan.numbers.places[other][1] == 1
+
+
 def test_stages_of_commands() -> None:
     stages = ((0, -1.0, 1.0), (10, -2.0, 0.5))
     assert [range_at(stages, iteration) for iteration in (0, 9, 10, 99)] == [(-1, 1), (-1, 1), (-2, 0.5), (-2, 0.5)]
