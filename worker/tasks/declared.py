@@ -256,9 +256,11 @@ class DeclaredTask(Task):
         super().load_state_dict(state)
         if self._adapting:
             self._adapting.read()
-        if self.randomizations:
-            with on_torch_stream(self.device):
+        with on_torch_stream(self.device):
+            if self.randomizations:
                 self.randomizations.apply()
+            if self._needs.placed:
+                self.worlds.update_bodies()
 
     def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
         """The control step in order, each part with whether it is to be captured; torch's terms are not, unless torch captures all."""
@@ -319,7 +321,7 @@ class DeclaredTask(Task):
             self.randomizations.settle()
         if self.worlds.drives:
             self.worlds.drives.settle(self._episodes.ages)
-        if self._cameras or (self._needs.apart and self._needs.bodies):
+        if self._cameras or self._needs.placed:
             self.worlds.update_bodies()
         if self._cameras:
             self.worlds.update_shapes()
@@ -344,15 +346,16 @@ class _Needs:
     Attributes:
         bodies: Poses of bodies, after the physics.
         apart: Whether observations have a kernel of their own: they read what is stale in a world that was just placed afresh.
+        placed: Poses of bodies once more, after worlds were placed afresh: observations or the next step's actions read them.
     """
 
     def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
         observed = [seen.bound for group in plan.groups.values() for seen in group]
-        judged = [*plan.rewards, *plan.metrics, *plan.terminations, *plan.curricula]
-        judged += [bound for told in plan.commands for bound in (told.bound, told.update) if bound is not None]
+        acting = [*(driven.bound for driven in plan.driven), *([plan.choice] if plan.choice else [])]
         measured = any(sensor.needs_bodies for sensor in sensors.values())
-        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, (*observed, *judged)))
+        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, plan.terms))
         self.apart = torch_terms.observe_any or any(_reads_bodies(bound) or _reads_sensors(bound) for bound in observed)
+        self.placed = self.bodies and (self.apart or any(map(_reads_bodies, acting)))
 
 
 def _reads_bodies(bound: Bound) -> bool:
