@@ -26,6 +26,7 @@ def main() -> int:
     from worker.learning.setup import build_task, spaces_from, spaces_of
     from worker.learning.trained import choose_checkpoint, load_policy
     from worker.tasks import find_task
+    from worker.tasks.adapting import begin_evaluation
 
     checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
     facts = checkpoint.manifest
@@ -36,7 +37,8 @@ def main() -> int:
     seed_generators(seed)
     share = Share.of(gang.rank, gang.size, job.setting("worlds", 64) * gang.size)
     task = build_task(task_type, config, share, gang, seed)
-    task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
+    told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
+    begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
     policy = load_policy(checkpoint, gang.device)
     if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
         raise UserError(

@@ -30,6 +30,7 @@ from worker.learning.setup import build_algorithm, build_task, describe, observe
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
+from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.config import value_at
 
 if TYPE_CHECKING:
@@ -376,7 +377,8 @@ class Loop:
             total = min(self.share.total, EVALUATED * self.gang.size)
             share = Share.of(self.gang.rank, self.gang.size, total)
             worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.training.seed))
-        worlds.begin_iteration(began, self.state.progress.reward, self.state.progress.episode_length)
+        told = began, self.state.progress.reward, self.state.progress.episode_length
+        begin_evaluation(worlds, *told, adaptive_steps(self.task))
         return worlds
 
     def _say(self, text: str) -> None:

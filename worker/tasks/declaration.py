@@ -165,7 +165,7 @@ class Adaptive:
     """A number that follows how well the policy does: the same in all worlds of all ranks, and part of a run's state.
 
     Before each iteration it goes one step from ``start`` towards ``end`` where the mean of the episodes that ended last is above
-    ``above``, and one step back where it is below ``below``. An evaluation of a checkpoint has it at ``start``.
+    ``above``, and one step back where it is below ``below``. An evaluation of a checkpoint has it as the training had.
 
     Args:
         place: Of the number, such as ``events.push.speed``; of several numbers, all of them.

@@ -66,7 +66,6 @@ class DeclaredTask(Task):
 
     solver_options: ClassVar[Mapping[str, Any]] = {}
     randomizations: Randomizations | None = None
-    _adapting: Adapting | None = None
 
     def robot(self, config: Any) -> Any:
         """The robot: a :class:`worker.simulation.robot.Robot`."""
@@ -180,7 +179,7 @@ class DeclaredTask(Task):
                     view.copy_(torch.tensor(flat(f"config.numbers.{place}", value, view.numel())).view_as(view))
             if self.plan.adaptive:
                 rules = self.plan.adaptive
-                self._adapting = Adapting(rules, self.numbers, self.world_count, self.device)
+                self.adapting = Adapting(rules, self.numbers, self.world_count, self.device)
         self.randomizations.restart()
         if self.worlds.ground:
             self.worlds.ground.deal(self._episodes)
@@ -221,8 +220,8 @@ class DeclaredTask(Task):
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Set the adaptive numbers, then what ``config.curriculum`` names. See :meth:`Task.begin_iteration`."""
-        if self._adapting:
-            self._adapting.begin(iteration, reward, episode_length)
+        if self.adapting:
+            self.adapting.begin(iteration, reward, episode_length)
         super().begin_iteration(iteration, reward, episode_length)
 
     def _number(self, name: str) -> torch.Tensor:
@@ -237,8 +236,8 @@ class DeclaredTask(Task):
         """As :meth:`Task.state_tensors`, with what delays, actions of the past and sensors keep."""
         tensors = super().state_tensors()
         tensors |= {"last_actions": self._last_actions, "earlier_actions": self._earlier_actions}
-        if self._adapting:
-            tensors["adaptive_numbers"] = self._adapting.state
+        if self.adapting:
+            tensors["adaptive_numbers"] = self.adapting.state
         if self.plan.past:
             tensors["past"] = wp.to_torch(self._past)
         if self.lasting_size:
@@ -254,8 +253,8 @@ class DeclaredTask(Task):
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """As :meth:`Task.load_state_dict`; the physics of each world becomes what was drawn for it."""
         super().load_state_dict(state)
-        if self._adapting:
-            self._adapting.read()
+        if self.adapting:
+            self.adapting.read()
         with on_torch_stream(self.device):
             if self.randomizations:
                 self.randomizations.apply()

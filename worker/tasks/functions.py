@@ -171,7 +171,11 @@ def _reads(function: Any, names: set[str]) -> bool:
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr == "coms":
             harmless.add(node.value)
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and is_warp(called := known.get(node.func.id)):
+        elif (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and is_warp(called := known.get(node.func.id))
+        ):
             parameters = list(inspect.signature(called.func).parameters)
             handed = {name: value for name, value in zip(parameters, node.args, strict=False)}
             handed |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}

@@ -25,6 +25,7 @@ from worker.simulation.episodes import (
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
+from worker.tasks.adapting import Adapting
 from worker.tasks.checks import check_arguments, checked_interface
 from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.interface import Interface, deviations
@@ -101,6 +102,8 @@ class Task:
     """Numbers that survive episodes, in ``episodes.lasting``."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
+    adapting: Adapting | None = None
+    """The numbers that follow the returns; of declared tasks."""
     _exact: tuple[wp.array, wp.array] | None = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
@@ -371,13 +374,11 @@ class Task:
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Views of all state that persists between control steps."""
         arrays = self.worlds.arrays
-        memory = {"memory": self._memory} if self.memory_size else {}
+        own = {"memory": self._memory, "activations": wp.to_torch(arrays.activations)}
         images = {"images": self._camera.images} if self._camera else {}
-        activations = {"activations": wp.to_torch(arrays.activations)} if arrays.activations.size else {}
         return {
-            **memory,
+            **{name: tensor for name, tensor in own.items() if tensor.numel()},
             **images,
-            **activations,
             **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
