@@ -216,8 +216,9 @@ def rewards(source: Source) -> list[str]:
             value = f"seconds * total_{number}" if bound.term.per_second else f"total_{number}"
             lines += [f"add_reward(episodes, world, {number}, {value})"]
         else:
+            # one that is not finite would spoil the figure of all worlds
             column = f"episodes.sums[world, TERMS + {number}]"
-            lines += [f"{column} = {column} + total_{number}"]
+            lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {column} + total_{number}"]
     return ["if valid:", *indent(lines)] if bounds else []
 
 

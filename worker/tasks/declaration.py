@@ -272,7 +272,7 @@ class Action(Term):
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
         clip: Least and greatest action; None: the policy's output as it is.
         kind: What the actuator's input is: an ``"effort"``, a ``"position"`` or a ``"velocity"``.
-        unit: Of the actuator's input.
+        unit: Of the actuator's input; by default what ``kind`` has on a joint that turns or slides, such as N m or N.
         **options: As for :class:`Term`.
     """
 
@@ -284,7 +284,7 @@ class Action(Term):
         offset: Any = 0.0,
         clip: tuple[float, float] | None = (-1.0, 1.0),
         kind: Literal["effort", "position", "velocity"] = "effort",
-        unit: str = "N m",
+        unit: str | None = None,
         **options: Any,
     ) -> None:
         super().__init__(function, **options)

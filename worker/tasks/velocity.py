@@ -207,8 +207,8 @@ class Velocity(DeclaredTask):
     def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
         """What ends an episode: a fall, or the end of the terrain, which is none; a subclass may change it."""
         ends = {"fell_over": Termination(terms.root_tilted, limit=math.radians(70.0))}
-        if self.rough:
-            margin = Terrain().border - UNSEEN
+        if terrain := self.terrain(config):
+            margin = terrain.border - UNSEEN
             ends["out_of_terrain_bounds"] = Termination(terms.left_terrain, margin=margin, time_out=True)
         return ends
 

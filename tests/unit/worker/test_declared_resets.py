@@ -11,7 +11,7 @@ import warp as wp
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig
 from tests.support.worker.tasks import observe, put, statistics
 from worker.simulation.objects import Box
-from worker.tasks import Action, Robot, terms
+from worker.tasks import Action, Metric, Robot, RobotArrays, WorldArrays, terms
 
 
 class BesideACube(Sliders):
@@ -68,3 +68,34 @@ def test_activations_of_actuators_are_part_of_the_state_and_cleared_at_a_reset()
     task.reset()
     assert not activations.any()
     assert "activations" not in BesideACube(SlidersConfig(), 1).state_dict(), "where no actuator has any"
+
+
+@wp.func
+def root_of_place(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
+    return wp.sqrt(worlds.joint_q[world, robot.coordinates[joint]])
+
+
+class Measured(Sliders):
+    """A metric that is no number to the left of 0, and what slides and turns in one robot."""
+
+    def robot(self, config: SlidersConfig) -> Robot:
+        return Robot(MODEL.replace('name="second" type="slide"', 'name="second" type="hinge"'))
+
+    def sections(self) -> dict[str, Any]:
+        sections = super().sections() | {"actions": {"force": Action(terms.effort)}}
+        return sections | {"metrics": {"root": Metric(root_of_place, joints="first")}}
+
+
+def test_a_metric_that_is_not_finite_counts_0_in_that_step() -> None:
+    task = Measured(SlidersConfig(), 2, seed=1)
+    column = task.statistic_names.index("metric_root") - 1  # sums begin with the return, after the count of episodes
+    put(task)
+    for place in (-0.25, 0.25):
+        wp.to_torch(task.worlds.arrays.joint_q)[:, 0] = place
+        observe(task)
+    assert task.state_dict()["episode_sums"][:, column].tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_the_unit_of_an_action_is_that_of_its_joint() -> None:
+    task = Measured(SlidersConfig(), 1)
+    assert [action.unit for action in task.interface().actions] == ["N", "N m"]
