@@ -33,6 +33,7 @@ from benchmarks.training import device_name, wait
 from shared_store.wording import nearest
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
+from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.task import Task
 
 ALGORITHMS = ("sac", "ppo")
@@ -111,7 +112,8 @@ class WalkingLoop(Loop):
     def _judge(self) -> None:
         seconds, started = self.trained, time.perf_counter()
         progress = self.state.progress
-        self._worlds.begin_iteration(progress.iteration - 1, progress.reward, progress.episode_length)
+        told = progress.iteration - 1, progress.reward, progress.episode_length
+        begin_evaluation(self._worlds, *told, adaptive_steps(self.task))
         judged = judge(self._worlds, self.algorithm.policy())
         row = {"seconds": seconds, "env_steps": progress.env_steps, "iteration": progress.iteration} | asdict(judged)
         self.curve.append(row)

@@ -40,6 +40,7 @@ from worker.learning.setup import (
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
 from worker.learning.training import Training
+from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.config import value_at
 from worker.telemetry.attending import Attending
 
@@ -406,17 +407,14 @@ class Loop:
             self._say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
 
     def held_out_worlds(self) -> Task:
-        """The worlds on which the policy is evaluated. All ranks call it.
-
-        They are those of training, whose episodes each begin at a new random start, unless the worlds themselves were drawn at random:
-        then they are others, drawn from another seed.
-        """
+        """The worlds on which the policy is evaluated: those of training, or, where worlds were drawn at random, others of another seed."""
         worlds, began = self.task, max(0, self.state.progress.iteration - 1)
         if self.config.randomize.draws_worlds:
             total = min(self.share.total, EVALUATED * self.gang.size)
             share = Share.of(self.gang.rank, self.gang.size, total)
             worlds = build_task(type(self.task), self.config, share, self.gang, held_out_seed(self.training.seed))
-        worlds.begin_iteration(began, self.state.progress.reward, self.state.progress.episode_length)
+        told = began, self.state.progress.reward, self.state.progress.episode_length
+        begin_evaluation(worlds, *told, adaptive_steps(self.task))
         return worlds
 
     def _say(self, text: str) -> None:

@@ -36,6 +36,7 @@ from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
 from worker.learning.setup import contract_from
 from worker.learning.shards import Shards, read_file
+from worker.tasks.adapting import adaptive_steps
 
 if TYPE_CHECKING:
     from worker.learning.reporter import Gate, Reporter
@@ -228,6 +229,7 @@ class TrainingState:
             "score_error": self.progress.score_error,
             "score_episodes": self.progress.score_episodes,
             "episode_length": self.progress.episode_length,
+            "adaptive_steps": adaptive_steps(self.task),
             "env_steps": self.progress.env_steps,
             "learning_rate": self.learning_rate,
             "seconds": self.seconds,

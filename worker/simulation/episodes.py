@@ -58,6 +58,7 @@ class EpisodeArrays:
             episode begins; shape ``(worlds, actions)``.
         earlier_actions: Those of one step earlier; shape ``(worlds, actions)``.
         warm_start: Accelerations from which the constraint solver starts, those of the worlds, shape ``(worlds, dofs)``.
+        activations: State of the actuators that have one, that of the worlds, shape ``(worlds, activations)``.
         broken: Where the last observation was not finite, one more than the first such column, else 0; shape ``(worlds,)``.
         mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
             :data:`NO_MISHAP`; shape ``(1,)``.
@@ -86,6 +87,7 @@ class EpisodeArrays:
     last_actions: wp.array2d(dtype=wp.float32)
     earlier_actions: wp.array2d(dtype=wp.float32)
     warm_start: wp.array2d(dtype=wp.float32)
+    activations: wp.array2d(dtype=wp.float32)
     broken: wp.array(dtype=wp.int32)
     mishap: wp.array(dtype=wp.int32)
     last_sums: wp.array2d(dtype=wp.float32)
@@ -134,11 +136,12 @@ def add_reward(episodes: EpisodeArrays, world: int, term: int, value: float):
 
 @wp.func
 def begin_episode(episodes: EpisodeArrays, world: int):
-    """Clear a world's clock, sums and memory, and what its solver remembers of the old episode."""
+    """Clear a world's clock, sums and memory, and what its solver and its actuators remember of the old episode."""
     episodes.ages[world] = 0
     clear_row(episodes.sums, world)
     clear_row(episodes.memory, world)
     clear_row(episodes.warm_start, world)
+    clear_row(episodes.activations, world)
 
 
 @wp.func

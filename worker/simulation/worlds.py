@@ -33,6 +33,9 @@ class WorldArrays:
         controls: Actuator inputs in the order of the model file [actuator's own unit], shape ``(worlds, actuators)``.
         drives: Forces of the actuators on the joints in the last physics step [N, N m], shape ``(worlds, dofs)``.
         warm_start: Accelerations [m/s^2, rad/s^2] from which the constraint solver starts, shape ``(worlds, dofs)``.
+        activations: State of the actuators that have one, such as filters and muscles, shape ``(worlds, activations)``.
+        start_q: The model's own joint coordinates, as ``joint_q``.
+        start_qd: The model's own joint velocities, as ``joint_qd``.
         overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
         fastest: Velocity from which on the physics can't be believed [m/s, rad/s].
     """
@@ -42,6 +45,9 @@ class WorldArrays:
     controls: wp.array2d(dtype=wp.float32)
     drives: wp.array2d(dtype=wp.float32)
     warm_start: wp.array2d(dtype=wp.float32)
+    activations: wp.array2d(dtype=wp.float32)
+    start_q: wp.array2d(dtype=wp.float32)
+    start_qd: wp.array2d(dtype=wp.float32)
     overflow: wp.array(dtype=wp.int32)
     fastest: float
 
@@ -83,6 +89,15 @@ def is_sound(worlds: WorldArrays, world: int) -> bool:
         if not wp.abs(worlds.joint_qd[world, column]) < worlds.fastest:  # NaN is not either
             return False
     return True
+
+
+@wp.func
+def restore_start(worlds: WorldArrays, world: int):
+    """Put every joint of a world where the model has it, with the model's own velocity (0 as a rule)."""
+    for column in range(worlds.joint_q.shape[1]):
+        worlds.joint_q[world, column] = worlds.start_q[world, column]
+    for column in range(worlds.joint_qd.shape[1]):
+        worlds.joint_qd[world, column] = worlds.start_qd[world, column]
 
 
 FEW_ITERATIONS = 8
@@ -218,6 +233,8 @@ class Worlds:
         self.arrays.fastest = fastest
         self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
         self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
+        self.arrays.start_q = self.model.joint_q.reshape((world_count, -1))
+        self.arrays.start_qd = self.model.joint_qd.reshape((world_count, -1))
         self.drives = Drives(self.model, self.solver, world_count) if has_drives(self.model) else None
         if self.drives is None:
             self.arrays.controls = self.control.mujoco.ctrl.reshape((world_count, -1))
@@ -226,6 +243,7 @@ class Worlds:
             self.solver.before_substep = [self.drives.launch]
         self.arrays.drives = self.solver.mjw_data.qfrc_actuator
         self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
+        self.arrays.activations = self.solver.mjw_data.act
         self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
 
     def simulate(self) -> None:
@@ -261,6 +279,7 @@ class Worlds:
         if self.drives is not None:
             self.drives.forget()
         self.arrays.warm_start.zero_()
+        self.arrays.activations.zero_()
         self.arrays.overflow.zero_()
 
     def update_bodies(self) -> None:

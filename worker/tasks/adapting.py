@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 
 from worker.tasks.declaration import Adaptive
+
+if TYPE_CHECKING:
+    from worker.tasks.task import Task
 
 
 class Adapting:
@@ -26,7 +30,7 @@ class Adapting:
     def __init__(
         self, rules: Mapping[str, Adaptive], number: Callable[[str], torch.Tensor], world_count: int, device: str
     ) -> None:
-        self._rules, self._number = list(rules.values()), number
+        self._names, self._rules, self._number = list(rules), list(rules.values()), number
         self.state = torch.zeros(world_count, 1 + len(rules), device=device)
         self.state[:, 0] = -1.0
         self.read()
@@ -37,8 +41,25 @@ class Adapting:
         self._begun, self._steps = int(begun), steps
         self._write()
 
+    @property
+    def steps(self) -> dict[str, float]:
+        """The step of each rule, by name."""
+        return dict(zip(self._names, self._steps, strict=True))
+
+    def hold(self, iteration: int, steps: Mapping[str, float]) -> None:
+        """Set the numbers as a checkpoint has them, up to and with ``iteration``: :meth:`begin` moves them only after it.
+
+        Args:
+            iteration: The checkpoint's last.
+            steps: As :attr:`steps`; a rule that it lacks is at its start.
+        """
+        self._begun = max(self._begun, iteration)
+        given = zip(self._names, self._rules, strict=True)
+        self._steps = [min(max(float(steps.get(name, 0.0)), 0.0), float(rule.steps)) for name, rule in given]
+        self._write()
+
     def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Before an iteration: go on or back. Once an iteration: an evaluation begins its last one again.
+        """Before an iteration: go on or back, once an iteration.
 
         Args:
             iteration: How many are done.
@@ -56,3 +77,25 @@ class Adapting:
         for rule, step in zip(self._rules, self._steps, strict=True):
             self._number(rule.place).fill_(rule.value(step))
         self.state[:] = torch.tensor([float(self._begun), *self._steps])
+
+
+def adaptive_steps(task: Task) -> dict[str, float]:
+    """How far the adaptive numbers of a task have gone, by name: what a checkpoint's manifest keeps of them."""
+    return task.adapting.steps if task.adapting else {}
+
+
+def begin_evaluation(
+    task: Task, iteration: int, reward: float | None, episode_length: float | None, steps: Mapping[str, float]
+) -> None:
+    """As :meth:`Task.begin_iteration`, where a policy is judged: adaptive numbers are as in the training, and do not move.
+
+    Args:
+        task: The worlds in which it is judged; they may be those of the training.
+        iteration: The training's last, and so the next two.
+        reward: Mean return of the episodes that ended last; None before the first.
+        episode_length: Their mean length [steps].
+        steps: What :func:`adaptive_steps` gave in the training; a number that it lacks is at its start.
+    """
+    if task.adapting:
+        task.adapting.hold(iteration, steps)
+    task.begin_iteration(iteration, reward, episode_length)

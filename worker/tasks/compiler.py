@@ -216,8 +216,9 @@ def rewards(source: Source) -> list[str]:
             value = f"seconds * total_{number}" if bound.term.per_second else f"total_{number}"
             lines += [f"add_reward(episodes, world, {number}, {value})"]
         else:
+            # one that is not finite would spoil the figure of all worlds
             column = f"episodes.sums[world, TERMS + {number}]"
-            lines += [f"{column} = {column} + total_{number}"]
+            lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {column} + total_{number}"]
     if source.plan.success is not None:
         lines += [f"episodes.successes[world] = {source.plan.success}"]
     return ["if valid:", *indent(lines)] if bounds else []
@@ -322,9 +323,12 @@ def wait(countdown: str, seconds: int) -> list[str]:
 
 
 def reset(source: Source) -> list[str]:
-    """Begin an episode: events, then commands, then the first waits."""
+    """Begin an episode: events, then commands, then the first waits.
+
+    What no event places is where the model has it: a world whose physics failed would otherwise fail for ever.
+    """
     plan = source.plan
-    lines = ["begin_episode(episodes, world)"]
+    lines = ["begin_episode(episodes, world)", "restore_start(worlds, world)"]
     lines += ["for k in range(episodes.actions.shape[1]):"]
     lines += ["    episodes.earlier_actions[world, k] = 0.0", "    episodes.last_actions[world, k] = 0.0"]
     lines += each(source, happening(plan, "reset"))

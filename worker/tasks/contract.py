@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
+
+import mujoco
 
 from worker.tasks.declaration import Action as DeclaredAction
 from worker.tasks.declaration import Choice, Command
@@ -11,6 +13,9 @@ from worker.tasks.interface import Action, Interface, Observation
 
 if TYPE_CHECKING:
     from worker.tasks.plan import Column, Driven, Plan, Seen
+
+UNITS: Mapping[str, tuple[str, str]] = {"effort": ("N m", "N"), "position": ("rad", "m"), "velocity": ("rad/s", "m/s")}
+"""Unit of an actuator's input on a joint that turns, and on one that slides."""
 
 
 def contract(plan: Plan, model: Any) -> Interface:
@@ -94,6 +99,7 @@ def _actions(plan: Plan, driven: Driven, model: Any) -> list[Action]:
     if driven.clip is not None:
         clip = (plan.numbers.values[driven.clip], plan.numbers.values[driven.clip + 1])
     found = []
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
     for index, joint in enumerate(driven.bound.elements or ()):
         actuator = view.actuators[joint]
         gain = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
@@ -104,7 +110,7 @@ def _actions(plan: Plan, driven: Driven, model: Any) -> list[Action]:
             Action(
                 view.joint_names[joint],
                 term.kind,
-                term.unit,
+                term.unit or UNITS[term.kind][int(model.jnt_type[model.actuator_trnid[actuator, 0]] == slide)],
                 scale=scale * gain if is_effort else scale,
                 default_position=view.defaults[joint],
                 offset=offset * gain if is_effort else offset,

@@ -167,7 +167,7 @@ class Adaptive:
     """A number that follows how well the policy does: the same in all worlds of all ranks, and part of a run's state.
 
     Before each iteration it goes one step from ``start`` towards ``end`` where the mean of the episodes that ended last is above
-    ``above``, and one step back where it is below ``below``. An evaluation of a checkpoint has it at ``start``.
+    ``above``, and one step back where it is below ``below``. An evaluation of a checkpoint has it as the training had.
 
     Args:
         place: Of the number, such as ``events.push.speed``; of several numbers, all of them.
@@ -275,7 +275,7 @@ class Action(Term):
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
         clip: Least and greatest action; None: the policy's output as it is.
         kind: What the actuator's input is: an ``"effort"``, a ``"position"`` or a ``"velocity"``.
-        unit: Of the actuator's input.
+        unit: Of the actuator's input; by default what ``kind`` has on a joint that turns or slides, such as N m or N.
         **options: As for :class:`Term`.
     """
 
@@ -287,7 +287,7 @@ class Action(Term):
         offset: Any = 0.0,
         clip: tuple[float, float] | None = (-1.0, 1.0),
         kind: Literal["effort", "position", "velocity"] = "effort",
-        unit: str = "N m",
+        unit: str | None = None,
         **options: Any,
     ) -> None:
         super().__init__(function, **options)

@@ -52,7 +52,8 @@ class DeclaredTask(Task):
     4. The end of the step: clock, sums, statistics; which worlds begin a new episode.
     5. Of an episode that ended, the last observation, then ``curricula``.
     6. In a world that goes on: ``commands`` whose time is over are drawn anew, ``events`` at intervals.
-    7. In a world that begins: memory and solver forget the old episode; ``events`` at a reset place it, then ``commands`` are drawn.
+    7. In a world that begins: memory and solver forget the old episode, and every joint is where the model has it; ``events`` at a
+       reset place it, then ``commands`` are drawn.
     8. ``observations`` of every world, with noise, clip, scale, delay and history.
 
     Attributes:
@@ -65,7 +66,6 @@ class DeclaredTask(Task):
 
     solver_options: ClassVar[Mapping[str, Any]] = {}
     randomizations: Randomizations | None = None
-    _adapting: Adapting | None = None
 
     def robot(self, config: Any) -> Any:
         """The robot: a :class:`worker.simulation.robot.Robot`."""
@@ -180,7 +180,7 @@ class DeclaredTask(Task):
                     view.copy_(torch.tensor(flat(f"config.numbers.{place}", value, view.numel())).view_as(view))
             if self.plan.adaptive:
                 rules = self.plan.adaptive
-                self._adapting = Adapting(rules, self.numbers, self.world_count, self.device)
+                self.adapting = Adapting(rules, self.numbers, self.world_count, self.device)
         self.randomizations.restart()
         if self.worlds.ground:
             self.worlds.ground.deal(self._episodes)
@@ -221,8 +221,8 @@ class DeclaredTask(Task):
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Set the adaptive numbers, then what ``config.curriculum`` names. See :meth:`Task.begin_iteration`."""
-        if self._adapting:
-            self._adapting.begin(iteration, reward, episode_length)
+        if self.adapting:
+            self.adapting.begin(iteration, reward, episode_length)
         super().begin_iteration(iteration, reward, episode_length)
 
     def _number(self, name: str) -> torch.Tensor:
@@ -237,8 +237,8 @@ class DeclaredTask(Task):
         """As :meth:`Task.state_tensors`, with what delays, actions of the past and sensors keep."""
         tensors = super().state_tensors()
         tensors |= {"last_actions": self._last_actions, "earlier_actions": self._earlier_actions}
-        if self._adapting:
-            tensors["adaptive_numbers"] = self._adapting.state
+        if self.adapting:
+            tensors["adaptive_numbers"] = self.adapting.state
         if self.plan.past:
             tensors["past"] = wp.to_torch(self._past)
         if self.lasting_size:
@@ -254,11 +254,13 @@ class DeclaredTask(Task):
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """As :meth:`Task.load_state_dict`; the physics of each world becomes what was drawn for it."""
         super().load_state_dict(state)
-        if self._adapting:
-            self._adapting.read()
-        if self.randomizations:
-            with on_torch_stream(self.device):
+        if self.adapting:
+            self.adapting.read()
+        with on_torch_stream(self.device):
+            if self.randomizations:
                 self.randomizations.apply()
+            if self._needs.placed:
+                self.worlds.update_bodies()
 
     def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
         """The control step in order, each part with whether it is to be captured; torch's terms are not, unless torch captures all."""
@@ -319,7 +321,7 @@ class DeclaredTask(Task):
             self.randomizations.settle()
         if self.worlds.drives:
             self.worlds.drives.settle(self._episodes.ages)
-        if self._cameras or (self._needs.apart and self._needs.bodies):
+        if self._cameras or self._needs.placed:
             self.worlds.update_bodies()
         if self._cameras:
             self.worlds.update_shapes()
@@ -344,15 +346,16 @@ class _Needs:
     Attributes:
         bodies: Poses of bodies, after the physics.
         apart: Whether observations have a kernel of their own: they read what is stale in a world that was just placed afresh.
+        placed: Poses of bodies once more, after worlds were placed afresh: observations or the next step's actions read them.
     """
 
     def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
         observed = [seen.bound for group in plan.groups.values() for seen in group]
-        judged = [*plan.rewards, *plan.metrics, *plan.terminations, *plan.curricula]
-        judged += [bound for told in plan.commands for bound in (told.bound, told.update) if bound is not None]
+        acting = [*(driven.bound for driven in plan.driven), *([plan.choice] if plan.choice else [])]
         measured = any(sensor.needs_bodies for sensor in sensors.values())
-        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, (*observed, *judged)))
+        self.bodies = measured or torch_terms.any or any(map(_reads_bodies, plan.terms))
         self.apart = torch_terms.observe_any or any(_reads_bodies(bound) or _reads_sensors(bound) for bound in observed)
+        self.placed = self.bodies and (self.apart or any(map(_reads_bodies, acting)))
 
 
 def _reads_bodies(bound: Bound) -> bool:

@@ -150,10 +150,10 @@ def shown_type(kind: Any) -> str:
 
 
 def reads_poses(function: Any) -> bool:
-    """Whether a Warp function, or one that it calls, reads poses or velocities of ``BodyArrays``.
+    """Whether a Warp function, or one that it calls, may read poses or velocities of ``BodyArrays``.
 
     Centres of mass in their bodies stay what they are in a step: a function that reads nothing else of it needs no body brought up to
-    date.
+    date. Where the text does not tell, as with another name for the same arrays, the answer is yes.
     """
     hints = typing.get_type_hints(function.func)
     names = {name for name, kind in hints.items() if kind is BodyArrays}
@@ -161,21 +161,27 @@ def reads_poses(function: Any) -> bool:
 
 
 def _reads(function: Any, names: set[str]) -> bool:
-    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    """Whether a function does anything with ``names`` but read their centres of mass, or hand them to functions that do no more."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError):
+        return True
     scope = inspect.getclosurevars(function)
     known = {**scope.globals, **scope.nonlocals}
+    harmless: set[ast.expr] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in names:
-            if node.attr != "coms":
-                return True
-        elif isinstance(node, ast.Call):
-            handed = [place for place, each in enumerate(node.args) if isinstance(each, ast.Name) and each.id in names]
-            called = known.get(node.func.id) if isinstance(node.func, ast.Name) else None
-            if not handed:
-                continue
-            if not is_warp(called):
-                return True  # whatever it is, it may read all of it
+        if isinstance(node, ast.Attribute) and node.attr == "coms":
+            harmless.add(node.value)
+        elif (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and is_warp(called := known.get(node.func.id))
+        ):
             parameters = list(inspect.signature(called.func).parameters)
-            if _reads(called.func, {parameters[place] for place in handed}):
-                return True
-    return False
+            handed = {name: value for name, value in zip(parameters, node.args, strict=False)}
+            handed |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
+            ours = {name for name, value in handed.items() if isinstance(value, ast.Name) and value.id in names}
+            if not ours or not _reads(called.func, ours):
+                harmless |= {handed[name] for name in ours}
+    used = [node for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in names]
+    return any(node not in harmless for node in used)

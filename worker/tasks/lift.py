@@ -59,6 +59,7 @@ class LiftCube(DeclaredTask):
         def rate(function: Any, **options: Any) -> Reward:
             return Reward(function, per_second=True, **options)
 
+        turns, slides = ["rad"] * 6, ["m"] * 2  # the arm, then the fingers
         return Declaration(
             sensors={
                 "hand": Frames(sites=GRASP),
@@ -72,12 +73,13 @@ class LiftCube(DeclaredTask):
                     offset="default",
                     clip=None,
                     kind="position",
-                    unit="rad",
                 )
             },
             observations={
-                "joint_pos": Observation(terms.joint_position, offset="default", noise=0.01, unit="rad"),
-                "joint_vel": Observation(terms.joint_velocity, noise=1.5, unit="rad/s"),
+                "joint_pos": Observation(terms.joint_position, offset="default", noise=0.01, unit=turns + slides),
+                "joint_vel": Observation(
+                    terms.joint_velocity, noise=1.5, unit=[f"{unit}/s" for unit in turns + slides]
+                ),
                 "ee_to_cube": Observation(terms.hand_to_object, other="cube", hand="hand", noise=0.01, unit="m"),
                 "cube_to_goal": Observation(
                     terms.object_to_target, other="cube", noise=0.01, unit="m", kind="measured"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
-NEWER = ("broken", "last_actions", "earlier_actions")
+NEWER = ("broken", "last_actions", "earlier_actions", "activations")
 """What states of older versions do not have, and which may begin at 0."""
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from worker.simulation import episodes as episode_functions
 from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.worlds import WorldArrays, is_sound
+from worker.simulation.worlds import WorldArrays, is_sound, restore_start
 from worker.tasks.binding import Bound
 from worker.tasks.plan import Plan
 
@@ -66,6 +66,7 @@ class Source:
             "WorldArrays": WorldArrays,
             "EpisodeArrays": EpisodeArrays,
             "is_sound": is_sound,
+            "restore_start": restore_start,
             **ours,
             **types,
             **self._functions,

@@ -26,6 +26,7 @@ from worker.simulation.episodes import (
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
 from worker.simulation.worlds import Worlds
+from worker.tasks.adapting import Adapting
 from worker.tasks.checks import assert_replays, check_arguments, checked_interface
 from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
@@ -105,6 +106,7 @@ class Task:
     solver_options: ClassVar[Mapping[str, Any]] = {}
     """Options of ``newton.solvers.SolverMuJoCo``."""
     template: newton.ModelBuilder  # of a sketch
+    adapting: Adapting | None = None
     _exact: tuple[wp.array, wp.array] | None = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
@@ -126,8 +128,7 @@ class Task:
         self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
         self.statistic_names: tuple[str, ...] = (
             *("episodes", "episode_return", "episode_length"),
-            *(f"reward_{name}" for name in self.reward_terms),
-            *self.metric_names,
+            *(*(f"reward_{name}" for name in self.reward_terms), *self.metric_names),
             *("nan_worlds", "solver_overflows", "squared_return"),
             *self.termination_names,
         )
@@ -344,6 +345,7 @@ class Task:
 
         self._episodes = EpisodeArrays()
         self._episodes.warm_start = self.worlds.arrays.warm_start
+        self._episodes.activations = self.worlds.arrays.activations
         self.actions = buffer("actions", (count, 1 if self.discrete else self.action_size), wp.float32)
         states = len(self.observation_names)
         self.states = self.observations = buffer("observations", (count, states), wp.float32)
@@ -386,10 +388,10 @@ class Task:
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Views of all state that persists between control steps."""
         arrays = self.worlds.arrays
-        memory = {"memory": self._memory} if self.memory_size else {}
+        own = {"memory": self._memory, "activations": wp.to_torch(arrays.activations)}
         images = {"images": self._camera.images} if self._camera else {}
         return {
-            **memory,
+            **{name: tensor for name, tensor in own.items() if tensor.numel()},
             **images,
             **self.randomizer.state_tensors(),
             "joint_q": wp.to_torch(arrays.joint_q),

@@ -36,6 +36,8 @@ from worker.tasks.declaration import (
 from worker.tasks.declared import DeclaredTask
 from worker.tasks.randomize import Randomize
 
+COMMANDED = ("forward", "left", "turn")
+"""What is commanded: each has stages in the configuration, such as ``command_forward``."""
 FARTHEST_SCAN = 5.0
 """Beyond this depth the ground below the trunk is not seen [m]; also what heights are divided by."""
 FOOT_HEIGHT = 0.1
@@ -98,19 +100,28 @@ class Velocity(DeclaredTask):
         return Terrain() if self.rough else None
 
     def build(self, builder: newton.ModelBuilder) -> None:
-        """As :meth:`DeclaredTask.build`; the limits of the solver are those of the configuration."""
-        super().build(builder)
+        """As :meth:`DeclaredTask.build`; the limits of the solver are those of the configuration.
+
+        Raises:
+            ValueError: ``config.numbers`` names a range that the stages of a command set in each iteration.
+        """
         config: Any = self.config
+        for name in COMMANDED:
+            for place in commanded_places(name):
+                if place in config.numbers:
+                    raise ValueError(
+                        f"config.numbers: the stages of command_{name} set {place} before every iteration; use command_{name}"
+                    )
+        super().build(builder)
         limits = {"iterations": config.solver_iterations, "ls_iterations": config.solver_line_search}
         self.solver_options = {**type(self).solver_options, **limits}  # type: ignore[misc]
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Command from the ranges of this iteration, then do what ``config.curriculum`` says."""
         config: Any = self.config
-        for name in ("forward", "left", "turn"):
+        for name in COMMANDED:
             ends = range_at(getattr(config, f"command_{name}"), iteration)
-            places = [f"commands.twist.{name}"] + (["commands.twist.update.turn"] if name == "turn" else [])
-            for place in places:
+            for place in commanded_places(name):
                 for index, end in enumerate(ends):
                     self.numbers(place)[index].fill_(end)
         super().begin_iteration(iteration, reward, episode_length)
@@ -196,8 +207,8 @@ class Velocity(DeclaredTask):
     def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
         """What ends an episode: a fall, or the end of the terrain, which is none; a subclass may change it."""
         ends = {"fell_over": Termination(terms.root_tilted, limit=math.radians(70.0))}
-        if self.rough:
-            margin = Terrain().border - UNSEEN
+        if terrain := self.terrain(config):
+            margin = terrain.border - UNSEEN
             ends["out_of_terrain_bounds"] = Termination(terms.left_terrain, margin=margin, time_out=True)
         return ends
 
@@ -241,7 +252,7 @@ class Velocity(DeclaredTask):
         }
 
     def _command(self, config: VelocityConfig) -> Command:
-        stages = {name: getattr(config, f"command_{name}") for name in ("forward", "left", "turn")}
+        stages = {name: getattr(config, f"command_{name}") for name in COMMANDED}
         first = {name: range_at(each, 0) for name, each in stages.items()}
         steer = Term(terms.steer_velocity_command, turn=first["turn"], stiffness=config.heading_stiffness)
         return Command(
@@ -287,3 +298,8 @@ class Velocity(DeclaredTask):
 def rate(function: Any, **options: Any) -> Reward:
     """A reward per second."""
     return Reward(function, per_second=True, **options)
+
+
+def commanded_places(name: str) -> list[str]:
+    """The numbers of the declaration that hold the range of a command."""
+    return [f"commands.twist.{name}"] + (["commands.twist.update.turn"] if name == "turn" else [])

@@ -14,12 +14,12 @@ import warp
 
 from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Run
-from worker.errors import UserError
 from worker.learning.job import configure, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.setup import observed, spaces_from, spaces_of
+from worker.learning.setup import check_contract, observed
 from worker.learning.trained import find_checkpoint, load_policy
 from worker.tasks import find_task
+from worker.tasks.adapting import begin_evaluation
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Reading, Tap
@@ -74,12 +74,10 @@ class Rollout:
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
         with user_errors():
             task = task_type(config, worlds, seed=seed, device=device)
-        task.begin_iteration(max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length"))
+        told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
+        begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
         policy = load_policy(checkpoint, device)
-        if (then := spaces_from(facts["policy"])) != (now := spaces_of(task)):
-            raise UserError(
-                f"checkpoint {checkpoint.name} does not fit task {facts['task']} as it is now: it had {then}, it has {now}"
-            )
+        check_contract(checkpoint, task)
         return cls(run, checkpoint, config, task, policy, seed)
 
     def stage(self, device: str = "cpu") -> Stage:

@@ -319,13 +319,6 @@ def test_joints_are_placed_within_their_ranges(rig: Rig) -> None:
         scaled = np.sort([0.5 * default, 1.5 * default])
         assert (found[:, 0] >= max(scaled[0], low) - 1e-5).all() and (found[:, 0] <= min(scaled[1], high) + 1e-5).all()
         assert not found[:, 1].any()
-    evenly(
-        draws(
-            rig, lambda: rig.robot.encoder_bias.numpy()[:, 1], events.draw_encoder_bias, element=1, bias=(-0.02, 0.03)
-        ),
-        -0.02,
-        0.03,
-    )
 
 
 def test_a_reset_to_the_default_and_a_push(rig: Rig) -> None:

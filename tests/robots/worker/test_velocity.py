@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import math
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 
 from tests.support.worker.tasks import play, put, same
 from tests.support.worker.walkers import Twin, plain
+from worker.simulation.terrain import Terrain
 from worker.tasks import find_task
 from worker.tasks.configs.velocity import Go1FlatConfig, range_at, widest
 from worker.tasks.overrides import Refused
@@ -255,6 +257,30 @@ def test_commands_grow_with_the_iterations(tasks: dict[str, Velocity]) -> None:
         assert task.numbers("commands.twist.left").tolist() == [-1.0, 1.0]
         for place in ("commands.twist.turn", "commands.twist.update.turn"):
             assert task.numbers(place).tolist() == pytest.approx(list(turn))
+
+
+@pytest.mark.parametrize(
+    ("place", "field"),
+    [("commands.twist.forward", "command_forward"), ("commands.twist.update.turn", "command_turn")],
+)
+def test_a_number_that_the_stages_of_a_command_set_is_refused(place: str, field: str) -> None:
+    task = find_task("Go1Flat")
+    with pytest.raises(ValueError, match=rf"the stages of {field} set {place} before every iteration; use {field}$"):
+        task.sketch(task.config_type(numbers={place: [2.0, 3.0]}))
+    other = "commands.twist.least_forward"
+    assert task.sketch(task.config_type(numbers={other: 0.25})).plan.numbers.places[other][1] == 1
+
+
+def test_the_end_of_the_ground_is_that_of_the_terrain_that_the_task_has() -> None:
+    rough = find_task("Go1Rough")
+
+    class Wide(rough):  # type: ignore[misc, valid-type]
+        def terrain(self, config: Any) -> Terrain:
+            return dataclasses.replace(super().terrain(config), border=7.0)
+
+    plan = Wide.sketch(rough.config_type()).plan
+    first, _ = plan.numbers.find("terminations.out_of_terrain_bounds.margin", "the test")
+    assert plan.numbers.values[first] == pytest.approx(7.0 - 0.3)
 
 
 def test_stages_of_commands() -> None:

@@ -22,6 +22,7 @@ from worker.tasks import (
     WorldArrays,
     terms,
 )
+from worker.tasks.adapting import adaptive_steps, begin_evaluation
 
 WORLDS = 6
 
@@ -171,7 +172,7 @@ def test_an_adaptive_number_follows_the_returns_and_goes_on_after_a_restart() ->
     found = []
     for iteration, mean in enumerate((None, 6.0, 4.0, 6.0, 7.0, -6.0)):
         task.begin_iteration(iteration, mean, 3.0)
-        task.begin_iteration(iteration, mean, 3.0)  # as an evaluation does
+        task.begin_iteration(iteration, mean, 3.0)
         found.append(speed.item())
     assert found == [0.75, 1.25, 1.25, 1.75, 1.75, 1.25]
     other = Sliders(SlidersConfig(), 2, seed=1)
@@ -181,6 +182,23 @@ def test_an_adaptive_number_follows_the_returns_and_goes_on_after_a_restart() ->
     assert other.numbers("events.kick.speed").item() == 1.25, "that iteration was begun already"
     other.begin_iteration(6, 6.0, 3.0)
     assert other.numbers("events.kick.speed").item() == 1.75
+
+
+def test_an_evaluation_has_adaptive_numbers_as_the_checkpoint_has_them_and_moves_none() -> None:
+    task, judged = (Sliders(SlidersConfig(), 2, seed=seed) for seed in (1, 2))
+    for iteration, mean in enumerate((None, 6.0, 6.0, -6.0)):
+        task.begin_iteration(iteration, mean, 3.0)
+    assert adaptive_steps(task) == {"kicks": 1.0}
+    for other in (judged, task):
+        for _ in range(2):
+            begin_evaluation(other, 3, 9.0, 3.0, adaptive_steps(task))
+            assert other.numbers("events.kick.speed").item() == 1.25
+    begin_evaluation(judged, 8, 9.0, 3.0, {"kicks": 7.0, "unknown": 1.0})
+    assert judged.numbers("events.kick.speed").item() == 1.75, "the rule has 2 steps now"
+    begin_evaluation(judged, 9, 9.0, 3.0, {})
+    assert judged.numbers("events.kick.speed").item() == 0.75, "an older checkpoint does not say"
+    task.begin_iteration(4, 9.0, 3.0)
+    assert task.numbers("events.kick.speed").item() == 1.75, "the training itself goes on from where it was"
 
 
 def test_worlds_differ_as_declared_and_alike_on_any_number_of_ranks() -> None:

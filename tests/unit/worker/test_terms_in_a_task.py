@@ -85,7 +85,6 @@ class Walker(Quadruped):
             events={
                 "root": Event(terms.reset_root, x=(-0.5, 0.5), y=(-0.5, 0.5), yaw=(-3.14, 3.14)),
                 "joints": Event(terms.reset_joints_by_offset, position=(-0.1, 0.1)),
-                "bias": Event(terms.draw_encoder_bias, when="startup", bias=(-0.02, 0.02)),
                 "push": Event(terms.push, when="interval", seconds=(0.1, 0.2), velocity_x=(-0.2, 0.2)),
             },
             sensors={

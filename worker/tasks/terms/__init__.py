@@ -106,7 +106,6 @@ from worker.tasks.terms.episode import (
     time_left,
 )
 from worker.tasks.terms.events import (
-    draw_encoder_bias,
     push,
     reset_joints_between_limits,
     reset_joints_by_offset,

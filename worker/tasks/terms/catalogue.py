@@ -138,7 +138,8 @@ PORTING = """\
 
 What each term of mjlab 1.6 and Isaac Lab is called in `worker.tasks.terms`; [terms.md](terms.md) says what it means and what it is
 given, and [ports.md](ports.md) shows a whole task of each beside ours. This page is written by
-`python -m worker.tasks.terms porting` from the functions' docstrings. Three differences hold everywhere:
+`python -m worker.tasks.terms porting` from the functions' docstrings. What randomises physics, mjlab's `dr.*`, is no term here but a
+`Randomize`: [randomization.md](randomization.md). Three differences hold everywhere:
 
 - Quaternions are xyzw here, and wxyz there.
 - A function for one joint, body or foot gives one number, and rewards are summed over them: mjlab's `joint_vel_l2` is

@@ -189,12 +189,3 @@ def push(
     linear = linear + root_origin_velocity(worlds, robot, bodies, world)
     angular = angular + root_turning(worlds, robot, world)
     set_root_velocity(worlds, robot, bodies, world, linear, angular)
-
-
-@wp.func
-def draw_encoder_bias(world: int, robot: RobotArrays, joint: int, stream: wp.uint32, bias: wp.vec2):
-    """Give a joint's encoder a bias drawn evenly from ``bias`` [m, rad].
-
-    mjlab: dr.encoder_bias. Isaac Lab: -.
-    """
-    robot.encoder_bias[world, joint] = between(stream, 0, bias)

@@ -242,7 +242,7 @@ def object_was_at_target(
 
     It holds until the episode ends, also where a new target is drawn before.
 
-    mjlab: episode_success (of LiftingCommand). Isaac Lab: -.
+    mjlab: episode_success (of LiftingCommand, which forgets it when a target is drawn). Isaac Lab: -.
     """
     now = object_at_target(world, worlds, episodes, robot, command, distance)
     episodes.memory[world, memory] = wp.max(episodes.memory[world, memory], now)
