@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, kick, target
+from tests.support.worker.kernels.cartpole import Cartpole
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.tasks import Action, Adaptive, Command, Event, Observation, Robot, terms
+from worker.tasks.configs.cartpole import CartpoleConfig
 
 
 def refusal(config: SlidersConfig | None = None, **changed: Any) -> str:
@@ -143,3 +145,9 @@ def test_a_robots_file_that_is_no_text_is_named(tmp_path: Path, name: str) -> No
 
     with pytest.raises(ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\)$"):
         Unreadable.sketch(SlidersConfig())
+
+
+def test_a_task_of_kernels_has_no_numbers_for_a_curriculum() -> None:
+    config = CartpoleConfig(curriculum={"events.push.speed": ((0, 1.0),)})
+    with pytest.raises(ValueError, match=r"^task Cartpole: curriculum: it has no number events.push.speed; declared"):
+        Cartpole(config, 1)
