@@ -16,6 +16,7 @@ from worker.tasks import terms
 from worker.tasks.config import STRICT, reward_weights
 from worker.tasks.declaration import Action, Command, Declaration, Event, Metric, Observation, Reward, Term, Termination
 from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+from worker.tasks.randomize import Randomize
 
 
 @dataclass(frozen=True, config=STRICT)
