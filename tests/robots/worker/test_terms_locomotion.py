@@ -334,3 +334,21 @@ def test_tolerances_by_pattern() -> None:
     ):
         with pytest.raises(ValueError, match=said):
             tolerances.Tolerances(**wrong).build(context)
+
+
+def test_what_counts_from_the_start_counts_from_the_patch_on_a_terrain(rig: Rig) -> None:
+    origins = rig.structs[TerrainArrays].origins.numpy()[[0, 1, 1], [2, 0, 1]]
+    start = np.array(rig.robot.start)[:3]
+    here = rig.worlds.joint_q.numpy()[:, ROOT : ROOT + 3]
+    way = here - start - origins
+    near(rig.call(ground.root_displacement_on_terrain), way)
+    far = np.hypot(way[:, 0], way[:, 1])
+    limit = np.sort(far)[:2].mean()
+    near(rig.call(ground.root_too_far_on_terrain, distance=limit), far > limit)
+    rig.call(ground.planar_pose_command_on_terrain, command=3, stream=2, x=(-1.0, 1.0), y=(1.0, 2.0), heading=(0.0, 3.0))  # fmt: skip
+    target = rig.episodes.memory.numpy()[:, 6:8] - start[:2] - origins[:, :2]
+    assert (np.abs(target[:, 0]) <= 1.0 + 1e-5).all() and (target[:, 1] >= 1.0 - 1e-5).all() and (target[:, 1] <= 2.0 + 1e-5).all()  # fmt: skip
+    rig.call(ground.reset_to_default_on_terrain)
+    placed = rig.worlds.joint_q.numpy()
+    near(placed[:, ROOT : ROOT + 3], start + origins)
+    near(placed[:, rig.robot.coordinates.numpy()], np.tile(rig.robot.defaults.numpy(), (len(placed), 1)))

@@ -16,6 +16,7 @@ from worker.tasks import terms
 from worker.tasks.config import STRICT, reward_weights
 from worker.tasks.declaration import Action, Command, Declaration, Event, Metric, Observation, Reward, Term, Termination
 from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+from worker.tasks.randomize import Randomize
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -87,6 +88,7 @@ class Walker(Quadruped):
                 "joints": Event(terms.reset_joints_by_offset, position=(-0.1, 0.1)),
                 "push": Event(terms.push, when="interval", seconds=(0.1, 0.2), velocity_x=(-0.2, 0.2)),
             },
+            randomize={"bias": Randomize("encoder_bias", joints="*", range=(-0.02, 0.02), operation="add")},
             sensors={
                 "feet": ContactSensor(geoms="*_foot", against="ground", fine=True),
                 "shanks": Frames(bodies="*_shank"),

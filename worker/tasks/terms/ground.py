@@ -19,9 +19,10 @@ from worker.simulation.terrain_arrays import TerrainArrays, ground_height, on_te
 from worker.simulation.terrain_levels import walked_levels
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.term_needs import needs
-from worker.tasks.terms.commands import command_speed
+from worker.tasks.terms.commands import TARGET, command_speed, planar_pose_command, steer_planar_pose_command
 from worker.tasks.terms.contacts import planar_speed, swing_error
-from worker.tasks.terms.placing import NONE, between, place_root
+from worker.tasks.terms.placing import NONE, between, place_root, set_joint
+from worker.tasks.terms.root import root_displacement
 
 wp.set_module_options({"enable_backward": False})
 
@@ -213,6 +214,69 @@ def reset_root_on_terrain(
     linear = wp.vec3(between(stream, 6, velocity_x), between(stream, 7, velocity_y), between(stream, 8, velocity_z))
     angular = wp.vec3(between(stream, 9, turning_x), between(stream, 10, turning_y), between(stream, 11, turning_z))
     place_root(world, worlds, robot, bodies, terrain_origin(terrain, world), offset, turn, linear, angular)
+
+
+@wp.func
+def reset_to_default_on_terrain(
+    world: int, worlds: WorldArrays, robot: RobotArrays, bodies: BodyArrays, terrain: TerrainArrays
+):
+    """As :func:`reset_to_default`, on the world's patch: the place of a free root counts from the patch's origin.
+
+    mjlab: -. Isaac Lab: reset_scene_to_default.
+    """
+    nothing = wp.vec3(0.0, 0.0, 0.0)
+    origin = terrain_origin(terrain, world)
+    place_root(world, worlds, robot, bodies, origin, nothing, wp.quat_identity(), nothing, nothing)
+    for joint in range(robot.coordinates.shape[0]):
+        set_joint(worlds, robot, world, joint, robot.defaults[joint], 0.0)
+
+
+@wp.func
+def root_displacement_on_terrain(
+    world: int, worlds: WorldArrays, robot: RobotArrays, terrain: TerrainArrays
+) -> wp.vec3:
+    """As :func:`root_displacement`, where the place at the start counts from the origin of the world's patch [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return root_displacement(world, worlds, robot) - terrain_origin(terrain, world)
+
+
+@wp.func
+def root_too_far_on_terrain(
+    world: int, worlds: WorldArrays, robot: RobotArrays, terrain: TerrainArrays, distance: float
+) -> bool:
+    """As :func:`root_too_far`, where the place at the start counts from the origin of the world's patch [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    way = root_displacement_on_terrain(world, worlds, robot, terrain)
+    return wp.length(wp.vec2(way[0], way[1])) > distance
+
+
+@wp.func
+def planar_pose_command_on_terrain(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    terrain: TerrainArrays,
+    command: int,
+    stream: wp.uint32,
+    x: wp.vec2,
+    y: wp.vec2,
+    heading: wp.vec2,
+):
+    """As :func:`planar_pose_command`, around the robot's start on the world's patch [m]; its update is the same.
+
+    mjlab: -. Isaac Lab: UniformPose2dCommand.
+    """
+    planar_pose_command(world, worlds, episodes, robot, command, stream, x, y, heading)
+    origin = terrain_origin(terrain, world)
+    for axis in range(2):
+        column = command + TARGET + axis
+        episodes.memory[world, column] = episodes.memory[world, column] + origin[axis]
+    steer_planar_pose_command(world, worlds, episodes, robot, command)
 
 
 @wp.func
