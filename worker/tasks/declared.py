@@ -88,10 +88,13 @@ class DeclaredTask(Task):
         config: Any = self.config
         self.views: dict[str, RobotView] = {}
         for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
-            dataclasses.replace(entity, name=name).add_to(builder)
+            self._add(name, entity, builder)
         for name in ("robot", *self.objects(config)):
             self.views[name] = RobotView(builder, name)
         self.declaration = self.declare(config)
+        if not isinstance(self.declaration, Declaration):
+            found = type(self.declaration).__name__
+            raise ValueError(f"task {type(self).__name__}: declare() returned {found}, not a Declaration")
         self.ground_terrain = self.terrain(config)
         try:
             sensors = self.declaration.sensors
@@ -101,6 +104,16 @@ class DeclaredTask(Task):
             where = "" if str(error).startswith("config.") else f"task {type(self).__name__}: "
             raise ValueError(f"{where}{error}") from error
         self._name()
+
+    def _add(self, name: str, entity: Any, builder: newton.ModelBuilder) -> None:
+        where = f"task {type(self).__name__}: {'' if name == 'robot' else 'objects: '}"
+        if not dataclasses.is_dataclass(entity) or isinstance(entity, type) or not hasattr(entity, "add_to"):
+            whose = "robot() returned" if name == "robot" else f"{name} is"
+            raise ValueError(f"{where}{whose} {type(entity).__name__}, which can't be put into a world")
+        try:
+            dataclasses.replace(entity, name=name).add_to(builder)
+        except ValueError as error:
+            raise ValueError(f"{where}{error}") from error
 
     def stands_on(self) -> bool | Terrain:
         """The terrain that :meth:`terrain` gave, or whether there is a plane."""
