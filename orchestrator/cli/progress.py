@@ -81,7 +81,8 @@ def summary(client: Client, job_id: str) -> int:
     if succeeded and evaluation:
         console.print(f"  evaluation:  {evaluated(evaluation)}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
-    for name, value in {"checkpoint": results.get("checkpoint"), "log": log, "plot": results.get("plot")}.items():
+    found = {"checkpoint": results.get("checkpoint"), "log": log, "plot": results.get("plot"), "run": detail["run"]}
+    for name, value in found.items():
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
