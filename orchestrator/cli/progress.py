@@ -82,7 +82,8 @@ def summary(client: Client, job_id: str) -> int:
         console.print(f"  evaluation:  {evaluated(evaluation)}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
     known = {name: results.get(name) for name in ("checkpoint", "plot", "picture")}
-    for name, value in {"checkpoint": known.pop("checkpoint"), "log": log, **known}.items():
+    found = {"checkpoint": known.pop("checkpoint"), "log": log, **known, "run": detail["run"]}
+    for name, value in found.items():
         if value:
             console.print(f"  {name + ':':12} {value}", markup=False)
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":

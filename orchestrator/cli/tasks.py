@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.terminal import Console, echo, echo_json
+from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json
 from orchestrator.errors import ServerError, SpecError
 
 
@@ -34,18 +34,32 @@ def tasks(
     if as_json:
         echo_json(found, indent=1)
         return
-    console = Console()
-    console.print(_table(found))
+    _print(_table(found))
     if not name:
         return
+    console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for kind in ("observations", "actions"):
-        console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", highlight=False, markup=False)
+        console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", markup=False)
     for section, rows in found[0].get("tables", {}).items():
-        console.print()
-        console.print(_terms(section, rows))
+        echo("")
+        _print(_terms(section, rows))
     if numbers := found[0].get("numbers"):
-        console.print("\nNUMBERS of train.config.numbers and train.config.curriculum", highlight=False, markup=False)
-        console.print(_numbers(numbers))
+        console.print("\nNUMBERS of train.config.numbers and train.config.curriculum", markup=False)
+        _print(_numbers(numbers))
+
+
+def _print(table: Table) -> None:
+    """On a terminal wrap the text of cells between words, never within a name; for another program print every row as one line."""
+    terminal, wide = Console(), Console(width=10 * WHOLE)
+    if not sys.stdout.isatty():
+        wide.print(table, soft_wrap=True)
+        return
+    least = 2 * len(table.columns)
+    for column in table.columns:
+        sizes = [wide.measure(cell) for cell in (column.header, *column.cells)]
+        column.min_width = max(size.maximum if column.no_wrap else size.minimum for size in sizes)
+        least += column.min_width
+    Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
 
 
 def _ask_worker(names: list[str]) -> list[dict[str, Any]]:

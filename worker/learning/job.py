@@ -161,6 +161,7 @@ def run_command(body: Callable[[], int]) -> None:
     try:
         code = body()
     except (UserError, StoreError) as error:
+        print(getattr(error.__cause__, "trace", ""), end="", file=sys.stderr, flush=True)  # of a TaskMistake
         code = _fail(str(error), EX_USAGE)
     except (GangError, TrainingError, StaleEpoch, DamagedCheckpoint) as error:
         code = _fail(str(error), EX_ERROR)

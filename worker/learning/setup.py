@@ -21,6 +21,7 @@ from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
+from worker.tasks.mistakes import task_mistakes
 from worker.tasks.policy_contract import policy_contract, same_policy
 
 if TYPE_CHECKING:
@@ -30,12 +31,13 @@ if TYPE_CHECKING:
 
 
 def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
-    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses."""
+    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses, and for a mistake in the user's own code."""
     marker = warm_marker(task_type, gang.device)
     if gang.is_main and marker is not None and not marker.exists():
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
-    with user_errors(), gang.build_in_turn(marker):
+    name = f"{task_type.__module__}:{task_type.__qualname__}"
+    with user_errors(), task_mistakes(name), gang.build_in_turn(marker):
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
 
 

@@ -119,14 +119,18 @@ def _files(folder: Path) -> list[str]:
 
 
 def _kind_of_xml(text: str, shown: str) -> str:
-    try:
-        root = ElementTree.fromstring(text).tag
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{shown}: is not XML: {error}") from error
+    root = _root(text, shown).tag
     kinds = {"mujoco": "mjcf", "mujocoinclude": "mjcf", "robot": "urdf"}
     if root not in kinds:
         raise ValueError(f"{shown}: its first element is <{root}>; MJCF begins with <mujoco>, URDF with <robot>")
     return kinds[root]
+
+
+def _root(text: str, shown: str) -> ElementTree.Element:
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{shown}: is not XML: {error}") from error
 
 
 def _parse_mjcf(source: str, shown: str) -> Any:
@@ -149,7 +153,7 @@ def _check_mjcf_assets(spec: Any, shown: str) -> None:
 def _check_urdf_meshes(source: str, shown: str) -> None:
     """Newton warns of a mesh that it can't find, and goes on without it."""
     is_text = source.lstrip().startswith("<")
-    root = ElementTree.fromstring(source if is_text else _text_of(Path(source), shown))
+    root = _root(source if is_text else _text_of(Path(source), shown), shown)
     folder = Path(source).resolve().parent if not is_text else Path()
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")

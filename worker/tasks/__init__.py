@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from shared_store.wording import nearest
+from worker.tasks.mistakes import task_mistakes
 
 if TYPE_CHECKING:
     from worker.tasks.task import Task
@@ -106,7 +107,7 @@ def find_task(name: str) -> type[Task]:
             ``module:Class``.
 
     Raises:
-        ValueError: There is no such task, or what is there is not a task.
+        ValueError: There is no such task, what is there is not a task, or the user's module can't be imported.
     """
     known = task_names()
     where = name if ":" in name else known.get(name)
@@ -116,7 +117,8 @@ def find_task(name: str) -> type[Task]:
     if name == where and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a user's module lies where the job was submitted; ours are never hidden by it
     try:
-        module = importlib.import_module(module_name)
+        with task_mistakes(name):
+            module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not (module_name == error.name or module_name.startswith(error.name + ".")):
             raise

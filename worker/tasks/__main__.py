@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from worker.tasks import find_task, task_names
 from worker.tasks.images import shown
+from worker.tasks.mistakes import task_mistakes
 from worker.tasks.tables import numbers, tables
 
 if TYPE_CHECKING:
@@ -23,11 +24,12 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
         whole: Of a declared task its terms, too: their tables, and the numbers that a job can change.
 
     Raises:
-        ValueError: There is no such task.
+        ValueError: There is no such task, or its own code is wrong.
     """
     kind = find_task(name)
-    config = kind.config_type()
-    task = kind.sketch(config)
+    with task_mistakes(name):
+        config = kind.config_type()
+        task = kind.sketch(config)
     plan = getattr(task, "plan", None)
     return {
         "name": name,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import newton
@@ -88,19 +89,34 @@ class DeclaredTask(Task):
         config: Any = self.config
         self.views: dict[str, RobotView] = {}
         for name, entity in {"robot": self.robot(config), **self.objects(config)}.items():
-            dataclasses.replace(entity, name=name).add_to(builder)
+            self._add(name, entity, builder)
         for name in ("robot", *self.objects(config)):
             self.views[name] = RobotView(builder, name)
         self.declaration = self.declare(config)
+        if not isinstance(self.declaration, Declaration):
+            found = type(self.declaration).__name__
+            raise ValueError(f"task {type(self).__name__}: declare() returned {found}, not a Declaration")
         self.ground_terrain = self.terrain(config)
+        sensors = self.declaration.sensors
+        for name, sensor in sensors.items():
+            if hasattr(sensor, "rows"):  # one of a task's own may have no columns
+                with _placed(f"task {type(self).__name__}: sensors.{name}"):
+                    sensor.rows(self.views)
         try:
-            sensors = self.declaration.sensors
             self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
         except ValueError as error:
             # what a job sets is named by its place in the job alone
             where = "" if str(error).startswith("config.") else f"task {type(self).__name__}: "
             raise ValueError(f"{where}{error}") from error
         self._name()
+
+    def _add(self, name: str, entity: Any, builder: newton.ModelBuilder) -> None:
+        where = f"task {type(self).__name__}: {'' if name == 'robot' else 'objects: '}"
+        if not dataclasses.is_dataclass(entity) or isinstance(entity, type) or not hasattr(entity, "add_to"):
+            whose = "robot() returned" if name == "robot" else f"{name} is"
+            raise ValueError(f"{where}{whose} {type(entity).__name__}, which can't be put into a world")
+        with _placed(where.removesuffix(": ")):
+            dataclasses.replace(entity, name=name).add_to(builder)
 
     def stands_on(self) -> bool | Terrain:
         """The terrain that :meth:`terrain` gave, or whether there is a plane."""
@@ -156,10 +172,8 @@ class DeclaredTask(Task):
         self._common += [self.worlds.arrays, self._episodes, *(structs[name] for name in self._kernels.structs)]
 
     def _build_sensor(self, name: str, declared: Any, context: SensorContext) -> Any:
-        try:
+        with _placed(f"task {type(self).__name__}: sensors.{name}"):
             return declared.build(dataclasses.replace(context, name=name))
-        except ValueError as error:
-            raise ValueError(f"task {type(self).__name__}: sensors.{name}: {error}") from error
 
     def _begin(self) -> None:
         """What happens once, when random streams are seeded: physics of each world, its patch of terrain, events at startup."""
@@ -338,6 +352,15 @@ class DeclaredTask(Task):
             wp.launch(check_group, dim=self.world_count, inputs=[self._episodes.dones, *both], device=self.device)
         if self._camera:
             self._camera.render(mode)
+
+
+@contextmanager
+def _placed(where: str) -> Iterator[None]:
+    """Say where in the task a ValueError arose."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 class _Needs:

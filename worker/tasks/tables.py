@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from worker.tasks.binding import Bound
@@ -65,8 +65,21 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
 
 
 def numbers(plan: Plan) -> dict[str, list[float]]:
-    """The numbers of every place, as ``config.numbers`` and ``config.curriculum`` name them."""
-    return {place: plan.numbers.values[first : first + count] for place, (first, count) in plan.numbers.places.items()}
+    """The numbers of every place, as ``config.numbers`` and ``config.curriculum`` name them.
+
+    Those of ``randomize`` are as the task declares them; ``config.numbers`` sets them when the worlds are built.
+    """
+    values, places = plan.numbers.values, plan.numbers.places
+    found = {place: values[first : first + count] for place, (first, count) in places.items()}
+    for name, entry in plan.declaration.randomize.items():
+        place = f"randomize.{name}"
+        if isinstance(entry.range, Mapping):
+            found |= {f"{place}.range.{axis}": [*ends] for axis, ends in zip(entry.drawn_axes, entry.ends, strict=True)}
+        else:
+            found[f"{place}.range"] = [end for ends in entry.ends for end in ends]
+        if entry.when == "interval":
+            found[f"{place}.seconds"] = [*(entry.seconds or (0.0, 0.0))]
+    return found
 
 
 def _adaptive(rule: Adaptive) -> str:

@@ -254,6 +254,7 @@ def root_too_far_on_terrain(
     return wp.length(wp.vec2(way[0], way[1])) > distance
 
 
+@needs(command=3, hidden=3)
 @wp.func
 def planar_pose_command_on_terrain(
     world: int,
