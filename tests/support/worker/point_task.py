@@ -47,6 +47,7 @@ class Point:
     action_names = ("push",)
     observation_names = ("place", "velocity")
     ended = None
+    adapting = None
 
     def __init__(
         self, config: PointConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"

@@ -21,6 +21,9 @@ from shared_store.models import Model, ModelError
 PARENT = {"run": "base", "checkpoint": "00000002-e1", "iteration": 2}
 
 
+EVALUATED = {"mean_return": 800.0, "mean_length": 10.0, "max_length": 20, "episodes": 3, "time": 1.0}
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "store").open()
@@ -37,7 +40,7 @@ def exported(store: Store, iteration: int = 4) -> tuple[Run, Checkpoint]:
     (bundle / "report.json").write_text(json.dumps({"judged": {"episodes": 16}}))
     seal(bundle, {"task": "Ant", "score": 812.3, "versions": {"muster": "0.1.0"}, "code": {"module": "ant"}})
     run.evaluations.mkdir(exist_ok=True)
-    (run.evaluations / f"{name}.json").write_text(json.dumps({"mean_return": 800.0}))
+    (run.evaluations / f"{name}.json").write_text(json.dumps(EVALUATED))
     return run, Checkpoint(run.checkpoints / name, iteration, 1)
 
 
@@ -56,7 +59,9 @@ def test_a_model_holds_its_bundle_and_where_it_comes_from(store: Store) -> None:
     assert (facts["run"], facts["checkpoint"], facts["parent"]) == ("ant", "00000004-e1", PARENT)
     assert (facts["spec"], facts["task"], facts["queue"]) == ({"name": "ant"}, "Ant", "robots")
     assert (facts["made_with"], facts["code"]) == ({"muster": "0.1.0"}, {"module": "ant"})
-    assert (facts["evaluations"], facts["judged"]) == ([{"mean_return": 800.0}], {"episodes": 16})
+    (evaluated,) = facts["evaluations"]
+    assert evaluated["mean_return"] == 800.0 and evaluated["checkpoint"] == "00000004-e1"
+    assert facts["judged"] == {"episodes": 16}
     assert (model.bundle / "policy.onnx").read_bytes() == b"weights"
 
 
