@@ -135,6 +135,8 @@ class Action(_Part):
     """Gain on the velocity, which the actuator works against [N s/m, N m s/rad]."""
     effort_limit: float | None = None
     """Greatest force or torque of the actuator [N, N m]; null: not limited."""
+    rule: str = ""
+    """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
 
 
 @dataclass(frozen=True)

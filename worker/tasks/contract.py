@@ -12,18 +12,26 @@ from worker.tasks.declaration import Choice, Command
 from worker.tasks.interface import Action, Interface, Observation
 
 if TYPE_CHECKING:
+    from worker.simulation.robot_view import RobotView
     from worker.tasks.plan import Column, Driven, Plan, Seen
 
 UNITS: Mapping[str, tuple[str, str]] = {"effort": ("N m", "N"), "position": ("rad", "m"), "velocity": ("rad/s", "m/s")}
 """Unit of an actuator's input on a joint that turns, and on one that slides."""
 
 
-def contract(plan: Plan, model: Any) -> Interface:
+DIRECT = frozenset({"effort", "position_target", "velocity_target"})
+"""Functions that act as their value says."""
+Explicit = Mapping[str, Sequence[float]]
+"""``stiffness``, ``damping`` and ``effort_limit`` of each actuator of one world, and whether its force is computed ``explicit``ly."""
+
+
+def contract(plan: Plan, model: Any, motors: Explicit | None = None) -> Interface:
     """Observations and actions of the policy, in order.
 
     Args:
         plan: The task's.
         model: MuJoCo's, of one world: gains and limits of the actuators are read from it.
+        motors: Those of actuators whose force is computed explicitly; None where there is none.
     """
     observations = [
         column for seen in plan.groups["policy"] for back in backs(seen) for column in described(plan, seen, back)
@@ -32,7 +40,7 @@ def contract(plan: Plan, model: Any) -> Interface:
         assert isinstance(plan.choice.term, Choice)
         actions = [Action(name, "choice", "1", scale=1.0, default_position=0.0) for name in plan.choice.term.names]
     else:
-        actions = [action for driven in plan.driven for action in _actions(plan, driven, model)]
+        actions = [action for driven in plan.driven for action in _actions(plan, driven, model, motors)]
     return Interface(tuple(observations), tuple(actions))
 
 
@@ -91,7 +99,7 @@ def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[floa
     return (plan.numbers.values[first], plan.numbers.values[first + 1]) if count == 2 else None
 
 
-def _actions(plan: Plan, driven: Driven, model: Any) -> list[Action]:
+def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) -> list[Action]:
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)
     view = plan.views[term.robot]
@@ -103,21 +111,72 @@ def _actions(plan: Plan, driven: Driven, model: Any) -> list[Action]:
     for index, joint in enumerate(driven.bound.elements or ()):
         actuator = view.actuators[joint]
         gain = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
-        scale, offset = value_of(plan, driven.scale, index, 1.0), value_of(plan, driven.offset, index, 0.0)
-        is_effort = term.kind == "effort"
+        stiffness, damping = gain if term.kind == "position" else 0.0, -float(model.actuator_biasprm[actuator, 2])
         effort = view.efforts[joint]
+        is_effort = term.kind == "effort"
+        if motors is not None and motors["explicit"][actuator]:
+            stiffness, damping, effort = (float(motors[name][actuator]) for name in _GAINS)
+            is_effort = False
+        scale, offset = value_of(plan, driven.scale, index, 1.0), value_of(plan, driven.offset, index, 0.0)
+        scale, offset, limits = _as_input(term, view, joint, scale, offset, gain if is_effort else 1.0)
         found.append(
             Action(
                 view.joint_names[joint],
                 term.kind,
                 term.unit or UNITS[term.kind][int(model.jnt_type[model.actuator_trnid[actuator, 0]] == slide)],
-                scale=scale * gain if is_effort else scale,
+                scale=scale,
                 default_position=view.defaults[joint],
-                offset=offset * gain if is_effort else offset,
-                clip=clip,
-                stiffness=gain if term.kind == "position" else 0.0,
-                damping=0.0 if is_effort else -float(model.actuator_biasprm[actuator, 2]),
+                offset=offset,
+                clip=_both(clip, limits),
+                stiffness=stiffness,
+                damping=0.0 if is_effort else damping,
                 effort_limit=effort if effort != float("inf") else abs(gain) if is_effort else None,
+                rule=_rule(term),
             )
         )
     return found
+
+
+_GAINS = ("stiffness", "damping", "effort_limit")
+
+
+def _as_input(
+    term: DeclaredAction, view: RobotView, joint: int, scale: float, offset: float, gain: float
+) -> tuple[float, float, tuple[float, float] | None]:
+    """Scale and offset of an action as an actuator's input, and the limits that its function puts on the action."""
+    if term.function_name == "share_of_range_target":
+        low, high = view.ranges[joint]
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        return half * scale, middle + half * offset, _within_one(scale, offset)
+    if term.function_name == "limited_effort":
+        greatest = view.efforts[joint] if view.efforts[joint] != float("inf") else 1.0
+        return greatest * scale, greatest * offset, _within_one(scale, offset)
+    return gain * scale, gain * offset, None
+
+
+def _within_one(scale: float, offset: float) -> tuple[float, float] | None:
+    """The actions whose value is within [-1, 1]."""
+    if scale == 0.0:
+        return None
+    ends = ((-1.0 - offset) / scale, (1.0 - offset) / scale)
+    return min(ends), max(ends)
+
+
+def _both(first: tuple[float, float] | None, second: tuple[float, float] | None) -> tuple[float, float] | None:
+    if first is None or second is None:
+        return first or second
+    return max(first[0], second[0]), min(first[1], second[1])
+
+
+def _rule(term: DeclaredAction) -> str:
+    """What a function makes of its value where a scale and an offset do not say it: its own words, and its numbers."""
+    if term.function_name in DIRECT | {"share_of_range_target", "limited_effort"}:
+        return ""
+    text = (
+        getattr(term.function, "__doc__", None) or getattr(getattr(term.function, "func", None), "__doc__", None) or ""
+    )
+    words = " ".join(text.split("\n\n")[0].split()) or f"the task's own function {term.function_name}"
+    numbers = ", ".join(
+        f"{name} = {value:g}" for name, value in term.parameters.items() if isinstance(value, int | float)
+    )
+    return f"{words} ({numbers})" if numbers else words

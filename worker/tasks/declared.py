@@ -134,7 +134,13 @@ class DeclaredTask(Task):
 
     def interface(self) -> Interface:
         """The policy's contract, which follows from the declaration."""
-        return contract(self.plan, self.worlds.solver.mj_model)
+        attributes = getattr(self.worlds.model, "muster", None)
+        motors = None
+        if attributes is not None and self.worlds.drives is not None:
+            count = self.worlds.solver.mj_model.nu
+            names = ("explicit", "stiffness", "damping", "effort_limit")
+            motors = {name: getattr(attributes, name).numpy()[:count].tolist() for name in names}
+        return contract(self.plan, self.worlds.solver.mj_model, motors)
 
     def _prepare(self) -> None:
         """Everything on the device that the kernels take."""

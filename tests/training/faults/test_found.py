@@ -56,7 +56,7 @@ def test_a_job_that_was_struck_after_its_last_save_may_be_resumed_for_its_evalua
     submitted = server.muster("submit", "job_specs/cartpole.yaml", "--json", *options)
     done = server.wait(json.loads(submitted.stdout)["jobId"], timeout=120)
     run = Store(server.home / "store").run(done["run"])
-    (evaluation,) = run.evaluations.iterdir()
+    (evaluation,) = run.evaluations.glob("*.json")
     before = json.loads(evaluation.read_text())
     refused = server.muster("resume", run.name)
     assert refused.returncode == 1 and "complete at iteration 3 of 3" in refused.stderr

@@ -57,7 +57,7 @@ def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Pa
     records = read_metrics(run)
     assert records[0]["reward"] < 8.0 and records[-1]["reward"] > 18.0, "30 is the greatest that there could be"
     assert 0.0 < records[-1]["entropy"] < np.log(3.0)
-    (evaluation,) = run.evaluations.iterdir()
+    (evaluation,) = run.evaluations.glob("*.json")
     assert json.loads(evaluation.read_text())["mean_return"] > 20.0
     (directory / "export.yaml").write_text(f"name: export\nresources: {{memory: 1GiB}}\nexport: {{run: {run.name}}}\n")
     done = run_muster("run", "export.yaml", home=home, cwd=directory, timeout=300)

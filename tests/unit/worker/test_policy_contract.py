@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +19,19 @@ from tests.support.worker.kernels.cartpole import Cartpole as CartpoleOfKernels
 from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.setup import check_contract
+from worker.tasks import (
+    Action,
+    Declaration,
+    DeclaredTask,
+    ExplicitPDActuator,
+    Observation,
+    PositionActuator,
+    Reward,
+    Robot,
+    TaskConfig,
+    reward_weights,
+    terms,
+)
 from worker.tasks.configs.cartpole import CartpoleConfig
 from worker.tasks.policy_contract import policy_contract
 
@@ -158,3 +173,68 @@ def test_a_damaged_contract_in_a_checkpoint_is_one_line(sliders: Sliders) -> Non
 
 def test_the_contract_of_a_task_is_the_same_each_time(sliders: Sliders) -> None:
     assert differences(published(sliders), published(Sliders(SlidersConfig(), 2, seed=5)), ranges=True) == []
+
+
+LIMITED = """<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody><body name="near" pos="0 0 1">
+  <joint name="first" type="hinge" axis="0 0 1" range="-3 1" limited="true"/>
+  <geom type="sphere" size="0.1" mass="1" pos="0.5 0 0" contype="0" conaffinity="0"/>
+  <body name="far" pos="1 0 0">
+    <joint name="second" type="slide" axis="1 0 0" range="0 2" limited="true"/>
+    <geom type="sphere" size="0.1" mass="1" contype="0" conaffinity="0"/>
+  </body></body></worldbody></mujoco>"""
+
+
+@dataclass(frozen=True)
+class DrivenConfig(TaskConfig):
+    control_hz: float = 50.0
+    substeps: int = 4
+    episode_seconds: float = 1.0
+    rewards: Mapping[str, float] = reward_weights(alive=1.0)
+
+
+def driven_by(function: Any, actuator: Any, **options: Any) -> list[dict[str, Any]]:
+    """The actions of the contract of a task whose robot is driven so."""
+
+    class Driven(DeclaredTask):
+        config_type = DrivenConfig
+
+        def robot(self, config: DrivenConfig) -> Robot:
+            return Robot(LIMITED, actuators=[actuator])
+
+        def declare(self, config: DrivenConfig) -> Declaration:
+            return Declaration(
+                actions={"drive": Action(function, **options)},
+                observations={"policy": {"place": Observation(terms.joint_position)}},
+                rewards={"alive": Reward(terms.alive)},
+            )
+
+    found: list[dict[str, Any]] = published(Driven(DrivenConfig(), 2, seed=1)).document()["actions"]
+    return found
+
+
+def test_gains_of_a_motor_whose_force_is_computed_are_its_own() -> None:
+    motor = ExplicitPDActuator("*", {"first": 20.0, "second": 30.0}, 0.5, effort_limit=4.0)
+    first, second = driven_by(terms.position_target, motor, kind="position", scale=0.25)
+    assert [(each["stiffness"], each["damping"], each["effort_limit"]) for each in (first, second)] == [
+        (20.0, 0.5, 4.0),
+        (30.0, 0.5, 4.0),
+    ]
+    assert (first["scale"], first["unit"], second["unit"], first["rule"]) == (0.25, "rad", "m", "")
+
+
+def test_a_share_of_a_range_is_told_as_scale_and_offset_within_limits() -> None:
+    """value = 0.5 a + 0.2, within ±1, is a share of [-3, 1]: the target is -1 + 2 value."""
+    servo = PositionActuator("*", 20.0, 0.5)
+    first, second = driven_by(
+        terms.share_of_range_target, servo, kind="position", scale=0.5, offset=0.2, clip=(-2.0, 2.0)
+    )
+    assert (first["scale"], first["offset"]) == pytest.approx((1.0, -0.6))
+    assert (second["scale"], second["offset"]) == pytest.approx((0.5, 1.2))
+    assert first["clip"] == pytest.approx([-2.0, 1.6]) and first["rule"] == ""
+
+
+def test_what_a_scale_and_an_offset_do_not_say_is_told_in_words() -> None:
+    servo = PositionActuator("*", 20.0, 0.5)
+    first, _ = driven_by(terms.smoothed_position_target, servo, kind="position", share=0.25)
+    assert first["rule"].startswith("A position target that follows ``value`` slowly: t = share * value")
+    assert first["rule"].endswith("(share = 0.25)")
