@@ -21,8 +21,8 @@ from tests.support.processes import gang_members
 
 _TIMING = ("time", "_seconds", "_per_second", "slowest_rank", "slowest_excess")
 """How the names of fields end that no two runs share."""
-_NOT_TRAINING = {"checkpoint", "seconds", "time"}
-"""The same of an evaluation; the checkpoint's name has the epoch in it."""
+_NOT_TRAINING = {"checkpoint", "table", "seconds", "time"}
+"""The same of an evaluation; the names of the checkpoint and of the table have the epoch in them."""
 _MANIFEST = ("world_size", "worlds", "shards", "reward", "env_steps", "task", "train", "ppo", "policy")
 
 

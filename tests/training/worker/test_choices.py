@@ -21,7 +21,7 @@ import dataclasses
 
 import warp as wp
 
-from worker.tasks import Choice, RobotArrays, WorldArrays
+from worker.tasks import Choice, Reward, RobotArrays, WorldArrays, terms
 from worker.tasks.cartpole import Cartpole
 
 
@@ -34,7 +34,11 @@ class Pushed(Cartpole):
     """The cart is pushed to the left, not at all, or to the right."""
 
     def declare(self, config):
-        return dataclasses.replace(super().declare(config), actions=Choice(push, names=("left", "nothing", "right")))
+        declared = super().declare(config)
+        # a choice has no size that could cost anything
+        rewards = {**declared.rewards, "effort": Reward(terms.joint_velocity_squared, joints="slider")}
+        choice = Choice(push, names=("left", "nothing", "right"))
+        return dataclasses.replace(declared, actions=choice, rewards=rewards)
 '''
 JOB = "name: pushed\nresources: {cpus: 1, memory: 1GiB}\ntrain: {task: pushed:Pushed, worlds: 64, iterations: 80}\n"
 
