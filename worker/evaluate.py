@@ -39,10 +39,9 @@ def main() -> int:
     from worker.evaluation.evaluation import result_of
     from worker.learning.algorithm import Share
     from worker.learning.randomness import held_out_seed, seed_generators
-    from worker.learning.setup import build_task, check_contract
+    from worker.learning.setup import begin_as_trained, build_task, check_contract
     from worker.learning.trained import choose_checkpoint, load_policies
     from worker.tasks import find_task
-    from worker.tasks.adapting import begin_evaluation
 
     checkpoint = choose_checkpoint(gang, run, job.section.get("checkpoint"))
     facts = checkpoint.manifest
@@ -59,8 +58,7 @@ def main() -> int:
 
     def build(first: int) -> Task:
         task = build_task(task_type, config, Share(first + share.first, share.count, total), gang, seed)
-        told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
-        begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
+        begin_as_trained(task, checkpoint)
         return task
 
     task = build(0)

@@ -55,9 +55,8 @@ def main() -> int:
     gang = connect(Placement())
     from worker.learning.algorithm import Share
     from worker.learning.randomness import held_out_seed, seed_generators
-    from worker.learning.setup import build_task
+    from worker.learning.setup import begin_as_trained, build_task
     from worker.tasks import find_task
-    from worker.tasks.adapting import begin_evaluation
 
     facts = checkpoint.manifest
     with user_errors("task"):
@@ -66,8 +65,7 @@ def main() -> int:
     seed = held_out_seed(facts["train"].get("seed", 0))
     seed_generators(seed)
     task = build_task(task_type, config, Share.of(0, 1, worlds), gang, seed)
-    told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
-    begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
+    begin_as_trained(task, checkpoint)
     target = export(run, checkpoint, task, -(-episodes // worlds))
     print(f"exported: {target}", flush=True)
     gang.close()

@@ -21,6 +21,7 @@ from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.job import Job, user_errors
+from worker.tasks.adapting import begin_evaluation
 from worker.tasks.mistakes import task_mistakes
 from worker.tasks.policy_contract import policy_contract, same_policy
 
@@ -168,6 +169,13 @@ def contract_from(facts: Mapping[str, Any], checkpoint: str) -> Contract | None:
         return read(facts["contract"], f"checkpoint {checkpoint}: contract")
     except DocumentError as error:
         raise UserError(str(error)) from None
+
+
+def begin_as_trained(task: Task, checkpoint: Checkpoint) -> None:
+    """Prepare worlds in which a checkpoint's policy acts: curricula and adaptive numbers stand as they did in its training."""
+    facts = checkpoint.manifest
+    told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
+    begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
 
 
 def check_contract(checkpoint: Checkpoint, task: Task) -> None:

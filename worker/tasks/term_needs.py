@@ -21,7 +21,7 @@ class Needs:
     Attributes:
         memory: Numbers of its own in ``episodes.memory``.
         memory_each: Further ones for each value that its element may have: each joint of the robot, or each ``index``.
-        command: Numbers of its command that the policy is told; a function that draws a command writes exactly so many.
+        command: Numbers of its command that the policy sees; a function that draws a command writes exactly that many.
         hidden: Numbers of its command behind those.
         size: How many values ``index`` has, where it counts something of the function's own.
         each: How many values ``index`` has for each column of the sensors.

@@ -16,10 +16,9 @@ from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Run
 from worker.learning.job import configure, user_errors
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.setup import check_contract, observed
+from worker.learning.setup import begin_as_trained, check_contract, observed
 from worker.learning.trained import find_checkpoint, load_policy
 from worker.tasks import find_task
-from worker.tasks.adapting import begin_evaluation
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Reading, Tap
@@ -74,8 +73,7 @@ class Rollout:
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
         with user_errors():
             task = task_type(config, worlds, seed=seed, device=device)
-        told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
-        begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
+        begin_as_trained(task, checkpoint)
         policy = load_policy(checkpoint, device)
         check_contract(checkpoint, task)
         return cls(run, checkpoint, config, task, policy, seed)

@@ -164,7 +164,7 @@ def steer_velocity_command(
 ):
     """Turn a robot to the heading of :func:`heading_velocity_command`: stiffness * (heading - yaw), clipped to ``turn`` [rad/s].
 
-    Commands of the world's frame are told in the robot's, as it is turned now; those that stand stay 0. ``stiffness`` is in 1/s.
+    Commands in the world's frame are turned into the robot's present frame; commands to stand stay 0. ``stiffness`` is in 1/s.
 
     mjlab: UniformVelocityCommand (heading_control_stiffness). Isaac Lab: UniformVelocityCommand (heading_control_stiffness).
     """

@@ -98,6 +98,12 @@ def follow_anchor_turn(
 
 
 @wp.func
+def likeness(motion: MotionArrays, total: float, std: float) -> float:
+    """exp(-mean / std^2) of squared errors of the motion's bodies, given their ``total``."""
+    return wp.exp(-total / (float(motion.bodies.shape[0]) * std * std))
+
+
+@wp.func
 def follow_body_positions(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, command: int, std: float
 ) -> float:
@@ -108,7 +114,7 @@ def follow_body_positions(
     total = float(0.0)
     for index in range(motion.bodies.shape[0]):
         total += wp.length_sq(body_way(episodes, bodies, motion, world, index, command))
-    return wp.exp(-total / (float(motion.bodies.shape[0]) * std * std))
+    return likeness(motion, total, std)
 
 
 @wp.func
@@ -123,7 +129,7 @@ def follow_body_turns(
     for index in range(motion.bodies.shape[0]):
         angle = body_turn_error(episodes, bodies, motion, world, index, command)
         total += angle * angle
-    return wp.exp(-total / (float(motion.bodies.shape[0]) * std * std))
+    return likeness(motion, total, std)
 
 
 @wp.func
@@ -139,7 +145,7 @@ def follow_body_velocities(
     for index in range(motion.bodies.shape[0]):
         velocity = body_origin_velocity(bodies, world, motion.bodies[index])
         total += wp.length_sq(velocity - motion.linear[frame, index])
-    return wp.exp(-total / (float(motion.bodies.shape[0]) * std * std))
+    return likeness(motion, total, std)
 
 
 @wp.func
@@ -155,7 +161,7 @@ def follow_body_turning(
     for index in range(motion.bodies.shape[0]):
         turning = body_turning(bodies, world, motion.bodies[index])
         total += wp.length_sq(turning - motion.angular[frame, index])
-    return wp.exp(-total / (float(motion.bodies.shape[0]) * std * std))
+    return likeness(motion, total, std)
 
 
 @wp.func
