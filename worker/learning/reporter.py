@@ -19,7 +19,9 @@ from shared_store.layout import Run
 _EVERY = 1.0
 """Seconds between two reads of the epoch."""
 _LATE = 2.0
-"""Seconds since the last look from which on a record waits for the next one, at most as long: a volume that hangs answers no look."""
+"""Seconds since the last look from which on a record waits for the next one."""
+_PATIENT = 2.0
+"""Seconds that a record waits for a look at most: a volume that hangs answers none."""
 _MOST = 10_000
 """Calls that are kept while the volume does not take them; later ones are dropped."""
 _HELD = 0.02
@@ -48,7 +50,7 @@ class Fence:
 
         A process that was stopped, and goes on, would otherwise write before its next look.
         """
-        patience = time.monotonic() + _LATE
+        patience = time.monotonic() + _PATIENT
         while self._problem is None and not self._over.is_set() and self._is_late(patience):
             time.sleep(0.01)
         if self._problem is None:

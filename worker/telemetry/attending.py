@@ -141,5 +141,7 @@ class Attending:
         if self._segment is not None:
             self._segment.close()
         self._segment = None
-        for path in (answer_of(self._run), request_of(self._run)):
-            path.unlink(missing_ok=True)
+        answer_of(self._run).unlink(missing_ok=True)
+        request = read_json(request_of(self._run)) or {}
+        if (request.get("host"), request.get("process")) == self._reader:  # else it is the next reader's
+            request_of(self._run).unlink(missing_ok=True)

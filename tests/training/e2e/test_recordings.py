@@ -41,7 +41,8 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     known = episodes(live)
     assert {each["world"] for each in known} == {"0", "1"} and {each["job"] for each in known} == {job}
     assert all(each["length"] == "30" for each in known if each["complete"] == "true" and each["end"] == "time_out")
-    assert not list(run.telemetry.iterdir()) and server.detail(job)["status"] == "RUNNING"
+    wait_for(lambda: not list(run.telemetry.iterdir()), what="the training sees that nobody reads any more")
+    assert server.detail(job)["status"] == "RUNNING"
     with live.open("rb") as file:
         assert any(b"iteration" in message.data for _, _, message in make_reader(file).iter_messages("/rosout"))
 
