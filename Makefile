@@ -1,5 +1,6 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
 # make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
+# make long             trainings that are killed, stretched and cut off, and trainings that learn something
 # make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
@@ -14,7 +15,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test unit integration training robots engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test unit integration training long robots engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -23,7 +24,7 @@ run: $(READY)
 PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
 test: lint kernels
-	$(PYTEST) -m "not cluster and not robots"
+	$(PYTEST) -m "not cluster and not robots and not long"
 
 unit: $(READY)
 	$(PYTEST) tests/unit
@@ -33,6 +34,9 @@ integration: $(READY)
 
 training: $(READY) kernels
 	$(PYTEST) tests/training
+
+long: $(READY) kernels
+	$(PYTEST) tests/long
 
 robots: $(READY)
 	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube
@@ -91,7 +95,7 @@ torture: $(READY)
 	$(BIN)/python -m tests.support.faults.torture --kills $(or $(N),300) --rounds $(or $(ROUNDS),10)
 
 bits: $(READY)
-	MUSTER_LONG=1 $(BIN)/pytest -q tests/training/faults/test_bits.py tests/training/faults/test_bits_of_algorithms.py tests/training/e2e tests/integration/engines/test_docker_faults.py tests/training/engines
+	MUSTER_LONG=1 $(BIN)/pytest -q tests/training/faults/test_bits.py tests/long/faults/test_bits_of_algorithms.py tests/training/e2e tests/integration/engines/test_docker_faults.py tests/training/engines
 
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/integration/conformance/test_fuzz.py tests/integration/conformance/test_hostile_clients.py

@@ -86,11 +86,13 @@ def compiled(name: str, text: str, scope: dict[str, Any], functions: list[str], 
         return _COMPILED[key]
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     label = re.sub(r"\W", "_", name)
-    file = f"<task {label} {digest}-{len(_COMPILED)}>"
+    # the same from process to process, whatever was built before: else Warp's cache on the disk would not find it
+    alike = sum(known[:2] == key[:2] for known in _COMPILED)
+    file = f"<task {label} {digest}-{alike}>"
     # a reader of a traceback, and Warp itself, find the text here
     linecache.cache[file] = (len(text), None, [f"{line}\n" for line in text.split("\n")], file)
     exec(compile(text, file, "exec"), scope)
-    module = wp.get_module(f"muster.{label}.{digest}.{len(_COMPILED)}")
+    module = wp.get_module(f"muster.{label}.{digest}.{alike}")
     module.options["enable_backward"] = False
     for function in functions:
         scope[function] = wp.func(scope[function], module=module)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
-from tests.conftest import Serving, wait_for
+from tests.conftest import Serving, call_muster, wait_for
 
 SMALL = {
     "nodes": 1,
@@ -78,6 +78,6 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         ("render", run.name, "-o", "x.gif", "--size", "big"): "expected WIDTHxHEIGHT, such as 640x360",
     }
     for arguments, words in refused.items():
-        done = server.muster(*arguments)
+        done = call_muster(*arguments, home=server.home)
         assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
         assert len(done.stderr.strip().splitlines()) == 1

@@ -112,7 +112,7 @@ REFUSED = {
 }
 """Of each key that can't change: another value."""
 ELSEWHERE = {"train.worlds", "train.settings"}
-"""Depends on the checkpoint, or on the class of the user's own: tests/training/faults/test_refusals.py and test_resume_others.py."""
+"""Depends on the checkpoint, or on the class of the user's own: tests/training/faults/test_refusals.py and tests/long/faults/test_resume_others.py."""
 
 
 def sections_of(annotation: Any) -> list[type[BaseModel]]:
