@@ -171,6 +171,7 @@ class Worlds:
             placed worlds afresh and keeps ``drives.state_tensors``.
         after_substep: Called after each physics step of :meth:`simulate`, in this order: launches only. The contacts and forces of that
             step are in ``solver.mjw_data``; Newton's own state (``arrays.joint_q``, ``state``) is still that before :meth:`simulate`.
+        pushed: Bodies of a world on which something acts from outside, ``state.body_f``, which the solver reads.
 
     Raises:
         ValueError: An option of the solver is unknown or set here, the robot has actuators that would ignore the controls, or the
@@ -212,6 +213,7 @@ class Worlds:
         self.solver = _Solver(self.model, **_SET_HERE, **solver_options)
         self.solver.substeps = substeps
         self.after_substep: list[Callable[[], None]] = []
+        self.pushed: set[int] = set()
         self.solver.after_substep = self.after_substep
         # The kernels would print each overflow, which is slow; it is counted instead (see WorldArrays.overflow).
         options = self.solver.mjw_model.opt

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from tests.support.worker.terms_rig import (
@@ -24,6 +25,7 @@ from tests.support.worker.terms_rig import (
 )
 from worker.simulation.sensors.frames import FrameArrays
 from worker.tasks.terms import following, manipulation, tracking
+from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling
 from worker.tasks.terms.motion import Motion, MotionArrays
 
 SHARED = [
@@ -77,6 +79,7 @@ def motion() -> MotionArrays:
     arrays.root_linear = array(random.normal(size=(FRAMES, 3)), wp.vec3)
     arrays.root_angular = array(random.normal(size=(FRAMES, 3)), wp.vec3)
     arrays.bodies, arrays.anchor, arrays.rate = array(FOLLOWED, wp.int32), ANCHOR, 1.5
+    arrays.sampling = FrameSampling(None, 1.0, WORLDS, "cpu").arrays
     return arrays
 
 
@@ -274,7 +277,8 @@ def _context() -> Any:
     view = SimpleNamespace(
         joint_names=["j"] * JOINTS, body_names=names, bodies=list(range(3, 3 + BODIES)), find_bodies=find
     )
-    return SimpleNamespace(device="cpu", control_hz=25.0, view=lambda name, what: view)
+    worlds = SimpleNamespace(world_count=WORLDS)
+    return SimpleNamespace(device="cpu", control_hz=25.0, view=lambda name, what: view, worlds=worlds)
 
 
 def test_a_motion_is_read_from_its_file(tmp_path: Path) -> None:
@@ -315,3 +319,31 @@ def test_a_motion_that_is_not_there_or_has_another_anchor(tmp_path: Path) -> Non
         ValueError, match=r"Motion.anchor: name one of the bodies that are followed, not 'body_1'; body_2"
     ):
         Motion(_file(tmp_path), bodies=["body_2"], anchor="body_1").build(_context())
+
+
+def test_frames_behind_which_worlds_failed_become_likelier() -> None:
+    declaration = AdaptiveSampling(seconds=2.0, even=0.5, rate=0.25, reach=2, decay=0.5)
+    sampling = FrameSampling(declaration, 7.0, WORLDS, "cpu")  # four parts
+    near(sampling.arrays.likely.numpy(), [0.25, 0.5, 0.75, 1.0])
+    state = sampling.state_tensors()
+    state["failed"].copy_(torch.tensor([2, 2, 0]))
+    sampling.advance()
+    assert state["failed"].tolist() == [-1, -1, -1]
+    state["failed"].copy_(torch.tensor([-1, 3, -1]))
+    sampling.advance()
+    failures = np.array([0.25 * 0.75, 0.0, 2 * 0.25 * 0.75, 0.25])
+    near(state["failures"].numpy().sum(0), failures)
+    own = failures + 0.5 / 4
+    reached = own + 0.5 * own[[1, 2, 3, 3]]
+    wanted = reached / reached.sum()
+    near(sampling.arrays.likely.numpy(), np.cumsum(wanted))
+    near(sampling.arrays.evenness.numpy(), [-(wanted * np.log(wanted)).sum() / np.log(4)])
+
+
+@pytest.mark.parametrize("changed", [{"seconds": 0.0}, {"even": 0.0}, {"rate": 1.5}, {"reach": 0}, {"decay": -1.0}])
+def test_a_wrong_sampling_is_refused_in_one_line(changed: dict[str, Any], tmp_path: Path) -> None:
+    name, value = next(iter(changed.items()))
+    with pytest.raises(ValueError, match=rf"^AdaptiveSampling\.{name} is {value}; use a (whole )?number") as error:
+        sampling = AdaptiveSampling(**changed)
+        Motion(_file(tmp_path), bodies=["body_2"], anchor="body_2", sampling=sampling).build(_context())
+    assert "\n" not in str(error.value)

@@ -106,6 +106,8 @@ from worker.tasks.terms.episode import (
     time_left,
 )
 from worker.tasks.terms.events import (
+    apply_impulse,
+    apply_wrench,
     push,
     reset_joints_between_limits,
     reset_joints_by_offset,
@@ -141,6 +143,7 @@ from worker.tasks.terms.footing import (
     swung_foot_clearance,
     swung_foot_height_error,
 )
+from worker.tasks.terms.frame_sampling import AdaptiveSampling
 from worker.tasks.terms.ground import (
     draw_patch,
     foot_clearance_above_ground,
@@ -298,6 +301,7 @@ from worker.tasks.terms.tolerances import (
 )
 from worker.tasks.terms.tracking import (
     advance_motion,
+    evenness_of_frames,
     followed_body_position,
     followed_body_turn,
     motion_command,

@@ -12,6 +12,7 @@ from worker.simulation.kinematics import (
     set_root_velocity,
 )
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.sensors.wrench import LASTING_FROM_NOW, WrenchArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.terms.placing import NONE, between, place_root, set_joint, within_limits
 
@@ -189,3 +190,51 @@ def push(
     linear = linear + root_origin_velocity(worlds, robot, bodies, world)
     angular = angular + root_turning(worlds, robot, world)
     set_root_velocity(worlds, robot, bodies, world, linear, angular)
+
+
+@wp.func
+def _draw_wrenches(world: int, wrench: WrenchArrays, stream: wp.uint32, force: wp.vec2, torque: wp.vec2):
+    """Each component of each body's force and torque evenly from its range."""
+    for index in range(wrench.bodies.shape[0]):
+        first = 6 * index
+        wrench.wrenches[world, wrench.bodies[index]] = wp.spatial_vector(
+            between(stream, first, force),
+            between(stream, first + 1, force),
+            between(stream, first + 2, force),
+            between(stream, first + 3, torque),
+            between(stream, first + 4, torque),
+            between(stream, first + 5, torque),
+        )
+
+
+@wp.func
+def apply_wrench(world: int, wrench: WrenchArrays, stream: wp.uint32, force: wp.vec2 = NONE, torque: wp.vec2 = NONE):
+    """Pull at each body of an ``ExternalWrench`` from now to the end of the episode, as wind or a load does.
+
+    Each component of the force at its centre of mass [N] and of the torque [N m], in the world frame, is drawn evenly from its range.
+    What acted before ends.
+
+    mjlab: apply_external_force_torque. Isaac Lab: apply_external_force_torque.
+    """
+    _draw_wrenches(world, wrench, stream, force, torque)
+    wrench.left[world] = LASTING_FROM_NOW
+
+
+@wp.func
+def apply_impulse(
+    world: int,
+    wrench: WrenchArrays,
+    stream: wp.uint32,
+    duration: wp.vec2,
+    force: wp.vec2 = NONE,
+    torque: wp.vec2 = NONE,
+):
+    """Pull at each body of an ``ExternalWrench`` for some time, drawn from ``duration`` [s], as a bump or a gust does.
+
+    Each component of the force at its centre of mass [N] and of the torque [N m], in the world frame, is drawn evenly from its range.
+    Give it to an interval longer than ``duration``.
+
+    mjlab: apply_body_impulse (whose cooldown_s begins when an impulse is over). Isaac Lab: -.
+    """
+    _draw_wrenches(world, wrench, stream, force, torque)
+    wrench.left[world] = between(stream, 6 * wrench.bodies.shape[0], duration)

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from worker.simulation.sensors.places import place_names
+from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
@@ -47,6 +48,7 @@ class MotionArrays:
         bodies: Columns of ``BodyArrays`` of the bodies that are followed, shape ``(bodies,)``.
         anchor: Which of these is the anchor, to which the others are seen.
         rate: Frames of a control step.
+        sampling: With which frames episodes begin.
     """
 
     joint_positions: wp.array2d(dtype=wp.float32)
@@ -61,6 +63,7 @@ class MotionArrays:
     bodies: wp.array(dtype=wp.int32)
     anchor: int
     rate: float
+    sampling: SamplingArrays
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ class Motion:
         bodies: Pattern or patterns of the bodies that are followed.
         anchor: The body to which the others are seen, one of ``bodies``.
         robot: Who follows it.
+        sampling: With which frames episodes begin; None: each is as likely.
     """
 
     arrays_type: ClassVar[Any] = MotionArrays
@@ -81,6 +85,7 @@ class Motion:
     bodies: str | Sequence[str]
     anchor: str
     robot: str = "robot"
+    sampling: AdaptiveSampling | None = None
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each body that is followed. Raises ValueError where a pattern or a name matches nothing."""
@@ -90,7 +95,8 @@ class Motion:
         """The motion on the device of these worlds.
 
         Raises:
-            ValueError: The file can't be read, lacks an array, or is of another robot; or a pattern fits no body.
+            ValueError: The file can't be read, lacks an array, or is of another robot; a pattern fits no body, or a number of the
+                sampling is out of its range.
         """
         view = context.view(self.robot, "Motion.robot")
         found = view.find_bodies(self.bodies)
@@ -121,31 +127,36 @@ class Motion:
         arrays.bodies = wp.array([view.bodies[each] for each in found], dtype=wp.int32, device=device)
         arrays.anchor = found.index(anchors[0])
         arrays.rate = float(data["fps"]) / context.control_hz
-        return RecordedMotion(arrays, tuple(names))
+        length = len(data["joint_pos"]) / float(data["fps"])
+        sampling = FrameSampling(self.sampling, length, context.worlds.world_count, device)
+        arrays.sampling = sampling.arrays
+        return RecordedMotion(arrays, tuple(names), sampling)
 
 
 class RecordedMotion:
-    """A :class:`Motion` of some worlds; it never changes, so it has nothing to measure.
+    """A :class:`Motion` of some worlds; it never changes, but with which frames episodes begin may.
 
     Args:
         arrays: The motion.
         names: Of the bodies that are followed.
+        sampling: With which frames episodes begin.
     """
 
     needs_bodies = False
 
-    def __init__(self, arrays: MotionArrays, names: tuple[str, ...]) -> None:
-        self.arrays, self.names = arrays, names
+    def __init__(self, arrays: MotionArrays, names: tuple[str, ...], sampling: FrameSampling) -> None:
+        self.arrays, self.names, self._sampling = arrays, names, sampling
 
     def advance(self) -> None:
-        """Nothing changes in a step: where in the motion a world is, is in its command."""
+        """Count who failed where. Where in the motion a world is, is in its command."""
+        self._sampling.advance()
 
     def settle(self) -> None:
         """Nothing changes at a reset."""
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Nothing outlasts a step."""
-        return {}
+        """What the sampling of frames remembers."""
+        return self._sampling.state_tensors()
 
 
 def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.term_needs import needs
+from worker.tasks.terms.frame_sampling import drawn_frame
 from worker.tasks.terms.motion import MotionArrays
 from worker.tasks.terms.placing import between, set_joint, within_limits
 
@@ -91,18 +92,18 @@ def motion_command(
     joints: float = 0.0,
     soft_factor: float = 1.0,
 ):
-    """Draw a frame of the motion, each as likely, or take the first, and put the robot there; 1 number.
+    """Draw a frame of the motion, as its ``sampling`` says, or take the first, and put the robot there; 1 number.
 
     The pose and velocities of the root and the joints' positions are those of the frame plus numbers drawn evenly from plus and minus
     ``position`` [m], ``turn`` (roll, pitch, yaw, about the world's axes) [rad], ``velocity`` [m/s], ``turning`` [rad/s] and ``joints`` [m, rad]. Joints
     stay within ``soft_factor`` times their range. Give it ``update=Term(terms.advance_motion)`` and a time longer than an episode.
 
-    mjlab: MotionCommand (sampling_mode "uniform" or "start"). Isaac Lab: MotionCommand (of BeyondMimic).
+    mjlab: MotionCommand (sampling_mode "adaptive", "uniform" or "start"). Isaac Lab: MotionCommand (of BeyondMimic).
     """
     frames = motion.roots.shape[0]
     frame = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
     if not from_start:
-        frame = wp.randi(wp.rand_init(int(stream), 0), 0, frames)
+        frame = drawn_frame(episodes, motion.sampling, world, frames, stream, 13 + robot.defaults.shape[0])
     episodes.memory[world, command] = float(frame)
     place = wp.transform_get_translation(motion.roots[frame]) + sampled(stream, 1, position)
     angles = sampled(stream, 4, turn)
@@ -125,6 +126,16 @@ def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, co
     mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as mjlab's).
     """
     episodes.memory[world, command] = episodes.memory[world, command] + motion.rate
+    motion.sampling.frames[world] = episodes.memory[world, command]
+
+
+@wp.func
+def evenness_of_frames(world: int, motion: MotionArrays) -> float:
+    """How evenly episodes begin with all parts of the motion, from 0 to 1: the entropy of the sampling over its greatest.
+
+    mjlab: MotionCommand (its metric sampling_entropy). Isaac Lab: MotionCommand (of BeyondMimic, its metric sampling_entropy).
+    """
+    return motion.sampling.evenness[0]
 
 
 @wp.func
