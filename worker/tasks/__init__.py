@@ -55,6 +55,7 @@ _PUBLIC = {
     "worker.simulation.sensors.height_scan": ("GridPattern", "HeightScan", "HeightScanArrays", "RingPattern"),
     "worker.simulation.sensors.imu": ("Imu", "ImuArrays"),
     "worker.simulation.sensors.momentum": ("AngularMomentum", "MomentumArrays"),
+    "worker.simulation.sensors.rays": ("LidarPattern", "RayArrays", "RayCaster"),
     "worker.simulation.sensors.wrench": ("ExternalWrench", "WrenchArrays"),
     "worker.simulation.terrain": ("Terrain",),
     "worker.simulation.terrain_patches": (

@@ -18,6 +18,7 @@ from worker.simulation.episodes import STEP, check_group, check_observations
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.camera import Camera
+from worker.simulation.sensors.rays import RayCasting
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.terrain import Terrain
 from worker.tasks.adapting import Adapting
@@ -165,6 +166,7 @@ class DeclaredTask(Task):
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
         }
         self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
         structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
         structs |= {f"robot_{name}": arrays for name, arrays in robots.items()}
         structs |= {f"sensor_{name}": sensor.arrays for name, sensor in self.sensors.items()}
@@ -341,9 +343,9 @@ class DeclaredTask(Task):
             self.randomizations.settle()
         if self.worlds.drives:
             self.worlds.drives.settle(self._episodes.ages)
-        if self._cameras or self._needs.placed:
+        if self._sees or self._needs.placed:
             self.worlds.update_bodies()
-        if self._cameras:
+        if self._sees:
             self.worlds.update_shapes()
         for sensor in self.sensors.values():
             sensor.settle()

@@ -15,6 +15,7 @@ from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
+from worker.simulation.sensors.rays import RayArrays
 from worker.simulation.terrain_arrays import TerrainArrays
 from worker.tasks.terms import contacts, ground, locomotion, sensing, tolerances
 
@@ -77,8 +78,10 @@ def structs() -> dict[Any, Any]:
     allowed = tolerances.ToleranceArrays()
     allowed.columns = array([0, 3], wp.int32)
     allowed.standing, allowed.walking, allowed.running = array([0.5, 1.0]), array([1.0, 2.0]), array([3.0, 4.0])
-    found = (arrays, frames, imu, momentum, scan, terrain, allowed)
-    kinds = (ContactArrays, FrameArrays, ImuArrays, MomentumArrays, HeightScanArrays, TerrainArrays)
+    rays = RayArrays()
+    rays.distances = array(random.uniform(0.1, 5.0, (WORLDS, POINTS)))
+    found = (arrays, frames, imu, momentum, scan, terrain, rays, allowed)
+    kinds = (ContactArrays, FrameArrays, ImuArrays, MomentumArrays, HeightScanArrays, TerrainArrays, RayArrays)
     return dict(zip((*kinds, tolerances.ToleranceArrays), found, strict=True))
 
 
@@ -252,6 +255,9 @@ def test_sensors(rig: Rig) -> None:
     near(rig.call(sensing.angular_momentum_squared), (momentum.angular.numpy() ** 2).sum(1))
     near(rig.call(sensing.center_of_mass_velocity), momentum.velocities.numpy())
     near(rig.call(sensing.center_of_mass), momentum.centers.numpy())
+    distances = rig.structs[RayArrays].distances.numpy()
+    near(rig.call(sensing.ray_distance, 1), distances[:, 1])
+    near(rig.call(sensing.nearest_obstacle), distances.min(1))
 
 
 def test_the_ground(rig: Rig) -> None:

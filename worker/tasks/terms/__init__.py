@@ -292,6 +292,8 @@ from worker.tasks.terms.sensing import (
     imu_linear_velocity,
     imu_orientation,
     imu_projected_gravity,
+    nearest_obstacle,
+    ray_distance,
 )
 from worker.tasks.terms.tolerances import (
     ToleranceArrays,

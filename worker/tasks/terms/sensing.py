@@ -8,6 +8,7 @@ from worker.simulation.kinematics import turn_element, unique_quaternion
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
+from worker.simulation.sensors.rays import RayArrays
 from worker.tasks.term_needs import needs
 
 wp.set_module_options({"enable_backward": False})
@@ -166,3 +167,24 @@ def center_of_mass(world: int, momentum: MomentumArrays) -> wp.vec3:
     mjlab: builtin_sensor (a subtreecom). Isaac Lab: -.
     """
     return momentum.centers[world]
+
+
+@wp.func
+def ray_distance(world: int, rays: RayArrays, index: int) -> float:
+    """Distance to what a ray hits [m], of each ray; at most ``max_distance`` of the ``RayCaster``.
+
+    mjlab: builtin_sensor (distances of a RayCastSensor). Isaac Lab: ray_hits_w (of a RayCaster's data, as points).
+    """
+    return rays.distances[world, index]
+
+
+@wp.func
+def nearest_obstacle(world: int, rays: RayArrays) -> float:
+    """Distance to the nearest that any of the rays hits [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    nearest = float(wp.inf)
+    for ray in range(rays.distances.shape[1]):
+        nearest = wp.min(nearest, rays.distances[world, ray])
+    return nearest

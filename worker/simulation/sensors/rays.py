@@ -1,0 +1,211 @@
+"""Distances along rays from a frame on a robot: what a laser scanner measures, of all that cameras see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+import warp as wp
+
+from worker.simulation.camera import renderer
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.frames import only_one
+from worker.simulation.sensors.height_scan import ALIGNMENTS, FEW_POINTS, GridPattern, RingPattern
+from worker.simulation.sensors.places import Place, find_places, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
+
+wp.set_module_options({"enable_backward": False})
+
+_YAW = wp.constant(ALIGNMENTS.index("yaw"))
+_WORLD = wp.constant(ALIGNMENTS.index("world"))
+
+
+@wp.struct
+class RayArrays:
+    """What rays hit last: after the last reset, before the last observation. One row a world.
+
+    Attributes:
+        distances: From where each ray begins to what it hits, at most the declared ``max_distance`` [m], shape ``(worlds, rays)``.
+        directions: Unit vectors of the rays, in their frame, shape ``(rays,)``.
+    """
+
+    distances: wp.array2d(dtype=wp.float32)
+    directions: wp.array(dtype=wp.vec3)
+
+
+@wp.kernel
+def _follow(bodies: BodyArrays, body: int, mount: wp.transform, alignment: int, poses: wp.array(dtype=wp.transform)):
+    """The frame of one world's rays."""
+    world = wp.tid()
+    pose = place_pose(bodies, world, body, mount)
+    rotation = wp.transform_get_rotation(pose)
+    if alignment == _WORLD:
+        rotation = wp.quat_identity()
+    if alignment == _YAW:
+        forward = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))
+        rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.atan2(forward[1], forward[0]))
+    poses[world] = wp.transform(wp.transform_get_translation(pose), rotation)
+
+
+@wp.kernel
+def _measure(farthest: float, pixels: wp.array3d(dtype=wp.float32), arrays: RayArrays):
+    """One ray of one world; Newton says 0 where nothing is hit."""
+    world, ray = wp.tid()
+    distance = pixels[world, 0, ray]
+    if distance <= 0.0:
+        distance = farthest
+    arrays.distances[world, ray] = wp.min(distance, farthest)
+
+
+@dataclass(frozen=True)
+class LidarPattern:
+    """Rays from one point: ``count`` of them evenly around the frame's z axis, in each of the rows.
+
+    Attributes:
+        count: Rays of a row, from right to left; each is in the middle of its part of ``angle``.
+        elevations: Of each row above the frame's x-y plane [rad].
+        angle: How much of the circle a row covers, its middle ahead [rad].
+    """
+
+    count: int = 32
+    elevations: Sequence[float] = (0.0,)
+    angle: float = 2 * math.pi
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Origins [m] and directions (unit vectors) in the frame, each of shape ``(rays, 3)``.
+
+        Raises:
+            ValueError: There is no ray, there are too many, or an angle is out of range.
+        """
+        if not isinstance(self.count, int) or not 1 <= self.count * len(self.elevations) <= FEW_POINTS:
+            raise ValueError(
+                f"LidarPattern has {self.count} rays in {len(self.elevations)} rows; use 1 to {FEW_POINTS:,} in all"
+            )
+        if not 0.0 < self.angle <= 2 * math.pi + 1e-6:
+            raise ValueError(f"LidarPattern.angle is {self.angle}; use a number > 0, at most 2 pi [rad]")
+        if not all(abs(each) <= math.pi / 2 for each in self.elevations):
+            raise ValueError(
+                f"LidarPattern.elevations is {list(self.elevations)}; use numbers from -pi/2 to pi/2 [rad]"
+            )
+        around = self.angle * ((np.arange(self.count) + 0.5) / self.count - 0.5)
+        up = np.asarray(self.elevations, dtype=float)[:, None]
+        parts = (np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up) + 0.0 * around)
+        directions = np.stack(parts, axis=-1).reshape(-1, 3)
+        return np.zeros_like(directions), directions
+
+
+@dataclass(frozen=True)
+class RayCaster:
+    """Distances along rays to whatever cameras see: the ground, terrain, objects, and robots, its own too.
+
+    Attributes:
+        body: The body that the rays' frame is on. Give this or ``site``.
+        site: The site that it is on.
+        robot: Whose body or site that is.
+        pattern: A :class:`LidarPattern`, or the points of a ``GridPattern`` or ``RingPattern``, whose rays all go down.
+        position: Of the rays' frame in that of the body or site [m].
+        alignment: What the frame turns with: ``base``, with the body or site; ``yaw``, with it about the vertical alone; ``world``, with
+            nothing.
+        start: How far from its origin each ray begins, such as outside the robot's own shapes [m].
+        max_distance: Distances are at most this [m].
+    """
+
+    body: str | None = None
+    site: str | None = None
+    robot: str = "robot"
+    pattern: LidarPattern | GridPattern | RingPattern = LidarPattern()
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    alignment: Literal["yaw", "base", "world"] = "base"
+    start: float = 0.0
+    max_distance: float = 10.0
+    arrays_type: ClassVar[Any] = RayArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each ray, of these robots and objects. Raises ValueError where a name matches nothing or a number is out of range."""
+        if self.alignment not in ALIGNMENTS:
+            raise ValueError(f"RayCaster.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
+        for name, least in (("max_distance", 1e-9), ("start", 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                wanted = "> 0" if least else ">= 0"
+                raise ValueError(f"RayCaster.{name} is {getattr(self, name)}; use a number of metres {wanted}")
+        if (self.body is None) == (self.site is None):
+            raise ValueError("RayCaster: give either body or site, and not both")
+        place_names(views, "RayCaster", self.robot, bodies=self.body, sites=self.site)
+        return [str(ray) for ray in range(len(self.rays()[0]))]
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the rays begin [m] and their directions (unit vectors) in their frame, each of shape ``(rays, 3)``.
+
+        Raises:
+            ValueError: The pattern has a number that is out of range.
+        """
+        if isinstance(self.pattern, LidarPattern):
+            origins, directions = self.pattern.rays()
+        else:
+            points = self.pattern.points()
+            origins = np.concatenate((points, np.zeros((len(points), 1))), axis=-1)
+            directions = np.tile((0.0, 0.0, -1.0), (len(points), 1))
+        return origins + self.start * directions, directions
+
+    def build(self, context: SensorContext) -> RayCasting:
+        """The rays of these worlds.
+
+        Raises:
+            ValueError: Neither or both of ``body`` and ``site`` are given, it matches none or several, or a number is out of range.
+        """
+        self.rows(context.views)
+        found = find_places(context, "RayCaster", self.robot, self.body, self.site)
+        return RayCasting(self, only_one(found, "RayCaster"), context)
+
+
+class RayCasting:
+    """:class:`RayCaster` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    It measures in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
+    have been called.
+
+    Args:
+        declared: As a task declares it.
+        place: What the rays' frame is on.
+        context: The worlds.
+    """
+
+    needs_bodies = False  # only after resets, where the task sees to it
+
+    def __init__(self, declared: RayCaster, place: Place, context: SensorContext) -> None:
+        self.names = tuple(declared.rows(context.views))
+        self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
+        mount = wp.transform(wp.vec3(*declared.position), wp.quat_identity())
+        self._frame = [place.body, wp.transform_multiply(place.pose, mount), ALIGNMENTS.index(declared.alignment)]
+        self._farthest = declared.max_distance
+        origins, directions = declared.rays()
+        count, rays = context.worlds.world_count, len(origins)
+        self.arrays = RayArrays()
+        self.arrays.distances = context.array((count, rays), wp.float32)
+        self.arrays.directions = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=self._device)
+        self._sensor = renderer(context.worlds.model, 1)
+        # one row of pixels, each with a ray of its own
+        bundle = np.stack((origins, directions), axis=1).astype(np.float32)[None, :, None]
+        self._rays = wp.array(bundle, dtype=wp.vec3f, device=self._device)
+        self._poses = context.array((count,), wp.transform)
+        self._pixels = context.array((count, 1, rays), wp.float32)
+
+    def advance(self) -> None:
+        """Nothing: rays are cast once a step, after worlds were placed afresh."""
+
+    def settle(self) -> None:
+        """Cast the rays of every world."""
+        count, device = self._poses.shape, self._device
+        wp.launch(_follow, dim=count, inputs=[self._bodies, *self._frame, self._poses], device=device)
+        self._sensor.update(self._worlds.state, self._poses, self._rays, depth_image=self._pixels)
+        inputs = [self._farthest, self._pixels, self.arrays]
+        wp.launch(_measure, dim=self.arrays.distances.shape, inputs=inputs, device=device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """What was measured last: rewards of the next step read it."""
+        return views_of(self.arrays, "distances")
