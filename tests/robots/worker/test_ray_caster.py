@@ -151,7 +151,7 @@ class Scanning(DeclaredTask):
         )
 
     def objects(self, config: ScanningConfig) -> dict[str, Any]:
-        return {"box": Box(size=(0.5, 1.0, 1.0), position=(3.0, 0.0, 1.0), fixed=True)}
+        return {"box": Box("box", size=(0.5, 1.0, 1.0), position=(3.0, 0.0, 1.0), fixed=True)}
 
     def declare(self, config: ScanningConfig) -> Declaration:
         ahead = RayCaster(body="cart", pattern=LidarPattern(count=1, angle=0.1), start=0.2)
