@@ -202,7 +202,10 @@ def add(
     """
     driven: dict[int, Actuator] = {}
     for actuator in actuators:
-        joints = find(names, actuator.joints, f"joint of {robot}")
+        try:
+            joints = find(names, actuator.joints, f"joint of {robot}")
+        except ValueError as error:
+            raise ValueError(f"{robot}: {actuator._said()}: {error}") from error
         for joint in joints:
             if joint in driven:
                 raise ValueError(

@@ -136,15 +136,19 @@ class Robot:
             raise ValueError(f"{self.name}: {self._shown()} can't be read: {' '.join(str(error).split())}") from error
 
     def _set_joints(self, own: newton.ModelBuilder, view: RobotView) -> None:
-        for values, starts, given in (
-            (own.joint_q, view.coordinates, self.joint_positions),
-            (own.joint_armature, view.dofs, self.armature),
-            (own.joint_friction, view.dofs, self.friction_loss),
-            (own.joint_damping, view.dofs, self.viscous_damping),
+        for values, starts, argument in (
+            (own.joint_q, view.coordinates, "joint_positions"),
+            (own.joint_armature, view.dofs, "armature"),
+            (own.joint_friction, view.dofs, "friction_loss"),
+            (own.joint_damping, view.dofs, "viscous_damping"),
         ):
+            given = getattr(self, argument)
             if given is None or given == {}:
                 continue
-            resolved = resolve(view.joint_names, given, f"joint of {self.name}")
+            try:
+                resolved = resolve(view.joint_names, given, f"joint of {self.name}")
+            except ValueError as error:
+                raise ValueError(f"{self.name}: {argument}: {error}") from error
             for column, value in zip(starts, resolved, strict=True):
                 if value is not None:
                     values[column] = float(value)

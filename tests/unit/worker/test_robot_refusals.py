@@ -57,7 +57,11 @@ CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
     ),
     "no joint": (
         robot(actuators=(PositionActuator("left_kne", 1.0, 1.0),)),
-        ["no joint of robot matches 'left_kne'", "did you mean left_knee?", "there are left_hip, left_knee"],
+        [
+            "PositionActuator('left_kne'): no joint of robot matches 'left_kne'",
+            "did you mean left_knee?",
+            "there are left_hip, left_knee",
+        ],
     ),
     "a regular expression": (
         robot(actuators=(PositionActuator(".*_knee", 1.0, 1.0),)),
@@ -83,8 +87,11 @@ CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
     ),
     "damping that is a text": (lambda: VelocityActuator("*", "high"), ["damping must be 0 or more, not 'high'"]),
     "half a step of delay": (lambda: ExplicitPDActuator("*", 1.0, 1.0, delay=0.5), ["delay is a whole number", "0.5"]),
-    "default pose": (robot(joint_positions={"right_*": 1.0}), ["no joint of robot matches 'right_*'"]),
-    "armature": (robot(armature={"*_toe": 1.0}), ["no joint of robot matches '*_toe'"]),
+    "default pose": (
+        robot(joint_positions={"right_*": 1.0}),
+        ["robot: joint_positions: no joint of robot matches 'right_*'"],
+    ),
+    "armature": (robot(armature={"*_toe": 1.0}), ["robot: armature: no joint of robot matches '*_toe'"]),
     "collision": (
         robot(collisions=(Collision("foot_collision"),)),
         ["no geom of robot matches 'foot_collision'", "thigh_collision, shank_collision"],
