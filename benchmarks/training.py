@@ -51,11 +51,11 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9
     placement = Placement.from_env(os.environ)
     name = task.rpartition(":")[2]  # of a task by its path
     run = Store(store).open().run(f"bench-{name}-{worlds}-{seed}".lower())
-    if placement.rank == 0:
-        run.create({"run": run.name})
-        raise_epoch(run, 1)
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}
     spec = {"train": section, "checkpoint": {"every": every}}
+    if placement.rank == 0:
+        run.create({"run": run.name, "spec": spec})
+        raise_epoch(run, 1)
     job = Job(spec, Store(store), run, 1, 1, "bench", section=section)
     return Loop(Training.of(job, find_task(task)), connect(placement), StopRequest())
 

@@ -1,0 +1,205 @@
+"""What looking at a policy costs, and how fast it is judged and shipped: tap, recordings, evaluation, export, on this device.
+
+    python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
+
+Each training goes through three stretches of as many iterations: nobody has asked for its worlds, ``muster record`` writes four of
+them, and that has ended. Its checkpoint is then recorded, evaluated and exported. Writes ``seeing.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.load import Watch, add_option, told
+from benchmarks.training import CUDA, build, device_name
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Run
+from shared_store.metrics import read_metrics
+from worker.distributed import Placement, connect
+from worker.evaluation.blocks import SIZE, Blocks
+from worker.evaluation.episodes import play
+from worker.export import export
+from worker.learning.loop import Loop
+from worker.learning.trained import load_policy
+from worker.telemetry.attending import answer_of
+from worker.telemetry.recording import Recording
+from worker.telemetry.rollout import Rollout
+
+WORLDS = {"Cartpole": 4096, "Ant": 4096, "Humanoid": 4096, "Quadruped": 4096}
+WORLDS_CPU = {"Cartpole": 1024, "Ant": 64}
+WARM, STRETCH, ROUNDS = 8, 40, 3
+TAPPED, EPISODES = 4, 2
+"""Worlds that are recorded, and episodes of each of a checkpoint's recording."""
+
+
+def stretches(loop: Loop) -> list[float]:
+    """Milliseconds of an iteration: before anybody asks, while worlds are recorded, and after that; medians."""
+    run, marks = loop.job.run, list[int]()
+
+    def done() -> int:
+        return len(read_metrics(run))
+
+    def wait(iterations: int) -> None:
+        goal = done() + iterations
+        while done() < goal:
+            time.sleep(0.05)
+
+    def look_on(folder: Path) -> None:
+        wait(WARM)
+        marks.append(done())
+        wait(STRETCH)
+        marks.append(done())
+        command = [sys.executable, "-m", "worker.telemetry.live", str(run.path), "--worlds", str(TAPPED)]
+        output = ["--episodes", "1000000", "--output", str(folder / "live.mcap")]
+        reader = subprocess.Popen([*command, *output], stdout=subprocess.DEVNULL)
+        while not answer_of(run).exists():
+            if reader.poll() is not None:
+                loop.stop.requested = True
+                return
+            time.sleep(0.05)
+        wait(WARM)  # the rollout is captured anew, the reader has built what it shows
+        marks.append(done())
+        wait(STRETCH)
+        marks.append(done())
+        reader.send_signal(2)
+        reader.wait()
+        wait(WARM)
+        marks.append(done())
+        wait(STRETCH)
+        marks.append(done())
+        loop.stop.requested = True
+
+    with tempfile.TemporaryDirectory() as folder:
+        watcher = threading.Thread(target=look_on, args=(Path(folder),))
+        watcher.start()
+        with contextlib.redirect_stdout(io.StringIO()):
+            loop.train()
+        watcher.join()
+    ends = [record["total_seconds"] for record in read_metrics(run)]
+    took = [1000 * (after - before) for before, after in pairwise(ends)]
+    return [statistics.median(took[first:last]) for first, last in zip(marks[::2], marks[1::2], strict=True)]
+
+
+def recorded(run: Run, folder: Path) -> dict[str, float]:
+    """Control steps a second of a checkpoint's recording, and bytes of a simulated minute of it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        rollout = Rollout.of(run, None, TAPPED)
+        recording = Recording(folder / "a.mcap", rollout.stage(), rollout.facts(), rollout.attachments())
+        most, started = EPISODES * rollout.task.max_episode_length, time.perf_counter()
+        for rows in rollout.steps(most):
+            recording.write(rows)
+            if recording.complete(EPISODES):
+                break
+        recording.finish()
+    seconds = time.perf_counter() - started
+    minutes = recording.steps / rollout.config.control_hz / 60
+    return {"record_rate": recording.steps / seconds, "minute": (folder / "a.mcap").stat().st_size / minutes}
+
+
+def judged(run: Run, worlds: int) -> dict[str, float]:
+    """Policy steps and episodes a second of an evaluation in as many worlds as the training has."""
+    count = -(-worlds // SIZE) * SIZE
+    rollout = Rollout.of(run, None, count)
+    policies = [load_policy(rollout.checkpoint, str(rollout.task.device)) for _ in range(count // SIZE)]
+    gang = connect(Placement())
+    best: dict[str, float] = {}
+    for _ in range(2):  # the first loads kernels
+        started = time.perf_counter()
+        played = play([rollout.task], Blocks(policies), gang)
+        if CUDA:
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - started
+        # worlds step on to the longest episode's end
+        steps = float(played.lengths.max()) * count
+        best = {"evaluation_rate": steps / seconds, "episodes": count / seconds, "length": float(played.lengths.mean())}
+    gang.close()
+    return best
+
+
+def exported(run: Run) -> dict[str, float]:
+    """Seconds of an export with its judgement, 16 episodes."""
+    rollout = Rollout.of(run, None, 16)
+    started = time.perf_counter()
+    with contextlib.redirect_stdout(io.StringIO()):
+        export(run, rollout.checkpoint, rollout.task)
+    return {"export": time.perf_counter() - started}
+
+
+def measure(task: str, worlds: int) -> dict[str, Any]:
+    """All of one task."""
+    rounds, row = [], dict[str, Any]()
+    for number in range(ROUNDS):
+        with tempfile.TemporaryDirectory() as store:
+            loop = build(task, worlds, Path(store), every=1000)
+            rounds.append(stretches(loop))
+            run = loop.job.run
+            steps = worlds * loop.algorithm.steps
+            loop.close()
+            if number == ROUNDS - 1:
+                assert list_checkpoints(run)
+                row = {**recorded(run, Path(store)), **judged(run, worlds), **exported(run)}
+    alone = statistics.median(each[0] for each in rounds)
+    ratios = [statistics.median(each[stretch] / each[0] for each in rounds) - 1.0 for stretch in (1, 2)]
+    shown = {"task": task, "worlds": worlds, "iteration": alone, "tapped": ratios[0], "left": ratios[1]}
+    return {**shown, "training_rate": 1000 * steps / alone, **row}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        f"# What looking at a policy costs, on {device_name()}",
+        "",
+        f"`python -m benchmarks.seeing`; medians of {ROUNDS} trainings, each of {STRETCH} iterations without anybody who looks on, with "
+        f"`muster record` of {TAPPED} worlds, and after that. {told(rows)}",
+        "",
+        "| task | worlds | an iteration [ms] | while worlds are recorded | after that |",
+        "|---|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        changes = f"{row['tapped']:+.1%} | {row['left']:+.1%}"
+        lines.append(f"| {row['task']} | {row['worlds']:,} | {row['iteration']:.1f} | {changes} |")
+    lines += [
+        "",
+        "Of its checkpoint:",
+        "",
+        f"| task | recording of {TAPPED} worlds [control steps/s] | a simulated minute | training [steps/s] | evaluation, as many worlds "
+        "[steps/s] | episodes/s | their mean length [steps] | export, judged on 16 episodes [s] |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    lines += [
+        f"| {row['task']} | {row['record_rate']:,.0f} | {row['minute'] / 1e6:.1f} MB | {row['training_rate']:,.0f} | "
+        f"{row['evaluation_rate']:,.0f} | {row['episodes']:,.0f} | {row['length']:,.0f} | {row['export']:.1f} |"
+        for row in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    worlds = WORLDS if CUDA else WORLDS_CPU
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=list(worlds), choices=list(worlds))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
+    options = parser.parse_args()
+    watch, rows = Watch(options.loaded_anyway), list[dict[str, Any]]()
+    for task in options.tasks:
+        rows.append(measure(task, worlds[task]) | watch.check(f"while {task} was measured"))
+        (options.out / "seeing.md").write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
