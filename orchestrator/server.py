@@ -20,6 +20,7 @@ from orchestrator.api.app import BROWSER_HEADERS, create_app
 from orchestrator.api.auth import Access, is_loopback
 from orchestrator.api.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.limits import RATE, RateLimit
+from orchestrator.automatic import AutomaticEvaluations
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
@@ -117,6 +118,8 @@ class Server:
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
             stack.callback(self.controller.close)
+            self.evaluations = AutomaticEvaluations(self.controller)
+            stack.callback(self.evaluations.close)
             if "local" in nodes.names:
                 _name_lost_gangs(home, found)
             self._opened = stack.pop_all()
@@ -150,6 +153,7 @@ class Server:
         self.bus.open()
         self.peers.start()
         self.controller.start()
+        self.evaluations.start()
         self._thread.start()
         self._lock.publish(self.url)
 

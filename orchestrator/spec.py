@@ -238,9 +238,7 @@ class Spec(_Section):
 
     name: JobName
     queue: str = "default"
-    share: Share | None = Field(
-        default=None, description="share identifier, in a queue with a fair-share policy"
-    )
+    share: Share | None = Field(default=None, description="share identifier, in a queue with a fair-share policy")
     priority: int = Field(default=0, ge=0, le=9999, description="within the share; greater is served first")
     preemptible: bool = Field(
         default=False, description="a job of higher priority may have its place: it checkpoints, leaves and waits again"

@@ -194,9 +194,7 @@ def best_checkpoint(run: Run) -> Checkpoint | None:
     return best
 
 
-def best_evaluated(
-    checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]
-) -> Checkpoint | None:
+def best_evaluated(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> Checkpoint | None:
     """The one with the greatest mean return, the later one of equals; None where none is evaluated.
 
     Args:
