@@ -175,14 +175,14 @@ def newest_checkpoint(
 def best_checkpoint(run: Run) -> Checkpoint | None:
     """The best checkpoint, the later one of equals; None where none has been evaluated or has a score yet.
 
-    Where two or more have been evaluated in the worlds of their training, it is the one of them with the greatest mean return; one alone
-    would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
+    Where two or more have been evaluated in the worlds of their training, it is the one with the greatest mean return of those that are
+    there; one alone would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
     the one iteration before a checkpoint counts for nothing here.
     """
     checkpoints = list_checkpoints(run)
     evaluated = by_checkpoint(run)
-    if sum(checkpoint.name in evaluated for checkpoint in checkpoints) > 1:
-        return best_evaluated(checkpoints, evaluated)
+    if len(evaluated) > 1 and (judged := best_evaluated(checkpoints, evaluated)):
+        return judged
     best, found = None, -math.inf
     for checkpoint in checkpoints:
         try:

@@ -355,12 +355,11 @@ def _evaluated(run: Run) -> dict[str, dict[str, Any]]:
 
 def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
     """The best checkpoint by evaluations, where there is one to compare it with: ``RUN@best``."""
-    among = [checkpoint for checkpoint in checkpoints if checkpoint.name in evaluated]
-    best = best_evaluated(among, evaluated)
-    if best is None or len(among) < 2:
+    best = best_evaluated(checkpoints, evaluated)
+    if best is None or len(evaluated) < 2:
         return None
     mean = evaluated[best.name]["mean_return"]
-    return {"checkpoint": best.name, "iteration": best.iteration, "mean": mean, "of": len(among)}
+    return {"checkpoint": best.name, "iteration": best.iteration, "mean": mean, "of": len(evaluated)}
 
 
 def _automatic(session: Session, run: Run) -> dict[str, Any] | None:

@@ -170,12 +170,11 @@ def best_words(run: Run) -> str:
         evaluated, checkpoints = by_checkpoint(run), list_checkpoints(run)
     except OSError:
         return ""
-    among = [checkpoint for checkpoint in checkpoints if checkpoint.name in evaluated]
-    best = best_evaluated(among, evaluated)
-    if best is None or len(among) < 2:
+    best = best_evaluated(checkpoints, evaluated)
+    if best is None or len(evaluated) < 2:
         return ""
     mean = evaluated[best.name]["mean_return"]
-    return f"best of {len(among)} checkpoints that are evaluated: {best.name}, mean return {mean:.2f}"
+    return f"best of {len(evaluated)} checkpoints that are evaluated: {best.name}, mean return {mean:.2f}"
 
 
 def _finite(value: Any) -> Any:
