@@ -244,6 +244,26 @@ class AutomaticEvaluation(Base):
         return None if reason is None else excerpt(reason, LONGEST_REASON)
 
 
+class WebhookDelivery(Base):
+    """A message about a job that ended, until its receiver has accepted it (:mod:`orchestrator.deliveries`)."""
+
+    __tablename__ = "webhook_deliveries"
+    __table_args__ = (Index("ix_webhook_deliveries_due", "webhook", "next_at"),)
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """Its ``webhook-id``."""
+    webhook: Mapped[str]
+    """Name of the webhook; its URL and its secret are not here."""
+    job: Mapped[str] = mapped_column(index=True)
+    created_at: Mapped[int] = mapped_column(default=now)
+    next_at: Mapped[int | None]
+    """When it is tried next; None where it was given up."""
+    tries: Mapped[int] = mapped_column(default=0)
+    body: Mapped[str | None] = mapped_column(default=None)
+    """What is sent, from the first try on."""
+    problem: Mapped[str | None] = mapped_column(default=None)
+    """What was wrong with the last try."""
+
+
 class Dependency(Base):
     """One job waits for the success of another."""
 

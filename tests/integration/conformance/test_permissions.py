@@ -86,6 +86,8 @@ TABLE = {
     Operation.REGISTER_MODEL: OWN_WRITE,
     Operation.LIST_MODELS: OWN_LIST,
     Operation.READ_MODEL: OWN_READ,
+    Operation.READ_WEBHOOKS: ALL_READ,
+    Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
 ARN = "arn:aws:batch:us-east-1:000000000000:"
 
