@@ -12,6 +12,7 @@ import threading
 import time
 import uuid
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -60,10 +61,11 @@ class Deliveries:
             self._database.ended = self.note
 
     def start(self) -> None:
-        with self._controller.writing, self._database.session() as session:
-            gone = WebhookDelivery.webhook.not_in(self.webhooks), WebhookDelivery.next_at.is_not(None)
+        """Go on with what an earlier controller has left, but for webhooks that are not in the file any more."""
+        gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
+        with suppress(DatabaseError), self._controller.writing, self._database.session() as session:
             session.execute(
-                update(WebhookDelivery).where(*gone).values(next_at=None, problem="no webhook is called so")
+                update(WebhookDelivery).where(*gone).values(next_at=None, problem="no webhook is called so any more")
             )
         for thread in self._threads:
             thread.start()
@@ -100,7 +102,7 @@ class Deliveries:
     def described(self, session: Session) -> list[dict[str, Any]]:
         """Each webhook, without its secret: how many messages wait, and the newest that were given up."""
         query = select(WebhookDelivery.webhook, func.count()).where(WebhookDelivery.next_at.is_not(None))
-        waiting: dict[str, int] = dict(session.execute(query.group_by(WebhookDelivery.webhook)).tuples().all())
+        waiting = {name: count for name, count in session.execute(query.group_by(WebhookDelivery.webhook))}
         return [
             {
                 "name": webhook.name,
@@ -166,7 +168,7 @@ class Deliveries:
             if self._backoff.worked(webhook.name):
                 log.warning("webhook %s: messages are accepted again", webhook.name)
             return
-        self._backoff.failed(webhook.name, f"webhook {webhook.name}: {webhook.receiver} {problem}; trying again")
+        self._backoff.failed(webhook.name, f"webhook {webhook.name}: {webhook.receiver} {problem}")
         monitoring.webhook_tried(webhook.name, "given up" if row.next_at is None else "failed")
         if row.next_at is None:
             log.error(

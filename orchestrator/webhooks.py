@@ -142,10 +142,10 @@ _KEYS = [name for name in Webhook.model_fields if name != "name"]
 
 
 def _told(problem: Any) -> str:
-    """Never with the value: it may be a secret."""
-    if problem["loc"][-1] in ("secret", "url") and problem["type"] == "string_type":
-        return "expected a text"
-    return explain(problem)
+    """What is wrong with a value; of a secret or a URL, which may have one, without the value."""
+    if problem["type"] == "value_error":
+        return str(problem["ctx"]["error"])
+    return "expected a text" if problem["type"] == "string_type" else explain(problem)
 
 
 def event_of(status: str) -> str:

@@ -43,7 +43,7 @@ def create_app(
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
     app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
     app.state.controller = controller
-    app.state.deliveries = deliveries or Deliveries(controller, (), "")
+    app.state.deliveries = deliveries
     app.state.closing = threading.Event()
     app.include_router(native.router)
     app.add_middleware(Guard, access=access or Access(), limit=limit or RateLimit())

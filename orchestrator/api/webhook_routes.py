@@ -7,6 +7,8 @@ from typing import Any
 from fastapi import APIRouter, Request
 
 from orchestrator.api import permissions
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import controller_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.deliveries import Deliveries
@@ -15,17 +17,14 @@ from shared_store.wording import nearest
 router = APIRouter()
 
 
-def _deliveries(request: Request) -> Deliveries:
-    deliveries: Deliveries = request.app.state.deliveries
-    return deliveries
-
-
 @router.get("/webhooks")
 def list_webhooks(request: Request) -> list[dict[str, Any]]:
     """The webhooks of the controller's ``--webhooks`` file, without paths and secrets: how many messages wait, and which were given up."""
     permissions.check_all_queues(Operation.READ_WEBHOOKS)
-    deliveries = _deliveries(request)
-    with request.app.state.controller.database.session() as session:
+    deliveries: Deliveries | None = request.app.state.deliveries
+    if deliveries is None:
+        return []
+    with controller_of(request).database.session() as session:
         return deliveries.described(session)
 
 
@@ -34,10 +33,10 @@ def test_webhook(request: Request, name: str) -> dict[str, Any]:
     """Send a sample once, signed like any message; ``problem`` is null where the receiver accepted it."""
     permissions.check(Operation.TEST_WEBHOOK)
     permissions.check_all_queues(Operation.TEST_WEBHOOK)
-    deliveries = _deliveries(request)
+    deliveries: Deliveries | None = request.app.state.deliveries
+    if deliveries is None or not deliveries.webhooks:
+        raise ClientError("this controller has no webhooks; start it with: muster serve --webhooks FILE", CONFLICT)
     webhook = deliveries.webhooks.get(name)
     if webhook is None:
-        known = list(deliveries.webhooks)
-        hint = nearest(name, known, "" if known else "this controller has none; start it with --webhooks FILE")
-        raise ClientError(f"webhook {name[:100]} does not exist; {hint}", 404)
+        raise ClientError(f"webhook {name[:100]} does not exist; {nearest(name, list(deliveries.webhooks))}", 404)
     return deliveries.test(webhook)

@@ -184,6 +184,8 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.REGISTER_MODEL, {"name": "x"}),
         of_ours(of.LIST_MODELS),
         of_ours(of.READ_MODEL),
+        of_ours(of.READ_WEBHOOKS),
+        of_ours(of.TEST_WEBHOOK, {}),
     ]
     return dict(zip(Operation, found, strict=True))
 
