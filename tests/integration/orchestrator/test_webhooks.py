@@ -18,8 +18,8 @@ from orchestrator.jobs import Status
 from orchestrator.server import Server
 from orchestrator.tables import Job, WebhookDelivery
 from tests.conftest import Serving, submit_gang
+from tests.support.orchestrator import rows
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks
-from tests.support.orchestrator.rows import job
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
 
@@ -154,7 +154,7 @@ def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: 
     server = Server(tmp_path / "home", cpus=1, webhooks=file)  # nothing is started: nothing is sent
     database = server.controller.database
     with database.session() as session:
-        session.add_all([job("a", status=Status.RUNNING), job("b", status=Status.RUNNING)])
+        session.add_all([rows.job("a", status=Status.RUNNING), rows.job("b", status=Status.RUNNING)])
     with pytest.raises(RuntimeError), database.session() as session:
         session.get_one(Job, "a").move(Status.FAILED, "no")
         session.flush()
