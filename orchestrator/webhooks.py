@@ -53,7 +53,9 @@ def _secret(value: str) -> str:
     except (ValueError, binascii.Error):
         size = 0
     if not value.startswith(_PREFIX) or size not in _SECRET_SIZES:
-        raise ValueError("expected whsec_ and 24 to 64 random bytes in base64; make one: openssl rand -base64 32")
+        raise ValueError(
+            "expected whsec_ and 24 to 64 random bytes in base64; make one: echo whsec_$(openssl rand -base64 32)"
+        )
     return value
 
 

@@ -310,6 +310,9 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
         refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_SPEC=spec))
         later = {**submission(own, "lab", MUSTER_SPEC=spec), "dependsOn": [{"jobId": waits}]}
         refused(foreign, lab.batch, "SubmitJob", **later)
+    train = {"train": {"task": "Cartpole", "worlds": 4, "iterations": 9}, "evaluation": {"every": 1, "queue": "robots"}}
+    elsewhere = submission(own, "lab", MUSTER_SPEC=json.dumps({"name": "x", **train}))
+    refused("it concerns job queue robots", lab.batch, "SubmitJob", **elsewhere)
     to_come = {
         **submission(own, "lab", MUSTER_SPEC='{"evaluate": {"run": "not-yet"}}'),
         "dependsOn": [{"jobId": waits}],

@@ -18,6 +18,7 @@ from orchestrator.errors import ApiError
 from orchestrator.server import Server
 from orchestrator.tables import Job
 from shared_store.checkpoints import list_checkpoints, retain
+from tests.conftest import call_muster
 from tests.support.orchestrator.trained import SPEC, add_checkpoint
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
@@ -122,6 +123,8 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     assert controller.evaluations() == [(20, "FAILED"), (70, "RUNNABLE")]
     assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
     assert controller.newest()["passed"] == 1, "40, or 60"
+    shown = " ".join(call_muster("show", training, home=controller.home).stdout.split())
+    assert "evaluating: checkpoint 00000070-e1 by job " in shown and "1 that were due were passed over" in shown
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
     assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"
