@@ -83,6 +83,7 @@ class AutomaticEvaluations:
 
     def look(self) -> None:
         """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
+        self._backoff.tidy()
         self._isolated("open evaluations", self._close_ended)
         active = self._controller.roster.active()
         self._known = {job: self._known[job] for job in active if job in self._known}

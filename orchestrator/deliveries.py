@@ -62,11 +62,11 @@ class Deliveries:
 
     def start(self) -> None:
         """Go on with what an earlier controller has left, but for webhooks that are not in the file any more."""
-        gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
-        with suppress(DatabaseError), self._controller.writing, self._database.session() as session:
-            session.execute(
-                update(WebhookDelivery).where(*gone).values(next_at=None, problem="no webhook is called so any more")
-            )
+        if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
+            with suppress(DatabaseError), self._controller.writing, self._database.session() as session:
+                gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
+                said = "no webhook is called so any more"
+                session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
         for thread in self._threads:
             thread.start()
 

@@ -9,6 +9,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 from sqlalchemy import select
@@ -17,24 +18,32 @@ from orchestrator.client import Client
 from orchestrator.jobs import Status
 from orchestrator.server import Server
 from orchestrator.tables import Job, WebhookDelivery
-from tests.conftest import Serving, submit_gang
+from tests.conftest import Serving, call_muster, submit_gang
 from tests.support.orchestrator import rows
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
 
 
-@pytest.fixture
-def receiver() -> Iterator[Receiver]:
+@pytest.fixture(scope="module")
+def listening() -> Iterator[Receiver]:
     with receiving() as receiver:
         yield receiver
 
 
 @pytest.fixture
-def told(tmp_path: Path, receiver: Receiver) -> Iterator[Serving]:
+def receiver(listening: Receiver) -> Receiver:
+    """The receiver, which has heard nothing yet."""
+    listening.messages.clear()
+    return listening
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Iterator[Serving]:
     """A controller that tells the receiver of every end."""
-    file = write_webhooks(tmp_path / "hooks.json", chat={"url": receiver.url, "link": "https://muster.example/"})
-    server = Serving(tmp_path / "home", "--cpus", "2", "--webhooks", file)
+    home = tmp_path_factory.mktemp("told")
+    file = write_webhooks(home / "hooks.json", chat={"url": listening.url, "link": "https://muster.example/"})
+    server = Serving(home / "home", "--cpus", "2", "--webhooks", file)
     yield server
     server.close()
 
@@ -101,19 +110,22 @@ def test_a_receiver_that_is_slow_or_away_keeps_no_job_waiting(told: Serving, rec
 
 
 def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serving, receiver: Receiver) -> None:
-    sent = told.muster("webhooks", "test", "chat")
+    def command(*arguments: str) -> CompletedProcess[str]:
+        return call_muster("webhooks", *arguments, home=told.home)
+
+    sent = command("test", "chat")
     ((headers, body),) = receiver.messages
     place = f"http://127.0.0.1:{receiver.server_port}"
     assert sent.stdout == f"chat: {place} accepted the sample (webhook-id {headers['webhook-id']})\n", sent.stderr
     assert is_signed(headers, body) and json.loads(body)["type"] == "webhook.test"
     receiver.answers = [302]
-    refused = told.muster("webhooks", "test", "chat")
+    refused = command("test", "chat")
     assert refused.returncode == 1 and f"{place} answered 302" in refused.stdout, "no redirect is followed"
-    unknown = told.muster("webhooks", "test", "chatt")
+    unknown = command("test", "chatt")
     assert (unknown.returncode, unknown.stderr) == (2, "muster: webhook chatt does not exist; did you mean chat?\n")
-    listed = told.muster("webhooks", "list")
+    listed = command("list")
     assert "chat" in listed.stdout and place in listed.stdout
-    everything = listed.stdout + told.muster("webhooks", "list", "--json").stdout
+    everything = listed.stdout + command("list", "--json").stdout
     assert SECRET not in everything and "a-path-that-is-secret" not in everything
 
 
@@ -148,21 +160,43 @@ def test_what_no_receiver_takes_is_given_up_after_the_last_try_and_shown(
 
 def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: Path) -> None:
     with receiving() as gone:
-        file = write_webhooks(
-            tmp_path / "hooks.json", chat={"url": gone.url}, trained={"url": gone.url, "kinds": ["train"]}
-        )
+        here = {"url": gone.url}
+    file = write_webhooks(tmp_path / "hooks.json", chat=here, trained={**here, "kinds": ["train"]})
     server = Server(tmp_path / "home", cpus=1, webhooks=file)  # nothing is started: nothing is sent
-    database = server.controller.database
-    with database.session() as session:
+    with server.controller.database.session() as session:
         session.add_all([rows.job("a", status=Status.RUNNING), rows.job("b", status=Status.RUNNING)])
-    with pytest.raises(RuntimeError), database.session() as session:
+    with pytest.raises(RuntimeError), server.controller.database.session() as session:
         session.get_one(Job, "a").move(Status.FAILED, "no")
         session.flush()
         raise RuntimeError
-    with database.session() as session:
+    with server.controller.database.session() as session:
         assert session.scalars(select(WebhookDelivery)).all() == []
         session.get_one(Job, "b").move(Status.SUCCEEDED)
-    with database.session() as session:
+    with server.controller.database.session() as session:
         (row,) = session.scalars(select(WebhookDelivery))
         assert (row.webhook, row.job, row.tries, row.body) == ("chat", "b", 0, None)
     server.close()
+
+
+def test_what_waits_for_a_webhook_is_given_up_by_a_controller_that_has_others_and_by_none_without(
+    tmp_path: Path,
+) -> None:
+    with receiving() as gone:
+        here = {"url": gone.url}
+    home = tmp_path / "home"
+    server = Server(home, cpus=1, webhooks=write_webhooks(tmp_path / "hooks.json", chat=here))
+    with server.controller.database.session() as session:
+        session.add(rows.job("a", status=Status.RUNNING))
+    with server.controller.database.session() as session:
+        session.get_one(Job, "a").move(Status.SUCCEEDED)
+    server.close()
+    for file, problem in (
+        (None, None),
+        (write_webhooks(tmp_path / "hooks.json", other=here), "no webhook is called so"),
+    ):
+        server = Server(home, cpus=1, webhooks=file)
+        server.start()
+        with server.controller.database.session() as session:
+            (row,) = session.scalars(select(WebhookDelivery))
+            assert (row.problem or "").startswith(problem or "") and (row.next_at is None) == (problem is not None)
+        server.close()

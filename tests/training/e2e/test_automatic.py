@@ -48,6 +48,7 @@ def test_checkpoints_are_evaluated_beside_a_training_once_each_though_the_contro
     asked = [each["spec"]["evaluate"]["checkpoint"] for each in jobs]
     assert len(asked) == len(set(asked)) and len({each["checkpoint"] for each in found}) == len(found)
     assert {each["job"] for each in found} == {each["id"] for each in jobs}
+    assert not any(each["keep"] for each in found)
     best, told = best_checkpoint(run), server.detail(training)["results"]
     means = {each["checkpoint"]: each["mean_return"] for each in found}
     assert best is not None and means[best.name] == max(means.values()), "the best one is never pruned"
