@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sqlalchemy import select
@@ -88,7 +89,7 @@ class AutomaticEvaluations:
         active = self._controller.roster.active()
         self._known = {job: self._known[job] for job in active if job in self._known}
         for job in active:
-            self._isolated(job, lambda job=job: self._look_at(job))  # type: ignore[misc]
+            self._isolated(f"job {job}", partial(self._look_at, job))
 
     def _isolated(self, subject: str, body: Callable[[], None]) -> None:
         if self._backoff.waits(subject):
@@ -111,14 +112,16 @@ class AutomaticEvaluations:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open)).all()
             ended = [(row.run, row.checkpoint or "") for row in rows if not _is_open(session, row)]
         for name, checkpoint in ended:
-            evaluation_is_over(self._controller.store.run(name), checkpoint)
-            with self._controller.writing, self._controller.database.session() as session:
-                row = session.get_one(AutomaticEvaluation, name)
-                row.open = False
-                job = session.get(Job, row.job)
-                if job is not None and job.status == Status.FAILED:
-                    reason = job.status_reason
-                    log.warning("run %s: the evaluation of checkpoint %s failed: %s", name, checkpoint, reason)
+            self._isolated(f"run {name}", partial(self._close, name, checkpoint))
+
+    def _close(self, name: str, checkpoint: str) -> None:
+        evaluation_is_over(self._controller.store.run(name), checkpoint)
+        with self._controller.writing, self._controller.database.session() as session:
+            row = session.get_one(AutomaticEvaluation, name)
+            row.open = False
+            job = session.get(Job, row.job)
+        if job is not None and job.status == Status.FAILED:
+            log.warning("run %s: the evaluation of checkpoint %s failed: %s", name, checkpoint, job.status_reason)
 
     # -- what is due ----------------------------------------------------------------------------------------------------
 
@@ -171,7 +174,8 @@ class AutomaticEvaluations:
 
     def _note(self, training: _Training, counted: Counted, problem: str | None = None) -> None:
         with self._controller.writing, self._controller.database.session() as session:
-            _row(session, training, counted).problem = problem
+            row = _row(session, training, counted)
+            row.problem = problem or row.problem  # it stands until an evaluation is submitted
 
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
         """Submit the evaluation, as the training's owner, in one transaction with what is known of the training's checkpoints."""
@@ -186,10 +190,8 @@ class AutomaticEvaluations:
                 answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {})
                 row = _row(session, training, counted)
                 row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
-        except (
-            ClientError,
-            SpecError,
-        ) as error:  # a queue that takes no jobs, say: the next checkpoint that is due is tried
+        except (ClientError, SpecError) as error:
+            # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
             self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")
             log.warning("run %s: checkpoint %s is not evaluated: %s", run.name, chosen.name, error)

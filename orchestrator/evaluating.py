@@ -39,8 +39,8 @@ def evaluation_document(
 
 def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
     """The section ``evaluation`` of a training's spec; None where there is none. Raises SpecError: a job of the Batch API may say anything."""
-    section = (spec or {}).get("evaluation")
-    if section is None or not (spec or {}).get("train"):
+    section, train = (spec or {}).get("evaluation"), (spec or {}).get("train")
+    if section is None or not isinstance(train, dict) or not isinstance(train.get("iterations"), int):
         return None
     try:
         return Evaluation.model_validate(section)

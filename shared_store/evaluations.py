@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shared_store.files import DamagedFile, read_json, write_atomic
+from shared_store.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.layout import LARGEST_DESCRIPTION, Run
 
 TERMS_SHOWN = 6
@@ -64,7 +64,8 @@ def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def keep_for_evaluation(run: Run, checkpoint: str) -> None:
-    """Have retention leave a checkpoint alone that a job is going to evaluate, and no longer the one before. Raises OSError."""
+    """Have retention leave a checkpoint alone that a job is going to evaluate, and no longer the one before. Raises as :func:`evaluation_is_over`."""
+    refuse_links(run.evaluations, 2)
     write_atomic(run.evaluations / f"{checkpoint}.wanted", b"")
     for path in run.evaluations.glob("*.wanted"):
         if path.stem != checkpoint:
@@ -72,7 +73,8 @@ def keep_for_evaluation(run: Run, checkpoint: str) -> None:
 
 
 def evaluation_is_over(run: Run, checkpoint: str) -> None:
-    """The other end of :func:`keep_for_evaluation`. Raises OSError."""
+    """The other end of :func:`keep_for_evaluation`. Raises DamagedFile where a link leads out of the run, OSError."""
+    refuse_links(run.evaluations, 2)
     (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
 
 

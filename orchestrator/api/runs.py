@@ -15,7 +15,7 @@ from orchestrator.api.context import Context, visible_runs
 from orchestrator.api.continuing import Changes, answered, submit
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import visible_queues
+from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
 from orchestrator.controller import Controller
 from orchestrator.definition import gang_needs
@@ -368,6 +368,7 @@ def _automatic(session: Session, run: Run) -> dict[str, Any] | None:
     if row is None:
         return None
     job = session.get(Job, row.job) if row.job else None
+    job = job if job is not None and is_visible(job) else None  # it may be in a queue that the caller can't see
     return {
         "checkpoint": row.checkpoint,
         "job": row.job,

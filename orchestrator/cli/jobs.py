@@ -309,7 +309,7 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     if told["job"]:
         reason = f": {one_line(told['statusReason'] or '')}" if told["status"] not in ("SUCCEEDED", None) else ""
         parts.append(
-            f"checkpoint {told['checkpoint']} by job {told['job'][:8]}, {told['status'] or 'forgotten'}{reason}"
+            f"checkpoint {told['checkpoint']} by job {told['job'][:8]}, {told['status'] or 'which can not be seen'}{reason}"
         )
     if told["passed"]:
         parts.append(f"{told['passed']} that were due were passed over for newer ones")

@@ -91,6 +91,7 @@ def test_the_section_says_where_else_and_with_what() -> None:
 
 
 def test_a_spec_of_the_batch_api_is_read_with_care() -> None:
+    assert wanted_of({"train": "x", "evaluation": {"every": 1}}) is None
     assert wanted_of(None) is wanted_of(TRAINED) is wanted_of({"command": ["x"], "evaluation": {"every": 1}}) is None
     with pytest.raises(SpecError, match=r"^evaluation\.every: expected a value greater than or equal to 1, found 0$"):
         wanted_of({**TRAINED, "evaluation": {"every": 0}})
