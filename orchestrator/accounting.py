@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.jobs import Ending, Status
 from orchestrator.scheduling import decayed
-from orchestrator.tables import Attempt, Dependency, Job, ShareUsage
+from orchestrator.tables import Attempt, Dependency, Job, ShareUsage, WebhookDelivery
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.layout import Run
 
@@ -99,6 +99,7 @@ def forget_before(session: Session, moment: int, most: int = 500) -> int:
     query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone, last)
     query = query.order_by(Job.stopped_at).limit(most)
     ids = list(session.scalars(query))
+    session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(ids), WebhookDelivery.next_at.is_(None)))
     for table, column in ((Attempt, Attempt.job_id), (Dependency, Dependency.job_id), (Job, Job.id)):
         session.execute(delete(table).where(column.in_(ids)))
     return len(ids)

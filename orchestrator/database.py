@@ -18,6 +18,7 @@ from sqlalchemy import (
     and_,
     create_engine,
     event,
+    inspect,
     make_url,
     select,
     text,
@@ -62,6 +63,8 @@ class Database:
         self.committed: Callable[[Sequence[Job]], None] | None = None
         self.changed: Callable[[Collection[str]], None] | None = None
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
+        self.ended: Callable[[Session, Job], None] | None = None
+        """Called with each job that a transaction ends, before it is written: what it adds to the session is committed with that."""
         self._lock: Connection | None = None
         self._file_lock: IO[bytes] | None = None
         self._damage: str | None = None
@@ -355,6 +358,15 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
     note_changed(session, session.scalars(select(Job.id).where(asked)))
     changes = {"stop_reason": reason, **({"cancelled": True} if cancelled else {})}
     session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
+
+
+@event.listens_for(_Session, "before_flush")
+def _tell_ends(session: Session, _context: object, _instances: object) -> None:
+    if (ended := session.info["database"].ended) is None:
+        return
+    for each in list(session.dirty):
+        if isinstance(each, Job) and each.is_over and inspect(each).attrs.status.history.has_changes():
+            ended(session, each)
 
 
 @event.listens_for(_Session, "after_flush")

@@ -53,6 +53,12 @@ class Monitoring:
         self._attempts = Counter(
             "muster_attempts_ended", "Attempts that ended, by how.", [*_USED, "ending"], registry=registry
         )
+        self._webhooks = Counter(
+            "muster_webhook_tries",
+            "Tries to deliver a message about a job's end, by what came of it.",
+            ["webhook", "result"],
+            registry=registry,
+        )
         self._seconds = {
             unit: Counter(
                 f"muster_{unit}_seconds",
@@ -75,6 +81,10 @@ class Monitoring:
     def pass_took(self, seconds: float) -> None:
         """A scheduling pass was made."""
         self._passes.observe(seconds)
+
+    def webhook_tried(self, webhook: str, result: str) -> None:
+        """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""
+        self._webhooks.labels(webhook, result).inc()
 
     def begun(self, session: Session, job: Job, attempt: Attempt, waited: float) -> None:
         """An attempt begins once the session is committed, ``waited`` seconds after its job could."""

@@ -20,9 +20,11 @@ from orchestrator.api.app import BROWSER_HEADERS, create_app
 from orchestrator.api.auth import Access, is_loopback
 from orchestrator.api.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.limits import RATE, RateLimit
+from orchestrator.automatic import AutomaticEvaluations
 from orchestrator.bus import Bus
 from orchestrator.controller import Controller
 from orchestrator.database import Database, DatabaseError
+from orchestrator.deliveries import Deliveries
 from orchestrator.disk import DEFAULT, MinFree
 from orchestrator.engines import make_engine
 from orchestrator.engines.base import EngineError
@@ -35,6 +37,7 @@ from orchestrator.keys import KeyStore
 from orchestrator.peers import Peers
 from orchestrator.pools import ensure_pools
 from orchestrator.tables import Job
+from orchestrator.webhooks import Webhook, WebhooksError, read_webhooks
 from shared_store.layout import Store
 
 log = logging.getLogger("muster.controller")
@@ -69,6 +72,7 @@ class Server:
         secrets: str | None = None,
         trusted_proxies: Sequence[str] = (),
         min_free: MinFree = DEFAULT,
+        webhooks: str | None = None,
     ) -> None:
         """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
 
@@ -77,6 +81,7 @@ class Server:
         the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of
         jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.job_secrets.Secrets`); None: jobs get none.
+        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.webhooks.read_webhooks`).
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
 
         Raises:
@@ -84,6 +89,7 @@ class Server:
         """
         _check_token(token)
         _check_proxies(trusted_proxies)
+        told = _read_webhooks(webhooks)
         exposed = not is_loopback(host) or bool(trusted_proxies)
         self.access = Access(KeyStore(home), token, exposed=exposed, user=os.geteuid())
         _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
@@ -117,14 +123,18 @@ class Server:
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
             stack.callback(self.controller.close)
+            self.evaluations = AutomaticEvaluations(self.controller)
+            stack.callback(self.evaluations.close)
             if "local" in nodes.names:
                 _name_lost_gangs(home, found)
+            bound = self._socket.getsockname()[1]
+            self.url = (
+                f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
+            )
+            self.deliveries = Deliveries(self.controller, told, self.url)
+            stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
-        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit))
-        bound = self._socket.getsockname()[1]
-        self.url = (
-            f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
-        )
+        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
             self.app,
@@ -150,6 +160,8 @@ class Server:
         self.bus.open()
         self.peers.start()
         self.controller.start()
+        self.evaluations.start()
+        self.deliveries.start()
         self._thread.start()
         self._lock.publish(self.url)
 
@@ -164,6 +176,13 @@ class Server:
 
 def _database_url(text: str) -> str:
     return text if "://" in text else f"sqlite:///{Path(text).expanduser().absolute()}"
+
+
+def _read_webhooks(source: str | None) -> Sequence[Webhook]:
+    try:
+        return read_webhooks(source)
+    except WebhooksError as error:
+        raise ServerError(str(error)) from None
 
 
 def _take_lock(home: Path) -> HomeLock:

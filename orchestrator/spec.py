@@ -130,6 +130,8 @@ else:
     Train = train_section(_Train, {name: section_of(name, each, _Section) for name, each in ALGORITHMS.items()})
 
 
+Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
+
 CheckpointName = int | Literal["best", "latest"]
 """An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
 
@@ -155,6 +157,7 @@ class Evaluate(_Section):
     config: dict[str, Any] = Field(
         default_factory=dict, description="changes of the task's configuration with which the run was trained"
     )
+    keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
 class Export(_Section):
@@ -216,14 +219,26 @@ class Retry(_Section):
     attempts: int = Field(default=3, ge=1, le=10)
 
 
+class Evaluation(_Section):
+    """Evaluate every few checkpoints of a training, each in a job of its own beside it."""
+
+    every: int = Field(ge=1, description="checkpoints from one evaluation to the next")
+    episodes: int = Field(default=100, ge=1, le=1_000_000)
+    worlds: int = Field(default=1024, ge=1, description="simulated worlds, at most one for each episode")
+    queue: str | None = Field(default=None, description="job queue; that of the training where absent")
+    share: Share | None = Field(default=None, description="share identifier in that queue")
+    resources: Resources | None = Field(
+        default=None, description="of the one node; where absent those of a node of the training, with at most one GPU"
+    )
+    retry: Retry = Field(default_factory=Retry)
+
+
 class Spec(_Section):
     """One job."""
 
     name: JobName
     queue: str = "default"
-    share: Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")] | None = Field(
-        default=None, description="share identifier, in a queue with a fair-share policy"
-    )
+    share: Share | None = Field(default=None, description="share identifier, in a queue with a fair-share policy")
     priority: int = Field(default=0, ge=0, le=9999, description="within the share; greater is served first")
     preemptible: bool = Field(
         default=False, description="a job of higher priority may have its place: it checkpoints, leaves and waits again"
@@ -241,6 +256,7 @@ class Spec(_Section):
     environment: Environment = Field(default_factory=dict)
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
+    evaluation: Evaluation | None = Field(default=None, description="of checkpoints, while the job trains")
     logs: Logs = Field(default_factory=Logs)
     retry: Retry = Field(default_factory=Retry)
     on_child_failure: Literal["restart", "fail", "ignore"] = "restart"
@@ -256,6 +272,8 @@ class Spec(_Section):
         if len(given) != 1:
             found = f"found {' and '.join(given)}" if given else "found none"
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
+        if self.evaluation is not None and self.train is None:
+            raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
         return self
 
     @property

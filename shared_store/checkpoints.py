@@ -12,14 +12,14 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from shared_store.epoch import StaleEpoch, check_epoch
-from shared_store.evaluations import by_checkpoint, checkpoint_of
+from shared_store.evaluations import by_checkpoint, kept_checkpoints
 from shared_store.files import (
     DamagedFile,
     open_regular,
@@ -175,15 +175,14 @@ def newest_checkpoint(
 def best_checkpoint(run: Run) -> Checkpoint | None:
     """The best checkpoint, the later one of equals; None where none has been evaluated or has a score yet.
 
-    Where two or more have been evaluated in the worlds of their training, it is the one of them with the greatest mean return; one alone
-    would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
+    Where two or more have been evaluated in the worlds of their training, it is the one with the greatest mean return of those that are
+    there; one alone would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
     the one iteration before a checkpoint counts for nothing here.
     """
     checkpoints = list_checkpoints(run)
     evaluated = by_checkpoint(run)
-    judged = [checkpoint for checkpoint in checkpoints if checkpoint.name in evaluated]
-    if len(judged) > 1:
-        return max(reversed(judged), key=lambda checkpoint: evaluated[checkpoint.name]["mean_return"])
+    if len(evaluated) > 1 and (judged := best_evaluated(checkpoints, evaluated)):
+        return judged
     best, found = None, -math.inf
     for checkpoint in checkpoints:
         try:
@@ -193,6 +192,17 @@ def best_checkpoint(run: Run) -> Checkpoint | None:
         if isinstance(score, int | float) and found <= score < math.inf:
             best, found = checkpoint, score
     return best
+
+
+def best_evaluated(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> Checkpoint | None:
+    """The one with the greatest mean return, the later one of equals; None where none is evaluated.
+
+    Args:
+        checkpoints: The newest last.
+        evaluated: As :func:`shared_store.evaluations.by_checkpoint` has it.
+    """
+    judged = [checkpoint for checkpoint in reversed(checkpoints) if checkpoint.name in evaluated]
+    return max(judged, key=lambda checkpoint: float(evaluated[checkpoint.name]["mean_return"]), default=None)
 
 
 def set_aside(checkpoint: Checkpoint) -> Path:
@@ -286,13 +296,15 @@ class CheckpointWriter:
 
 
 def retain(run: Run, keep: int) -> list[str]:
-    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, and those that an evaluation or an export
-    was made of, the best evaluated one among them; returns the deleted names.
+    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, the best evaluated one, and those that an
+    export, or an evaluation that keeps its checkpoint, was made of or waits for; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
     scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
     kept = {c.name for c in checkpoints[-max(1, keep) :]} | ({max(scored)[1]} if scored else set())
-    kept |= {checkpoint_of(path.stem) or path.stem for path in run.evaluations.glob("*.json")}
+    kept |= kept_checkpoints(run)
+    best = best_evaluated(checkpoints, by_checkpoint(run))
+    kept |= {best.name} if best else set()
     kept |= {path.name for path in run.exports.glob("*")}
     deleted = [checkpoint for checkpoint in checkpoints if checkpoint.name not in kept]
     for checkpoint in deleted:

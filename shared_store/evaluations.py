@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shared_store.files import DamagedFile, read_json
+from shared_store.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.layout import LARGEST_DESCRIPTION, Run
 
 TERMS_SHOWN = 6
@@ -61,6 +61,35 @@ def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
         if not summary.get("config") and (before is None or before["episodes"] <= summary["episodes"]):
             found[summary["checkpoint"]] = summary
     return found
+
+
+def keep_for_evaluation(run: Run, checkpoint: str) -> None:
+    """Have retention leave a checkpoint alone that a job is going to evaluate, and no longer the one before. Raises as :func:`evaluation_is_over`."""
+    refuse_links(run.evaluations, 2)
+    write_atomic(run.evaluations / f"{checkpoint}.wanted", b"")
+    for path in run.evaluations.glob("*.wanted"):
+        if path.stem != checkpoint:
+            path.unlink(missing_ok=True)
+
+
+def evaluation_is_over(run: Run, checkpoint: str) -> None:
+    """The other end of :func:`keep_for_evaluation`. Raises DamagedFile where a link leads out of the run, OSError."""
+    refuse_links(run.evaluations, 2)
+    (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
+
+
+def kept_checkpoints(run: Run) -> set[str]:
+    """Names of the checkpoints that retention leaves alone for their evaluations.
+
+    Those that are going to be evaluated, and those that have been, unless each evaluation says that its checkpoint need not be kept;
+    of these the best one.
+    """
+    kept = {path.stem for path in run.evaluations.glob("*.wanted")}
+    for path in run.evaluations.glob("*.json"):
+        summary = _read(run, path.stem) if checkpoint_of(path.stem) else None
+        if summary is None or summary.get("keep", True):  # also where it can't be read: nothing is lost by a guess
+            kept.add(checkpoint_of(path.stem) or path.stem)
+    return kept
 
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:

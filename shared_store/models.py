@@ -121,8 +121,16 @@ def find(store: Store, name: str, version: int | None = None) -> Model:
     raise UnknownModel(f"model {name} has no version {version}; there are: {there}")
 
 
-def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: Mapping[str, Any]) -> Model:
+_in_progress: set[Path] = set()
+"""Hidden directories of registrations that go on in this process."""
+
+
+def register(
+    store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: Mapping[str, Any], registrar: str = ""
+) -> Model:
     """Keep the bundle of a checkpoint as the next version of a model.
+
+    What a registration of the same registrar left behind when it was killed is deleted first.
 
     Args:
         store: Of the models.
@@ -130,6 +138,7 @@ def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: M
         run: Of the checkpoint.
         checkpoint: It was exported.
         facts: What else ``model.json`` says: who registered it, for whom.
+        registrar: Id of the controller, under which no other process registers at the same time.
 
     Raises:
         ModelError: No model can be called so, or the checkpoint has no bundle.
@@ -147,8 +156,10 @@ def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: M
     folder = store.models / name
     refuse_links(folder, 2)
     folder.mkdir(parents=True, exist_ok=True)
-    hidden = folder / f".{uuid.uuid4().hex}.tmp"
+    hidden = folder / f".{registrar}.{uuid.uuid4().hex}.tmp"
+    _in_progress.add(hidden)
     try:
+        _clear_leftovers(store, registrar)
         hidden.mkdir()
         bundles.copy_files(bundle, hidden / "bundle")
         lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
@@ -168,6 +179,14 @@ def register(store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: M
                 return model
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
+        _in_progress.discard(hidden)
+
+
+def _clear_leftovers(store: Store, registrar: str) -> None:
+    """Delete what registrations of this controller left, of any model, when it was killed; of others nobody knows whether they go on."""
+    for path in store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ():
+        if path not in _in_progress and not path.parent.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:

@@ -80,7 +80,8 @@ def main() -> int:
     result = result_of(task, played, checkpoint.name, seed, started)
     if gang.is_main:
         print(result, flush=True)
-        told = result.write(run, job.id, iteration=checkpoint.iteration, config=changes, **_circumstances(facts))
+        known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
+        told = result.write(run, job.id, iteration=checkpoint.iteration, config=changes, **known)
         print("\n".join(lines(told)), flush=True)
         print(f"written: {run.evaluations / told['table']} and .json", flush=True)
     gang.close()

@@ -21,6 +21,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.limits import RateLimit, parse
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError
+from orchestrator.deliveries import Deliveries
 from shared_store import __version__
 from shared_store.files import DamagedFile
 
@@ -33,10 +34,16 @@ BROWSER_HEADERS = [
 """Headers of every answer, errors and refusals too, which the server adds: no page may frame an answer or guess its type."""
 
 
-def create_app(controller: Controller, access: Access | None = None, limit: RateLimit | None = None) -> FastAPI:
+def create_app(
+    controller: Controller,
+    access: Access | None = None,
+    limit: RateLimit | None = None,
+    deliveries: Deliveries | None = None,
+) -> FastAPI:
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
     app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
     app.state.controller = controller
+    app.state.deliveries = deliveries
     app.state.closing = threading.Event()
     app.include_router(native.router)
     app.add_middleware(Guard, access=access or Access(), limit=limit or RateLimit())

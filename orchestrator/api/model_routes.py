@@ -78,7 +78,7 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
         if there:
             permissions.check(Operation.REGISTER_MODEL, _owner(there[-1]))
         facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
-        model = models.register(controller.store, body.name, run, checkpoint, facts)
+        model = models.register(controller.store, body.name, run, checkpoint, facts, controller.peers.id)
     except ModelError as error:
         raise ClientError(str(error)) from None
     except (DamagedBundle, DamagedFile) as error:

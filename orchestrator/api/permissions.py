@@ -115,6 +115,8 @@ class Operation(StrEnum):
     REGISTER_MODEL = "POST /api/runs/{name}/models"
     LIST_MODELS = "GET /api/models"
     READ_MODEL = "GET /api/models/{name}"
+    READ_WEBHOOKS = "GET /api/webhooks"
+    TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 
     @property
     def reads(self) -> bool:

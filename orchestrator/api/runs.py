@@ -15,7 +15,7 @@ from orchestrator.api.context import Context, visible_runs
 from orchestrator.api.continuing import Changes, answered, submit
 from orchestrator.api.damaged import DamagedRow, reading
 from orchestrator.api.errors import ClientError
-from orchestrator.api.permissions import visible_queues
+from orchestrator.api.permissions import is_visible, visible_queues
 from orchestrator.api.sources import with_teacher
 from orchestrator.controller import Controller
 from orchestrator.definition import gang_needs
@@ -25,8 +25,8 @@ from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
 from orchestrator.spec import ALGORITHMS, Spec, Train, override, validate
-from orchestrator.tables import Job, RunRecord
-from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, list_checkpoints
+from orchestrator.tables import AutomaticEvaluation, Job, RunRecord
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
 from shared_store.evaluations import by_checkpoint
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
@@ -64,7 +64,8 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
     owner = owner_of(session, run)
     jobs = session.execute(select(Job.id, Job.name, Job.status).where(*_of_run(run)).order_by(Job.created_at)).all()
     checkpoints = list_checkpoints(run)
-    evaluation = _newest_evaluation(run, checkpoints)
+    evaluated = _evaluated(run)
+    newest = next((each.name for each in reversed(checkpoints) if each.name in evaluated), "")
     plot, picture = run.metrics / "reward.png", run.metrics / "policy.png"
     return {
         "run": run.name,
@@ -79,7 +80,9 @@ def describe_run(controller: Controller, session: Session, run: Run) -> dict[str
         "checkpoint": str(checkpoints[-1].path) if checkpoints else None,
         "plot": str(plot) if plot.exists() else None,
         "picture": str(picture) if picture.exists() else None,
-        "evaluation": evaluation,
+        "evaluation": evaluated.get(newest),
+        "best": _best(checkpoints, evaluated),
+        "automatic": _automatic(session, run),
         "parent": description.get("parent"),
     }
 
@@ -342,10 +345,35 @@ def _of_run(run: Run) -> list[ColumnElement[bool]]:
     return [Job.run == run.name, *([] if queues is None else [Job.queue.in_(queues)])]
 
 
-def _newest_evaluation(run: Run, checkpoints: Sequence[Checkpoint]) -> dict[str, Any] | None:
-    """That of the newest checkpoint that has one, in the worlds of its training."""
+def _evaluated(run: Run) -> dict[str, dict[str, Any]]:
+    """Of each checkpoint its evaluation in the worlds of its training; nothing where they can't be read."""
     try:
-        found = by_checkpoint(run)
+        return by_checkpoint(run)
     except OSError:
+        return {}
+
+
+def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+    """The best checkpoint by evaluations, where there is one to compare it with: ``RUN@best``."""
+    best = best_evaluated(checkpoints, evaluated)
+    if best is None or len(evaluated) < 2:
         return None
-    return next((found[each.name] for each in reversed(checkpoints) if each.name in found), None)
+    mean = evaluated[best.name]["mean_return"]
+    return {"checkpoint": best.name, "iteration": best.iteration, "mean": mean, "of": len(evaluated)}
+
+
+def _automatic(session: Session, run: Run) -> dict[str, Any] | None:
+    """The newest automatic evaluation of a training, how it is, and how many checkpoints that were due were passed over."""
+    row = session.get(AutomaticEvaluation, run.name)
+    if row is None:
+        return None
+    job = session.get(Job, row.job) if row.job else None
+    job = job if job is not None and is_visible(job) else None  # it may be in a queue that the caller can't see
+    return {
+        "checkpoint": row.checkpoint,
+        "job": row.job,
+        "status": job.status if job else None,
+        "statusReason": job.status_reason if job else None,
+        "passed": row.passed,
+        "problem": row.problem,
+    }

@@ -20,6 +20,8 @@ from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import check_sources, hold_teacher
 from orchestrator.database import note_changed
 from orchestrator.definition import GangNeeds, gang_needs
+from orchestrator.errors import SpecError
+from orchestrator.evaluating import place_of, wanted_of
 from orchestrator.job_secrets import SecretsError
 from orchestrator.jobs import WAITING, Status
 from orchestrator.ownership import owner_of
@@ -48,6 +50,7 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     definition = context.definition(request["jobDefinition"])
     permissions.check(Operation.SUBMIT_JOB, definition)
     job, needs = _job(context, request, queue, definition)
+    _check_automatic(context, request, needs)
     is_array, is_waiting = bool(request.get("arrayProperties")), bool(request.get("dependsOn"))
     teacher = check_sources(context, needs, is_waiting)
     job.idempotency_key = _scoped(context.idempotency_key)
@@ -100,6 +103,24 @@ def _queue(context: Context, request: Mapping[str, Any]) -> JobQueue:
         raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits")
     rules.check_priority("schedulingPriorityOverride", priority)
     return queue
+
+
+def _check_automatic(context: Context, request: Mapping[str, Any], needs: GangNeeds) -> None:
+    """Raise ClientError where the caller could not submit the evaluations of this training."""
+    try:
+        wanted = wanted_of(needs.spec)
+    except SpecError as error:
+        raise ClientError(str(error)) from None
+    if wanted is None:
+        return
+    place = place_of(request["jobQueue"], request.get("shareIdentifier"), wanted)
+    asked = {"jobQueue": place["queue"], **({"shareIdentifier": place["share"]} if "share" in place else {})}
+    try:
+        _queue(context, asked)
+    except permissions.Refusal:
+        raise
+    except ClientError as error:
+        raise ClientError(f"evaluation: {error}", error.status) from None
 
 
 def _job(

@@ -82,6 +82,7 @@ ENTRIES = (
         "List job queues; of one, the waiting jobs in the order in which they will start.",
     ),
     Entry("keys", "keys", _SHARED, "Access keys of this home directory's server: who may call it."),
+    Entry("webhooks", "webhooks", _SHARED, "Webhooks of a controller: who is told when jobs end."),
     Entry(
         "aws", "aws", _SHARED, "The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch)."
     ),

@@ -13,6 +13,7 @@ from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
+from orchestrator.evaluating import evaluation_document
 from orchestrator.spec import Spec, override, validate
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500
@@ -84,16 +85,7 @@ def _spec(
 ) -> Spec:
     """The job, on nodes like those of the training. Raises SpecError, ApiError for a run that does not exist."""
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
-    kept = {key: trained[key] for key in ("queue", "share", "image", "environment") if trained.get(key) is not None}
-    resources = dict(trained.get("resources") or {})
-    if resources.get("gpus"):
-        resources["gpus"] = 1
-    document = {
-        **kept,
-        "name": name or f"evaluate-{run}".replace(".", "-")[:100],
-        **({"resources": resources} if resources else {}),
-        "evaluate": {"run": run, **section},
-    }
+    document = evaluation_document(run, trained, section, name)
     worlds = [f"evaluate.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     return validate(override(document, [*worlds, *elsewhere]), f"evaluation of {run}")
 

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator import specfile
-from orchestrator.cli.progress import evaluated, follow
+from orchestrator.cli.progress import best_told, evaluated, follow
 from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line, print_cut
 from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
@@ -269,6 +269,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
+    facts["best"] = best_told(results.get("best"))
+    facts["evaluating"] = _automatic(results.get("automatic"))
     facts |= {name: results.get(name) for name in ("checkpoint", "plot", "picture")} | {
         "directory": results.get("path")
     }
@@ -297,6 +299,23 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             where = f"{node['host']}{_gpus(node)}"
             console.print(f"    node {node['index']}  {node.get('address', '-')} on {where}  {state}", markup=False)
             console.print(f"      {node['log']}", markup=False, style="dim")
+
+
+def _automatic(told: Mapping[str, Any] | None) -> str:
+    """The newest automatic evaluation of a training in one line."""
+    if not told:
+        return ""
+    parts = []
+    if told["job"]:
+        reason = f": {one_line(told['statusReason'] or '')}" if told["status"] not in ("SUCCEEDED", None) else ""
+        parts.append(
+            f"checkpoint {told['checkpoint']} by job {told['job'][:8]}, {told['status'] or 'which can not be seen'}{reason}"
+        )
+    if told["passed"]:
+        parts.append(f"{told['passed']} that were due were passed over for newer ones")
+    if told["problem"]:
+        parts.append(one_line(told["problem"]))
+    return "; ".join(parts)
 
 
 def started_from(parent: Mapping[str, Any] | None) -> str:

@@ -80,6 +80,8 @@ def summary(client: Client, job_id: str) -> int:
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
         console.print(f"  evaluation:  {evaluated(evaluation)}")
+    if succeeded and (best := best_told(results.get("best"))):
+        console.print(f"  best:        {best}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
     known = {name: results.get(name) for name in ("checkpoint", "plot", "picture")}
     found = {"checkpoint": known.pop("checkpoint"), "log": log, **known, "run": detail["run"]}
@@ -98,6 +100,13 @@ def evaluated(figures: dict[str, Any]) -> str:
         f"mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
         f"mean return {figures['mean_return']:.2f} over {figures['episodes']} episodes"
     )
+
+
+def best_told(best: Mapping[str, Any] | None) -> str:
+    """The best checkpoint by evaluations in one line; nothing where none can be compared with another."""
+    if not best:
+        return ""
+    return f"checkpoint {best['checkpoint']}, mean return {best['mean']:.2f}, of {best['of']} that are evaluated"
 
 
 def _follow_logs(client: Client, job_id: str) -> int:

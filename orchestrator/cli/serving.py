@@ -124,6 +124,10 @@ def serve(
             "MUSTER_SECRET_<name>. Jobs that name secrets are refused by default."
         ),
     ] = None,
+    webhooks: Annotated[
+        str | None,
+        typer.Option(help="Tell others when jobs end: a JSON file of URLs and secrets; see `muster webhooks --help`."),
+    ] = None,
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next one finds them."""
     from orchestrator.server import Server  # imports what only a controller needs
@@ -145,6 +149,7 @@ def serve(
         secrets=secrets,
         trusted_proxies=trust_proxy or (),
         min_free=_min_free(min_free),
+        webhooks=webhooks,
     )
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

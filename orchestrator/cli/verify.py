@@ -72,6 +72,7 @@ def _pair(spec: Spec, source: str, at: int, iterations: int | None) -> tuple[Spe
         "train": spec.train.model_copy(update={"iterations": at + after}),
         "nodes": spec.nodes.model_copy(update={"min": spec.nodes.max}),
         "on_child_failure": "restart",
+        "evaluation": None,  # jobs of their own, which the comparison has no use for
     }
     attempts = max(2, spec.retry.attempts)
     # a straight run that was restarted would not be one

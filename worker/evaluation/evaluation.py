@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from shared_store.evaluations import checkpoint_of, evaluation_name, list_evaluations
+from shared_store.checkpoints import best_evaluated, list_checkpoints
+from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, list_evaluations
 from shared_store.files import write_json
 from shared_store.layout import Run
 from worker.distributed import Gang
@@ -161,6 +162,19 @@ def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, s
         seed=seed,
         seconds=time.perf_counter() - started,
     )
+
+
+def best_words(run: Run) -> str:
+    """Which checkpoint is the best by evaluations, as it is told at the end of a training; nothing where there is none to compare it with."""
+    try:
+        evaluated, checkpoints = by_checkpoint(run), list_checkpoints(run)
+    except OSError:
+        return ""
+    best = best_evaluated(checkpoints, evaluated)
+    if best is None or len(evaluated) < 2:
+        return ""
+    mean = evaluated[best.name]["mean_return"]
+    return f"best of {len(evaluated)} checkpoints that are evaluated: {best.name}, mean return {mean:.2f}"
 
 
 def _finite(value: Any) -> Any:

@@ -13,7 +13,7 @@ from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
 from worker.distributed import Gang
 from worker.errors import TrainingError
-from worker.evaluation.evaluation import evaluate
+from worker.evaluation.evaluation import best_words, evaluate
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
@@ -384,6 +384,8 @@ class Loop:
             self._say(f"warning: the evaluation or the plot could not be written ({error})")
             plot = None
         self._say(f"last checkpoint: {self.job.run.checkpoints / name}")
+        if best := best_words(self.job.run):
+            self._say(best)
         if plot:
             self._say(f"reward plot: {plot}")
         if glance:

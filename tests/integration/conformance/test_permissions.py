@@ -86,6 +86,8 @@ TABLE = {
     Operation.REGISTER_MODEL: OWN_WRITE,
     Operation.LIST_MODELS: OWN_LIST,
     Operation.READ_MODEL: OWN_READ,
+    Operation.READ_WEBHOOKS: ALL_READ,
+    Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
 ARN = "arn:aws:batch:us-east-1:000000000000:"
 
@@ -182,6 +184,8 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.REGISTER_MODEL, {"name": "x"}),
         of_ours(of.LIST_MODELS),
         of_ours(of.READ_MODEL),
+        of_ours(of.READ_WEBHOOKS),
+        of_ours(of.TEST_WEBHOOK, {}),
     ]
     return dict(zip(Operation, found, strict=True))
 
@@ -306,6 +310,9 @@ def test_a_run_of_another_queue_is_neither_continued_nor_resumed_nor_used_as_a_s
         refused(foreign, lab.batch, "SubmitJob", **submission(own, "lab", MUSTER_SPEC=spec))
         later = {**submission(own, "lab", MUSTER_SPEC=spec), "dependsOn": [{"jobId": waits}]}
         refused(foreign, lab.batch, "SubmitJob", **later)
+    train = {"train": {"task": "Cartpole", "worlds": 4, "iterations": 9}, "evaluation": {"every": 1, "queue": "robots"}}
+    elsewhere = submission(own, "lab", MUSTER_SPEC=json.dumps({"name": "x", **train}))
+    refused("it concerns job queue robots", lab.batch, "SubmitJob", **elsewhere)
     to_come = {
         **submission(own, "lab", MUSTER_SPEC='{"evaluate": {"run": "not-yet"}}'),
         "dependsOn": [{"jobId": waits}],

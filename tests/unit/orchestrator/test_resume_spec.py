@@ -76,6 +76,20 @@ APPLIED: dict[str, tuple[str, Any, Place]] = {
     "evaluate.worlds": ("3", 3, carried("evaluate.worlds")),
     "evaluate.seed": ("3", 3, carried("evaluate.seed")),
     "evaluate.config": ("{x: 1}", {"x": 1}, carried("evaluate.config")),
+    "evaluate.keep": ("false", False, carried("evaluate.keep")),
+    "evaluation.every": ("{every: 3}", 3, carried("evaluation.every")),
+    "evaluation.episodes": ("{every: 3, episodes: 7}", 7, carried("evaluation.episodes")),
+    "evaluation.worlds": ("{every: 3, worlds: 7}", 7, carried("evaluation.worlds")),
+    "evaluation.queue": ("{every: 3, queue: idle}", "idle", carried("evaluation.queue")),
+    "evaluation.share": ("{every: 3, share: mine}", "mine", carried("evaluation.share")),
+    "evaluation.resources.cpus": ("{every: 3, resources: {cpus: 2.5}}", 2.5, carried("evaluation.resources.cpus")),
+    "evaluation.resources.gpus": ("{every: 3, resources: {gpus: 1}}", 1, carried("evaluation.resources.gpus")),
+    "evaluation.resources.memory": (
+        "{every: 3, resources: {memory: 2GiB}}",
+        2048,
+        carried("evaluation.resources.memory"),
+    ),
+    "evaluation.retry.attempts": ("{every: 3, retry: {attempts: 2}}", 2, carried("evaluation.retry.attempts")),
     "export.run": ("ant", "ant", carried("export.run")),
     "export.checkpoint": ("3", 3, carried("export.checkpoint")),
     "export.episodes": ("3", 3, carried("export.episodes")),
@@ -154,7 +168,7 @@ def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
 @pytest.mark.parametrize("key", APPLIED)
 def test_a_key_that_is_accepted_is_in_the_job_that_goes_on(key: str) -> None:
     text, expected, place = APPLIED[key]
-    named = "nodes" if key.startswith("nodes.") else key
+    named = next((section for section in ("nodes", "evaluation") if key.startswith(f"{section}.")), key)
     before, after = changed(kind_of(key), f"{named}={text}")
     _check_changes(RUN, before, after)
     assert place(*requests_of(before)) != expected and place(*requests_of(after)) == expected

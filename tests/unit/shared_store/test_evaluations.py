@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 
 from shared_store.checkpoints import best_checkpoint, list_checkpoints, retain
-from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, lines, list_evaluations
+from shared_store.evaluations import (
+    by_checkpoint,
+    checkpoint_of,
+    evaluation_is_over,
+    evaluation_name,
+    keep_for_evaluation,
+    lines,
+    list_evaluations,
+)
 from shared_store.files import write_json
 from shared_store.layout import Run, Store
 from shared_store.settings import merged
@@ -87,6 +95,22 @@ def test_retention_keeps_what_was_evaluated_by_a_job(run: Run) -> None:
     assert [each.iteration for each in list_checkpoints(run)] == [3, 6, 12], (
         "evaluated, of the greatest score, the newest"
     )
+
+
+def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_still_to_be_evaluated(run: Run) -> None:
+    store = Store(run.path.parent.parent)
+    add_checkpoint(store, "taught", 12)
+    evaluate(run, "00000003-e1-1f2e3d4c", 7.0, keep=False)
+    evaluate(run, "00000009-e1-1f2e3d4c", 5.0, keep=False)
+    keep_for_evaluation(run, "00000009-e1")
+    add_checkpoint(store, "taught", 15)
+    assert retain(run, keep=1) == ["00000012-e1"]
+    keep_for_evaluation(run, "00000015-e1")
+    assert retain(run, keep=1) == ["00000009-e1"], "one waits at a time"
+    evaluation_is_over(run, "00000015-e1")
+    evaluate(run, "00000015-e1-1f2e3d4c", 8.0, keep=False)
+    assert retain(run, keep=1) == ["00000003-e1"], "there is a better one"
+    assert [each.iteration for each in list_checkpoints(run)] == [6, 15], "of the greatest score, the newest"
 
 
 def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:

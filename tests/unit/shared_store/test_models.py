@@ -115,6 +115,30 @@ def test_processes_that_register_at_once_get_a_version_each(store: Store) -> Non
     assert sorted(os.listdir(store.models / "ant"), key=int) == [str(number) for number in range(1, 21)]
 
 
+KILLED = """
+import os, signal, sys
+from shared_store import bundles, models
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Store
+store = Store(sys.argv[1])
+run = store.run("ant")
+bundles.publish = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+models.register(store, sys.argv[2], run, Checkpoint(run.checkpoints / "00000004-e1", 4, 1), {}, sys.argv[3])
+"""
+
+
+def test_what_a_killed_registration_left_is_deleted_by_the_next_one_of_its_controller(store: Store) -> None:
+    run, checkpoint = exported(store)
+    for name, registrar in (("bee", "a1"), ("ant", "b2")):
+        subprocess.run([sys.executable, "-c", KILLED, str(store.path), name, registrar], timeout=60)
+    hidden = [path.name for path in store.models.glob("*/.*")]
+    assert sorted(name.split(".")[1] for name in hidden) == ["a1", "b2"]
+    assert models.register(store, "ant", run, checkpoint, {}, "a1").reference == "ant@1"
+    left = [path.name for path in store.models.glob("*/.*")]
+    assert [name.split(".")[1] for name in left] == ["b2"], "another controller's may go on"
+    models.find(store, "ant").verify()
+
+
 def test_a_version_is_never_published_over_another(store: Store, tmp_path: Path) -> None:
     exported(store)
     model = register(store)

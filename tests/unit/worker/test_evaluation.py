@@ -13,11 +13,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from shared_store.layout import Run
+from shared_store.files import write_json
+from shared_store.layout import Run, Store
+from tests.support.orchestrator.trained import add_checkpoint, add_run
 from worker.distributed import Gang, Placement
 from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import Episodes, Stopped, play
-from worker.evaluation.evaluation import result_of
+from worker.evaluation.evaluation import best_words, result_of
 from worker.evaluation.table import write_table
 from worker.tasks import terms
 from worker.tasks.cartpole import Cartpole
@@ -231,3 +233,14 @@ def test_a_killed_evaluation_leaves_no_half_table_and_the_next_one_clears_what_i
         "00000003-e1-job.json",
         "00000003-e1-job.parquet",
     ]
+
+
+def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_compare_it_with(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    add_run(store, "taught")
+    run, figures = store.run("taught"), {"mean_length": 9.0, "max_length": 10, "episodes": 4, "time": 1.0}
+    for iteration, mean in ((3, 7.25), (6, 5.0)):
+        assert best_words(run) == ""
+        name = add_checkpoint(store, "taught", iteration).name
+        write_json(run.evaluations / f"{name}.json", {**figures, "mean_return": mean})
+    assert best_words(run) == "best of 2 checkpoints that are evaluated: 00000003-e1, mean return 7.25"

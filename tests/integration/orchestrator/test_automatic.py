@@ -1,0 +1,201 @@
+"""Automatic evaluations in a real controller: of what looks like a training to it, a process whose checkpoints the test writes."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from orchestrator import automatic
+from orchestrator.api import submission
+from orchestrator.client import Client
+from orchestrator.errors import ApiError
+from orchestrator.server import Server
+from orchestrator.tables import Job
+from shared_store.checkpoints import list_checkpoints, retain
+from tests.conftest import call_muster
+from tests.support.orchestrator.trained import SPEC, add_checkpoint
+from tests.support.processes import end_all
+from tests.support.waiting import wait_for
+
+TRAIN = {**SPEC["train"], "iterations": 100}
+
+
+class Controller:
+    """A server in this process, whose thread for evaluations looks when the test says so."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.start()
+
+    def start(self) -> None:
+        self.server = Server(self.home, cpus=1)
+        self.server.evaluations._interval = 3600
+        self.server.start()
+        self.client = Client(self.server.url)
+        self.look: Callable[[], None] = self.server.evaluations.look
+
+    def stop(self) -> None:
+        self.client.close()
+        self.server.evaluations._ending.set()
+        self.server.close()
+
+    def train(self, evaluation: dict[str, Any], name: str = "taught") -> str:
+        """Submit a training; what runs is a process that sleeps on the one CPU. Returns the job's id once it runs."""
+        spec = {**SPEC, "name": name, "train": TRAIN, "evaluation": evaluation}
+        variables = {"MUSTER_SPEC": json.dumps(spec), "MUSTER_RUN": name, "MUSTER_ON_CHILD_FAILURE": "restart"}
+        container = {
+            "image": "muster",
+            "command": ["python", "-c", "import time; time.sleep(3600)"],
+            "environment": [{"name": key, "value": value} for key, value in variables.items()],
+            "resourceRequirements": [{"type": "VCPU", "value": "1"}, {"type": "MEMORY", "value": "16"}],
+        }
+        properties = {
+            **{"numNodes": 1, "mainNode": 0},
+            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
+        }
+        definition = {"jobDefinitionName": name, "type": "multinode", "nodeProperties": properties}
+        registered = self.client.batch("RegisterJobDefinition", **definition)
+        asked = {"jobName": name, "jobQueue": "default", "jobDefinition": registered["jobDefinitionArn"]}
+        job = str(self.client.batch("SubmitJob", **asked)["jobId"])
+        self.wait(job, "RUNNING")
+        return job
+
+    def wait(self, job: str, *statuses: str) -> None:
+        wait_for(lambda: self.client.get(f"/api/jobs/{job}")["status"] in statuses, 20, f"{job} {statuses}")
+
+    def end(self, job: str) -> None:
+        self.client.batch("TerminateJob", jobId=job, reason="the test says so")
+        self.wait(job, "FAILED")
+
+    def save(self, *iterations: int, keep: int = 2) -> None:
+        for iteration in iterations:
+            add_checkpoint(self.server.store, "taught", iteration)
+            retain(self.server.store.run("taught"), keep)
+
+    def evaluations(self) -> list[tuple[int, str]]:
+        """Iteration and state of each evaluation that was submitted, in their order."""
+        with self.server.controller.database.session() as session:
+            jobs = session.scalars(select(Job).where(Job.name == "evaluate-taught").order_by(Job.created_at, Job.id))
+            specs = [(each.node_properties["nodeRangeProperties"][0]["container"], each.status) for each in jobs]
+        read = [({e["name"]: e["value"] for e in each["environment"]}, status) for each, status in specs]
+        return [(json.loads(each["MUSTER_SPEC"])["evaluate"]["checkpoint"], status) for each, status in read]
+
+    def newest(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.client.get("/api/runs/taught")["automatic"]
+        return found
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Iterator[Controller]:
+    running = Controller(tmp_path / "home")
+    yield running
+    running.stop()
+    end_all(tmp_path)
+
+
+def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_they_fall_behind(
+    controller: Controller, caplog: pytest.LogCaptureFixture
+) -> None:
+    training = controller.train({"every": 2, "episodes": 8})
+    controller.save(10)
+    controller.look()
+    assert controller.evaluations() == []
+    controller.save(20)
+    controller.look()
+    controller.look()
+    assert controller.evaluations() == [(20, "RUNNABLE")]
+    controller.save(30, 40)
+    controller.look()
+    controller.save(50, 60, 70)
+    controller.look()
+    assert controller.evaluations() == [(20, "RUNNABLE")], "one at a time"
+    run = controller.server.store.run("taught")
+    assert [each.iteration for each in list_checkpoints(run)] == [20, 60, 70], "what waits is not pruned"
+    with caplog.at_level(logging.WARNING):
+        controller.end(controller.newest()["job"])
+        controller.look()
+    assert controller.evaluations() == [(20, "FAILED"), (70, "RUNNABLE")]
+    assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
+    assert controller.newest()["passed"] == 1, "40, or 60"
+    shown = " ".join(call_muster("show", training, home=controller.home).stdout.split())
+    assert "evaluating: checkpoint 00000070-e1 by job " in shown and "1 that were due were passed over" in shown
+    controller.save(80)
+    assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
+    assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"
+    with controller.server.controller.database.session() as session:
+        owners = set(session.scalars(select(Job.owner)))
+    assert len(owners) == 1, "the evaluations are the training's owner's"
+
+
+def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_evaluation(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        """Nothing after it is done."""
+
+    def killed(*_: object) -> None:
+        raise Killed
+
+    controller.train({"every": 1})
+    controller.save(10)
+    for module, name in ((automatic, "submit"), (automatic, "_row"), (submission, "_release")):
+        with monkeypatch.context() as patch:  # before the transaction, at its end, and in the middle of the submission
+            patch.setattr(module, name, killed)
+            with pytest.raises(Killed):
+                controller.look()
+        controller.stop()
+        controller.start()
+        assert controller.evaluations() == []
+    controller.look()
+    assert controller.evaluations() == [(10, "RUNNABLE")]
+    controller.stop()
+    controller.start()
+    controller.look()
+    assert controller.evaluations() == [(10, "RUNNABLE")]
+
+
+def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_no_more(controller: Controller) -> None:
+    training = controller.train({"every": 1})
+    controller.save(90, 100)
+    controller.look()
+    assert controller.evaluations() == [], "the training itself evaluates its last one"
+    with controller.server.controller.database.session() as session:
+        session.get_one(Job, training).stop_reason = "enough"
+        session.commit()
+        controller.save(95)
+        controller.look()
+    assert controller.evaluations() == []
+
+
+def test_an_evaluation_that_its_queue_refuses_is_told_and_the_next_checkpoint_is_tried(controller: Controller) -> None:
+    controller.client.batch(
+        "CreateJobQueue",
+        jobQueueName="idle",
+        priority=1,
+        state="ENABLED",
+        computeEnvironmentOrder=[{"order": 1, "computeEnvironment": "local"}],
+    )
+    controller.train({"every": 1, "queue": "idle"})
+    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="DISABLED")
+    controller.save(10)
+    controller.look()
+    controller.look()
+    problem = "checkpoint 00000010-e1 was not evaluated: Job queue idle is DISABLED and takes no jobs"
+    assert controller.newest()["problem"] == problem and controller.evaluations() == []
+    controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
+    controller.save(20)
+    controller.look()
+    assert controller.evaluations() == [(20, "RUNNABLE")] and controller.newest()["problem"] is None
+
+
+def test_a_queue_that_does_not_take_the_evaluations_is_refused_with_the_training(controller: Controller) -> None:
+    with pytest.raises(ApiError, match="evaluation: Job queue nowhere does not exist"):
+        controller.train({"every": 1, "queue": "nowhere"})
+    with pytest.raises(ApiError, match=r"^evaluation\.every: is required$"):
+        controller.train({})
