@@ -15,7 +15,6 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -26,6 +25,7 @@ from pydantic import (
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
 from orchestrator.settings import effective_problem, section_of, settings_classes, task_config, train_section
+from orchestrator.spec_track import Track, key_in
 from orchestrator.spec_values import (
     Argument,
     Duration,
@@ -33,6 +33,8 @@ from orchestrator.spec_values import (
     JobName,
     Memory,
     RunName,
+    Secrets,
+    Section,
     Size,
     TaskName,
 )
@@ -46,11 +48,7 @@ LONGEST_CHANGES = 24 << 10
 """Characters of all ``--set`` assignments together: as many as a job definition has."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class NodeRange(_Section):
+class NodeRange(Section):
     """How many nodes: ``nodes: 3`` or ``nodes: {min: 2, max: 4}`` (start with what is free)."""
 
     min: int = Field(ge=1, le=250)
@@ -72,7 +70,7 @@ class NodeRange(_Section):
         return self
 
 
-class Resources(_Section):
+class Resources(Section):
     """What each node gets."""
 
     cpus: float = Field(default=1.0, gt=0, description="CPU cores; fractions are allowed")
@@ -92,7 +90,7 @@ def _algorithm_name(value: str) -> str:
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 
-class _Train(_Section):
+class _Train(Section):
     """Train a policy."""
 
     task: TaskName = Field(description="name of a task, or module:Class")
@@ -127,7 +125,7 @@ class _Train(_Section):
 if TYPE_CHECKING:
     Train = _Train
 else:
-    Train = train_section(_Train, {name: section_of(name, each, _Section) for name, each in ALGORITHMS.items()})
+    Train = train_section(_Train, {name: section_of(name, each, Section) for name, each in ALGORITHMS.items()})
 
 
 CheckpointName = int | Literal["best", "latest"]
@@ -140,7 +138,7 @@ def _checkpoint(value: object) -> object:
     raise ValueError("expected an iteration, best or latest")
 
 
-class Evaluate(_Section):
+class Evaluate(Section):
     """Evaluate a checkpoint of a run with the mean action."""
 
     run: RunName
@@ -157,7 +155,7 @@ class Evaluate(_Section):
     )
 
 
-class Export(_Section):
+class Export(Section):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
     run: RunName
@@ -168,11 +166,13 @@ class Export(_Section):
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
-class Record(_Section):
+class Record(Section):
     """Record a checkpoint's policy on a few worlds as an MCAP file."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
     worlds: int = Field(default=4, ge=1, le=16, description="worlds that are recorded")
     episodes: int = Field(default=2, ge=1, description="episodes of each world")
     seed: int | None = Field(
@@ -180,11 +180,13 @@ class Record(_Section):
     )
 
 
-class Render(_Section):
+class Render(Section):
     """Film a checkpoint's policy."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
     format: Literal["mp4", "gif", "png"] = Field(default="gif", description="png: six moments side by side")
     worlds: int = Field(default=4, ge=1, le=16, description="worlds, side by side")
     seconds: float = Field(default=6.0, gt=0, le=600, description="simulated")
@@ -192,7 +194,7 @@ class Render(_Section):
     height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
 
 
-class CheckpointPolicy(_Section):
+class CheckpointPolicy(Section):
     """When training is saved, and how many checkpoints are kept (the best one is always kept too)."""
 
     every: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
@@ -201,7 +203,7 @@ class CheckpointPolicy(_Section):
     keep: int = Field(default=5, ge=2)
 
 
-class Logs(_Section):
+class Logs(Section):
     """How much of what a node prints is kept."""
 
     limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
@@ -210,13 +212,13 @@ class Logs(_Section):
     )
 
 
-class Retry(_Section):
+class Retry(Section):
     """How often a failed gang is started, in all."""
 
     attempts: int = Field(default=3, ge=1, le=10)
 
 
-class Spec(_Section):
+class Spec(Section):
     """One job."""
 
     name: JobName
@@ -239,6 +241,10 @@ class Spec(_Section):
         default=None, min_length=1, description="program and arguments, run on every node"
     )
     environment: Environment = Field(default_factory=dict)
+    secrets: Secrets = Field(
+        default_factory=dict, description="variables and the names of their values, which the controller has"
+    )
+    track: Track | None = Field(default=None, description="services that get a training's metrics as well")
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
     logs: Logs = Field(default_factory=Logs)
@@ -256,6 +262,19 @@ class Spec(_Section):
         if len(given) != 1:
             found = f"found {' and '.join(given)}" if given else "found none"
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
+        return self
+
+    @model_validator(mode="after")
+    def _trackable(self) -> Spec:
+        if self.track is None:
+            return self
+        if self.train is None:
+            raise ValueError(f"track: only a training has metrics to track; this job has {self.kind}")
+        if key := key_in(self.environment):
+            raise ValueError(
+                f"environment.{key}: the key would be stored in the run; remove it, and give it as a secret: "
+                f"secrets: {{{key}: NAME}}"
+            )
         return self
 
     @property
