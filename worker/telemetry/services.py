@@ -98,12 +98,15 @@ class WandB:
         self._offline = mode in ("offline", "dryrun")
         if self._offline:
             return
+        what_to_do = "set WANDB_API_KEY where the job runs, as a secret or with `wandb login`, or choose mode: offline"
         try:
             has_key = self._wandb.login(verify=False)
+        except self._wandb.errors.UsageError:  # there is no terminal to ask at
+            has_key = False
         except (self._wandb.Error, ValueError) as error:
-            raise Refused(f"{one_line(error)} (set WANDB_API_KEY where the job runs, or mode: offline)") from None
+            raise Refused(f"{one_line(error)}; {what_to_do}") from None
         if not has_key:
-            raise Refused("there is no key: set WANDB_API_KEY where the job runs, or mode: offline")
+            raise Refused(f"there is no key for {known.base_url}; {what_to_do}")
 
     def open(self, identity: str | None, fresh: str) -> int:
         self.identity = identity or fresh
