@@ -21,7 +21,7 @@ from tests.conftest import PATIENCE
 from tests.support.worker.ranks import ROOT, free_port
 from tests.support.worker.wandb_files import history, records
 
-TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 9, "seed": 5, "config": {"episode_seconds": 0.5}}
+TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config": {"episode_seconds": 0.5}}
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def run(tmp_path: Path) -> Run:
 def train(run: Run, epoch: int, track: dict[str, Any], **env: str) -> tuple[int, str]:
     """A rank as the supervisor starts it; exit code and output."""
     raise_epoch(run, epoch)
-    spec = {"name": "taught", "train": TRAIN, "track": track, "checkpoint": {"every": 4, "keep": 5}}
+    spec = {"name": "taught", "train": TRAIN, "track": track, "checkpoint": {"every": 10, "keep": 5}}
     given = {
         **{"MUSTER_STORE": str(run.path.parent.parent), "MUSTER_RUN": run.name, "MUSTER_EPOCH": str(epoch)},
         **{"MUSTER_JOB_EPOCH": "1", "MUSTER_JOB_ID": "job", "MUSTER_SPEC": json.dumps(spec), "OMP_NUM_THREADS": "1"},
@@ -61,14 +61,14 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
         "wandb": {"mode": "offline", "project": "poles", "tags": ["a"]},
         "mlflow": {"uri": uri, "tags": {"b": "c"}},
     }
-    code, output = train(run, 1, track, MUSTER_KILL_AT="7")
+    code, output = train(run, 1, track, MUSTER_KILL_AT="33")
     assert code == -9, output
     code, output = train(run, 2, track)
     assert code == 0, output
-    assert "resumed from checkpoint 00000004-e1" in output and ": warning" not in output
+    assert "resumed from checkpoint 000000" in output and ": warning" not in output
 
     expected = read_metrics(run)
-    assert [each["iteration"] for each in expected] == list(range(1, 10))
+    assert [each["iteration"] for each in expected] == list(range(1, 41))
     client = mlflow.MlflowClient(uri)
     [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
     assert there.info.status == "FINISHED" and there.info.run_name == "taught" and there.data.tags["b"] == "c"
@@ -76,8 +76,8 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
     told = client.get_metric_history(there.info.run_id, "train/env_steps")
     assert [(each.step, each.value) for each in told] == [(each["iteration"], each["env_steps"]) for each in expected]
     files = {each.path for each in client.list_artifacts(there.info.run_id)}
-    assert files == {"reward.png", "00000009-e2.json"}
-    assert there.data.metrics["evaluation/length"] == 25.0  # 0.5 s at 50 Hz, which no pole falls within
+    assert files == {"reward.png", "00000040-e2.json"}
+    assert there.data.metrics["evaluation/length"] == 30.0  # 0.5 s at 60 Hz, within which no pole falls
 
     [file] = run.tracking.glob("wandb/offline-run-*-taught/run-taught.wandb")
     rows = [row for row in history(file) if "train/env_steps" in row]
@@ -90,7 +90,7 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
     config = {each.key: json.loads(each.value_json) for each in known[0].config.update}
     assert config["train"] == TRAIN and config["run"] == "taught" and "newton" in config["versions"]
     saved = {each.path for record in records(file) if record.HasField("files") for each in record.files.files}
-    assert {"reward.png", "00000009-e2.json"} <= saved
+    assert {"reward.png", "00000040-e2.json"} <= saved
 
 
 def test_without_a_key_a_training_ends_before_it_begins_with_one_line_and_no_prompt(run: Run) -> None:
@@ -123,7 +123,7 @@ def test_a_server_that_is_away_costs_the_training_nothing_and_the_rest_is_sent_a
     client = mlflow.MlflowClient(uri)
     [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
     steps = [each.step for each in client.get_metric_history(there.info.run_id, "train/kl")]
-    assert steps == list(range(1, 10)) and there.info.status == "FINISHED"
+    assert steps == list(range(1, 41)) and there.info.status == "FINISHED"
 
 
 def test_a_package_that_is_missing_is_named_with_what_installs_it(run: Run, tmp_path: Path) -> None:
