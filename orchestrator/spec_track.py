@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from orchestrator.spec_values import Section
-from shared_store.wording import kind_of, nearest, shown
+from shared_store.wording import nearest, shown
 
 SERVICES = ("wandb", "mlflow")
 
@@ -65,7 +65,7 @@ class Track(Section):
             return {name: {} if settings is None else settings for name, settings in value.items()}
         names = [value] if isinstance(value, str) else value
         if not isinstance(names, list):
-            raise ValueError(f"expected wandb, mlflow, a list of them or a mapping, found {kind_of(value)}")
+            raise ValueError("expected wandb, mlflow, a list of them, or each with its settings")
         for name in names:
             if name not in SERVICES:
                 raise ValueError(f"no service is called {shown(str(name))}; {nearest(str(name), list(SERVICES))}")

@@ -45,10 +45,10 @@ def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, k
     ("changes", "said"),
     [
         ({"track": "wandv"}, "job.yaml: track: no service is called 'wandv'; did you mean wandb?"),
-        ({"track": ["wandb", 3]}, "job.yaml: track: no service is called '3'; wandb, mlflow"),
+        ({"track": ["wandb", 3]}, "job.yaml: track: no service is called '3'; there are wandb, mlflow"),
         (
             {"track": 3},
-            "job.yaml: track: expected wandb, mlflow, a list of them or a mapping, found a whole number (3)",
+            "job.yaml: track: expected wandb, mlflow, a list of them, or each with its settings, found 3",
         ),
         ({"track": {"wandb": {"projct": "x"}}}, "job.yaml: track.wandb.projct: unknown key; did you mean project?"),
         (
