@@ -57,7 +57,7 @@ class Sender:
         self._note = run.tracking / f"{kind}.json"
         self._history = MetricsHistory(run)
         self._sent: int | None = None
-        self._trouble = ""
+        self._trouble = False
         self._tries = 0
         self._next = 0.0
 
@@ -77,7 +77,7 @@ class Sender:
         if is_other or note.get("id") != self._service.identity:
             write_json(self._note, {"id": self._service.identity, "settings": self._settings})
         self._sent = sent
-        self._say(self._service.place)
+        self._say(_without_key(self._service.place))
 
     def step(self, resumed_from: int | None, epoch: int, *, at_once: bool = False) -> bool:
         """Send what is new, unless a try failed a moment ago; returns whether everything is sent. Raises StaleEpoch."""
@@ -92,22 +92,26 @@ class Sender:
                 self._sent = records[-1]["iteration"]
             if self._trouble:
                 self._say("it answers again; everything is sent")
-            self._trouble, self._tries = "", 0
+            self._trouble, self._tries = False, 0
             return not self._history.behind
         except Exception as error:  # of the network, of the service's library, of the volume: all may pass
             first, most = _PATIENCE
             self._next = time.monotonic() + min(most, first * 2**self._tries)
             self._tries = min(self._tries + 1, 10)
-            trouble = re.sub(r"//[^/@\s]*@", "//", one_line(error))
             if not self._trouble:
-                self._say(f"warning: nothing can be sent ({trouble}); training goes on, and it is tried again")
-            self._trouble = trouble
+                self._say(f"warning: nothing can be sent now ({_without_key(one_line(error))})")
+            self._trouble = True
             return False
 
     def finish(self, outcome: str) -> None:
         """Send the end: evaluation and pictures of a training that is done. Raises whatever the service does."""
         figures, files = _results(self._run) if outcome == "finished" else ({}, [])
         self._service.finish(Ending(outcome, self._sent or 0, figures, files))
+
+
+def _without_key(text: str) -> str:
+    """A text whose URIs name no user and no password."""
+    return re.sub(r"//[^/@\s]*@", "//", text)
 
 
 def _results(run: Run) -> tuple[dict[str, float], list[Path]]:
@@ -230,7 +234,7 @@ def afterwards(directory: str, kind: str) -> int:
         run, service, kind, same_iterations(spec["train"]), lambda text: print(f"{kind}: {text}", flush=True)
     )
     if not sender.step(None, 0):
-        return 1
+        return _fail(f"{kind}: not everything was sent; run this again")
     try:
         sender.finish("finished")
     except Exception as error:

@@ -104,7 +104,7 @@ class WandB:
         except self._wandb.errors.UsageError:  # there is no terminal to ask at
             has_key = False
         except (self._wandb.Error, ValueError) as error:
-            raise Refused(f"{one_line(error)}; {what_to_do}") from None
+            raise Refused(f"{one_line(error).rstrip('.')}; {what_to_do}") from None
         if not has_key:
             raise Refused(f"there is no key for {known.base_url}; {what_to_do}")
 

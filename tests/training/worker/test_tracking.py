@@ -110,7 +110,7 @@ def test_a_server_that_is_away_costs_the_training_nothing_and_the_rest_is_sent_a
     code, output = train(run, 1, {"mlflow": {"uri": f"http://127.0.0.1:{free_port()}"}})
     assert code == 0, output
     said = [line for line in output.splitlines() if line.startswith("mlflow: ")]
-    assert [line.partition("(")[0] for line in said[:1]] == ["mlflow: warning: nothing can be sent "]
+    assert [line.partition("(")[0] for line in said[:1]] == ["mlflow: warning: nothing can be sent now "]
     sends = f"mlflow: warning: not everything was sent; `python -m worker.track {run.path} mlflow` sends the rest"
     assert said[1:] == [sends]
 

@@ -127,7 +127,7 @@ def test_while_a_service_is_away_one_line_says_so_and_later_everything_is_sent(
     assert sending.step(0, 1)
     assert [step for step, _ in service.sent["ant"]] == list(range(1, 701))
     assert said[1:] == [
-        "warning: nothing can be sent (no route to http://host/); training goes on, and it is tried again",
+        "warning: nothing can be sent now (no route to http://host/)",
         "it answers again; everything is sent",
     ]
 
