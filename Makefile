@@ -2,6 +2,7 @@
 # make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
 # make long             trainings that are killed, stretched and cut off, and trainings that learn something
 # make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
+# make services         W&B, MLflow and LEAPP, whose packages (130 MB) it installs: tracked trainings, a bundle that LEAPP runs
 # make engines          the engines on whole clusters: Ray, docker-compose, a training that goes from engine to engine, bad networks
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
@@ -15,7 +16,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test unit integration training long robots engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run test unit integration training long robots services engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -41,6 +42,10 @@ long: $(READY) kernels
 robots: $(READY)
 	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube
 	$(PYTEST) tests/robots
+
+services: $(READY) kernels
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]'
+	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_bundle_parts.py
 
 # one after the other: a cluster has this machine for itself
 engines: $(READY) kernels

@@ -29,7 +29,7 @@ from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.evaluating import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
 from orchestrator.jobs import Status
-from orchestrator.spec import Evaluation
+from orchestrator.spec_sections import Evaluation
 from orchestrator.tables import AutomaticEvaluation, Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.evaluations import evaluation_is_over, keep_for_evaluation

@@ -40,12 +40,14 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
     resources = {"VCPU": f"{spec.resources.cpus:g}", "MEMORY": str(spec.resources.memory)}
     if spec.resources.gpus:
         resources["GPU"] = str(spec.resources.gpus)
-    container = {
+    container: dict[str, Any] = {
         "image": spec.image,
         "command": command,
         "environment": [{"name": name, "value": value} for name, value in {**spec.environment, **ours}.items()],
         "resourceRequirements": [{"type": kind, "value": value} for kind, value in resources.items()],
     }
+    if spec.secrets:
+        container["secrets"] = [{"name": name, "valueFrom": reference} for name, reference in spec.secrets.items()]
     request: dict[str, Any] = {
         "jobDefinitionName": spec.name,
         "type": "multinode",

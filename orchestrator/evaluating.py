@@ -9,7 +9,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from orchestrator.errors import SpecError
-from orchestrator.spec import Evaluation, Spec, validate
+from orchestrator.spec import Spec, validate
+from orchestrator.spec_sections import Evaluation
 from shared_store.checkpoints import Checkpoint
 from shared_store.wording import explain, path_of
 

@@ -15,7 +15,6 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -26,17 +25,18 @@ from pydantic import (
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
 from orchestrator.settings import effective_problem, section_of, settings_classes, task_config, train_section
+from orchestrator.spec_sections import CheckpointPolicy, Evaluation, Logs, NodeRange, Resources, Retry, Share
+from orchestrator.spec_track import Track, key_in
 from orchestrator.spec_values import (
     Argument,
     Duration,
     Environment,
     JobName,
-    Memory,
     RunName,
-    Size,
+    Secrets,
+    Section,
     TaskName,
 )
-from shared_store.log_files import LEAST_LIMIT, LIMIT
 from shared_store.wording import explain, kind_of, nearest, path_of
 
 KINDS = ("train", "evaluate", "export", "record", "render", "command")
@@ -44,40 +44,6 @@ KINDS = ("train", "evaluate", "export", "record", "render", "command")
 
 LONGEST_CHANGES = 24 << 10
 """Characters of all ``--set`` assignments together: as many as a job definition has."""
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class NodeRange(_Section):
-    """How many nodes: ``nodes: 3`` or ``nodes: {min: 2, max: 4}`` (start with what is free)."""
-
-    min: int = Field(ge=1, le=250)
-    max: int = Field(ge=1, le=250)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_number(cls, value: object) -> object:
-        if isinstance(value, dict):
-            return value
-        if isinstance(value, int) and not isinstance(value, bool):
-            return {"min": value, "max": value}
-        raise ValueError("expected a whole number of nodes, or {min: 2, max: 4}")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> NodeRange:
-        if self.min > self.max:
-            raise ValueError(f"min ({self.min}) is more than max ({self.max})")
-        return self
-
-
-class Resources(_Section):
-    """What each node gets."""
-
-    cpus: float = Field(default=1.0, gt=0, description="CPU cores; fractions are allowed")
-    gpus: int = Field(default=0, ge=0, description="GPUs; one rank process is started for each")
-    memory: Memory = Field(default=1024, ge=4, description="memory, such as 4GiB")
 
 
 ALGORITHMS = settings_classes()
@@ -92,7 +58,7 @@ def _algorithm_name(value: str) -> str:
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 
-class _Train(_Section):
+class _Train(Section):
     """Train a policy."""
 
     task: TaskName = Field(description="name of a task, or module:Class")
@@ -127,10 +93,8 @@ class _Train(_Section):
 if TYPE_CHECKING:
     Train = _Train
 else:
-    Train = train_section(_Train, {name: section_of(name, each, _Section) for name, each in ALGORITHMS.items()})
+    Train = train_section(_Train, {name: section_of(name, each, Section) for name, each in ALGORITHMS.items()})
 
-
-Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
 
 CheckpointName = int | Literal["best", "latest"]
 """An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
@@ -142,7 +106,7 @@ def _checkpoint(value: object) -> object:
     raise ValueError("expected an iteration, best or latest")
 
 
-class Evaluate(_Section):
+class Evaluate(Section):
     """Evaluate a checkpoint of a run with the mean action."""
 
     run: RunName
@@ -160,7 +124,7 @@ class Evaluate(_Section):
     keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
-class Export(_Section):
+class Export(Section):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
     run: RunName
@@ -171,11 +135,13 @@ class Export(_Section):
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
-class Record(_Section):
+class Record(Section):
     """Record a checkpoint's policy on a few worlds as an MCAP file."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
     worlds: int = Field(default=4, ge=1, le=16, description="worlds that are recorded")
     episodes: int = Field(default=2, ge=1, description="episodes of each world")
     seed: int | None = Field(
@@ -183,11 +149,13 @@ class Record(_Section):
     )
 
 
-class Render(_Section):
+class Render(Section):
     """Film a checkpoint's policy."""
 
     run: RunName
-    checkpoint: int | None = Field(default=None, ge=0, description="iteration; the newest where absent")
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
     format: Literal["mp4", "gif", "png"] = Field(default="gif", description="png: six moments side by side")
     worlds: int = Field(default=4, ge=1, le=16, description="worlds, side by side")
     seconds: float = Field(default=6.0, gt=0, le=600, description="simulated")
@@ -195,45 +163,7 @@ class Render(_Section):
     height: int = Field(default=360, ge=64, le=4096, description="of a frame [px]")
 
 
-class CheckpointPolicy(_Section):
-    """When training is saved, and how many checkpoints are kept (the best one is always kept too)."""
-
-    every: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
-        default=25, description="iterations; auto: as often as 1 % of the time allows"
-    )
-    keep: int = Field(default=5, ge=2)
-
-
-class Logs(_Section):
-    """How much of what a node prints is kept."""
-
-    limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
-        default=LIMIT,
-        description="of each node in each attempt, at least 1MiB; of a longer log its beginning and its end are kept",
-    )
-
-
-class Retry(_Section):
-    """How often a failed gang is started, in all."""
-
-    attempts: int = Field(default=3, ge=1, le=10)
-
-
-class Evaluation(_Section):
-    """Evaluate every few checkpoints of a training, each in a job of its own beside it."""
-
-    every: int = Field(ge=1, description="checkpoints from one evaluation to the next")
-    episodes: int = Field(default=100, ge=1, le=1_000_000)
-    worlds: int = Field(default=1024, ge=1, description="simulated worlds, at most one for each episode")
-    queue: str | None = Field(default=None, description="job queue; that of the training where absent")
-    share: Share | None = Field(default=None, description="share identifier in that queue")
-    resources: Resources | None = Field(
-        default=None, description="of the one node; where absent those of a node of the training, with at most one GPU"
-    )
-    retry: Retry = Field(default_factory=Retry)
-
-
-class Spec(_Section):
+class Spec(Section):
     """One job."""
 
     name: JobName
@@ -254,6 +184,10 @@ class Spec(_Section):
         default=None, min_length=1, description="program and arguments, run on every node"
     )
     environment: Environment = Field(default_factory=dict)
+    secrets: Secrets = Field(
+        default_factory=dict, description="variables and the names of their values, which the controller has"
+    )
+    track: Track | None = Field(default=None, description="services that get a training's metrics as well")
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
     evaluation: Evaluation | None = Field(default=None, description="of checkpoints, while the job trains")
@@ -274,6 +208,19 @@ class Spec(_Section):
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
         if self.evaluation is not None and self.train is None:
             raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
+        return self
+
+    @model_validator(mode="after")
+    def _trackable(self) -> Spec:
+        if self.track is None:
+            return self
+        if self.train is None:
+            raise ValueError(f"track: only a training has metrics to track; this job has {self.kind}")
+        if key := key_in(self.environment):
+            raise ValueError(
+                f"environment.{key}: the key would be stored in the run; remove it, and give it as a secret: "
+                f"secrets: {{{key}: NAME}}"
+            )
         return self
 
     @property

@@ -8,6 +8,7 @@ from pydantic import PydanticUserError, TypeAdapter
 
 from orchestrator.settings import task_config
 from orchestrator.spec import ALGORITHMS, Spec
+from orchestrator.spec_track import track_schema
 from orchestrator.spec_values import known_tasks
 from shared_store.policy_contract import Contract
 
@@ -19,6 +20,7 @@ def schema() -> dict[str, Any]:
     document = Spec.model_json_schema()
     definitions = document["$defs"]
     definitions["NodeRange"] = {"anyOf": [{"type": "integer", "minimum": 1, "maximum": 250}, definitions["NodeRange"]]}
+    definitions["Track"] = track_schema(definitions["Track"])
     definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
     definitions["Train"]["properties"]["algorithm"]["examples"] = list(ALGORITHMS)
     text = {"type": ["string", "number"]}

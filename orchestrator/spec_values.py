@@ -6,7 +6,7 @@ import re
 from importlib.metadata import entry_points
 from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import excerpt, shown
@@ -15,6 +15,12 @@ from shared_store.wording import nearest
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 _BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+class Section(BaseModel):
+    """A mapping of the job YAML with keys of its own."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def _duration(value: object) -> object:
@@ -88,6 +94,13 @@ def _environment(value: dict[str, str]) -> dict[str, str]:
     return value
 
 
+def _secrets(value: dict[str, str]) -> dict[str, str]:
+    _environment(value)
+    if name := next((name for name, reference in value.items() if not reference), None):
+        raise ValueError(f"{shown(name)}: expected the name under which the controller has the value")
+    return value
+
+
 def _argument(value: str) -> str:
     if "\0" in value:
         raise ValueError("expected a text without a zero byte")
@@ -106,4 +119,5 @@ RunName = Annotated[str, AfterValidator(_run_name)]
 JobName = Annotated[str, AfterValidator(_job_name)]
 TaskName = Annotated[str, AfterValidator(_task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
+Secrets = Annotated[dict[str, str], AfterValidator(_secrets)]
 Argument = Annotated[str, AfterValidator(_argument)]

@@ -75,6 +75,10 @@ class Run:
     def telemetry(self) -> Path:
         return self.path / "telemetry"
 
+    @property
+    def tracking(self) -> Path:
+        return self.path / "tracking"
+
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
 
@@ -93,6 +97,7 @@ class Run:
             "exports",
             "recordings",
             "telemetry",
+            "tracking",
             "logs",
             "outcomes",
             "parent",

@@ -23,6 +23,14 @@ from typing import Any
 from shared_store.files import DamagedFile, json_object, open_regular
 from shared_store.layout import Run
 
+_SECTIONS = {
+    "reward": "episode/reward",
+    "episode_length": "episode/length",
+    "steps_per_second": "speed/steps_per_second",
+    "collect_seconds": "speed/collect_seconds",
+    "learn_seconds": "speed/learn_seconds",
+    "iteration_seconds": "speed/iteration_seconds",
+}
 _NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
 _BLOCK = 16 << 10
 """Bytes between two marks."""
@@ -58,6 +66,16 @@ class MetricsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def scalars(record: Mapping[str, Any]) -> dict[str, float]:
+    """A record's numbers by their names in TensorBoard, W&B and MLflow; without the iteration, which is the step, and the time."""
+    numbers = {name: value for name, value in record.items() if isinstance(value, int | float)}
+    return {
+        _SECTIONS.get(name, f"train/{name}"): value
+        for name, value in numbers.items()
+        if name not in ("iteration", "time") and math.isfinite(value)
+    }
 
 
 def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:

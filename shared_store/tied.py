@@ -11,6 +11,11 @@ import signal
 import sys
 from collections.abc import Sequence
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import subprocess
+    from typing import Any
+
 _PR_SET_PDEATHSIG = 1
 _PR_SET_PTRACER = 0x59616D61
 
@@ -23,6 +28,19 @@ def tied(command: Sequence[str], ignoring: Sequence[int] = ()) -> list[str]:
     """
     ignored = ",".join(str(int(number)) for number in ignoring)
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, *command]
+
+
+def start_tied(command: Sequence[str], ignoring: Sequence[int] = (), **options: Any) -> subprocess.Popen[bytes]:
+    """Start ``command`` as :func:`tied` has it, with ``options`` of ``Popen``. It ignores its signals from its first instant:
+    Slurm sends SIGTERM to every process of a step, whatever its session.
+    """
+    import subprocess  # not for what this program itself starts
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ignoring)
+    try:
+        return subprocess.Popen(tied(command, ignoring), **options)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def follow(parent: int) -> None:

@@ -7,6 +7,7 @@ import sys
 
 from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, run_command, user_errors
+from worker.telemetry.tracking import Tracking
 
 SWITCH_SECONDS = 0.0005
 """For how long a thread that reports or saves may keep the interpreter from the training thread, whose device may be idle meanwhile [s]."""
@@ -17,6 +18,11 @@ def main() -> int:
     stop = StopRequest().listen()  # before the imports, which take seconds
     sys.setswitchinterval(SWITCH_SECONDS)
     job = Job.from_env(os.environ, "train")
+    with Tracking(job, is_main=os.environ.get("RANK", "0") == "0") as tracking:
+        return tracking.ended(_train(job, stop, tracking))
+
+
+def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
     from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -36,6 +42,7 @@ def main() -> int:
     from worker.learning.training import Training
 
     training = Training.of(job, task_type)
+    tracking.check()
     learner = training.algorithm_type, training.settings
     worlds = -(-total_worlds(job, gang) // gang.size)
     loop: Loop | None = None

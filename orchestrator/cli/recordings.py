@@ -15,12 +15,14 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.clones import split_reference
+from orchestrator.cli.export import chosen
 from orchestrator.cli.jobs import submit_spec
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, named
 from orchestrator.errors import ApiError, ServerError, UsageError
-from orchestrator.spec import Record, Render, Resources, Retry, Spec
+from orchestrator.spec import Record, Render, Spec
+from orchestrator.spec_sections import Resources, Retry
 
 SourceArgument = Annotated[
     str | None,
@@ -139,27 +141,10 @@ def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
     return run, None
 
 
-def _iteration(client: Client, run: dict[str, Any], source: str) -> int | None:
-    """The checkpoint that is meant, None: the newest. Raises UsageError where there is none."""
-    wanted = split_reference(source)[1]
-    there = client.get(f"/api/runs/{named(run['run'])}/checkpoints")
-    if not there:
-        raise UsageError(f"run {run['run']} has no checkpoint yet; train it first")
-    if wanted is None:
-        return None
-    iterations = [each["iteration"] for each in there]
-    if wanted == "best":
-        scored = [each for each in there if each.get("score") is not None]
-        if not scored:
-            raise UsageError(
-                f"run {run['run']} has no checkpoint with a score; there are: {', '.join(map(str, iterations))}"
-            )
-        best: int = max(scored, key=lambda each: each["score"])["iteration"]
-        return best
-    if wanted not in iterations:
-        closest = min(iterations, key=lambda each: abs(each - int(wanted)))
-        raise UsageError(f"run {run['run']} has no checkpoint of iteration {wanted}; the nearest is {closest}")
-    return int(wanted)
+def _iteration(client: Client, run: dict[str, Any], source: str) -> int:
+    """The iteration of the checkpoint that is meant. Raises UsageError where there is none."""
+    iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
+    return iteration
 
 
 def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:

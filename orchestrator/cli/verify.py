@@ -14,7 +14,8 @@ from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_th
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.errors import SpecError
-from orchestrator.spec import Resources, Retry, Spec
+from orchestrator.spec import Spec
+from orchestrator.spec_sections import Resources, Retry
 
 Connect = Callable[[], Client]
 

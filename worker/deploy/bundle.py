@@ -6,6 +6,7 @@
 ``contract.json``   what goes in and what comes out (:mod:`shared_store.policy_contract`)
 ``parity.npz``      observations of roll-outs, and what the trained policy did: a self-test for who runs the bundle
 ``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
+``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.leapp_description`)
 ``robot/``          the robot's model, where its licence allows a copy
 ``README.md``       what is what, and licences
 ``manifest.json``   where the policy comes from, versions, and the SHA-256 of every other file
@@ -37,6 +38,7 @@ from shared_store.files import remove_tree, write_json
 from shared_store.layout import Run
 from shared_store.policy_contract import Contract
 from worker.deploy import parity, rollouts
+from worker.deploy.leapp_description import LEAPP, leapp_description
 from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
 
@@ -172,6 +174,7 @@ def _publish(
         (hidden / "parity.npz").write_bytes(files.parity)
         write_json(hidden / CONTRACT, contract.document())
         write_json(hidden / REPORT, report)
+        (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
         robot = add_robot(task, hidden)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot))
         seal(
@@ -234,6 +237,7 @@ From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iterati
 - `parity.npz`: observations of roll-outs (steps, worlds, ...), where episodes `begins`, and the `actions` of the trained policy. Whoever
   runs the policy should repeat them to within {parity.TOLERANCE:g}.
 - `report.json`: how the files were compared with the trained policy, and how both did on the same simulated worlds.
+- `leapp.yaml`: the inputs and outputs of `policy.onnx` for NVIDIA's LEAPP. Units, scales and offsets are in `contract.json` alone.
 - `manifest.json`: where the policy comes from, versions, and the SHA-256 of every file.
 
 ## Licences

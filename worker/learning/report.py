@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from shared_store.metrics import MetricsWriter
+from shared_store.metrics import MetricsWriter, scalars
 from worker.learning.job import Job
 
 
@@ -82,9 +82,8 @@ class Report:
         finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
         try:
             self._metrics.write({**finite, "time": time.time()})
-            for name, value in finite.items():
-                if name != "iteration" and value is not None:
-                    self._events.add_scalar(_TAGS.get(name, f"train/{name}"), value, record["iteration"])
+            for name, value in scalars(finite).items():
+                self._events.add_scalar(name, value, record["iteration"])
         except OSError as error:
             if not self._warned:
                 print(f"warning: metrics can't be written ({error}); training goes on without them", flush=True)
@@ -120,14 +119,6 @@ def _slow(record: dict[str, float | int | None]) -> str:
 _SLOW = 0.1
 _NOTICED = 0.1
 """Seconds of an iteration."""
-_TAGS = {
-    "reward": "episode/reward",
-    "episode_length": "episode/length",
-    "steps_per_second": "speed/steps_per_second",
-    "collect_seconds": "speed/collect_seconds",
-    "learn_seconds": "speed/learn_seconds",
-    "iteration_seconds": "speed/iteration_seconds",
-}
 
 
 def _text(value: float | None, form: str) -> str:

@@ -17,7 +17,7 @@ import torch
 
 from shared_store.epoch import StaleEpoch
 from shared_store.layout import Run
-from shared_store.tied import tied
+from shared_store.tied import start_tied
 from worker.learning.host_copies import HostCopies
 from worker.learning.reporter import Gate
 
@@ -200,22 +200,16 @@ class Saver:
         return self._process
 
     def _start(self) -> None:
-        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it.
-
-        Slurm sends SIGTERM to every process of a step, whatever its session: the writer ignores it from its first instant.
-        """
+        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it."""
         self._answers = b""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
-        try:
-            self._process = subprocess.Popen(
-                tied([sys.executable, "-P", "-m", "worker.checkpoint_writer"], ignoring=[signal.SIGTERM]),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=[file.fileno() for file in (*self._memory, self._records)],
-                start_new_session=True,
-            )
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        self._process = start_tied(
+            [sys.executable, "-P", "-m", "worker.checkpoint_writer"],
+            ignoring=[signal.SIGTERM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=[file.fileno() for file in (*self._memory, self._records)],
+            start_new_session=True,
+        )
 
     def _take_answer(self, seconds: float | None) -> bool:
         """Note the next answer, waiting for it up to ``seconds`` (None: for ever); False where none came. Raises StaleEpoch."""

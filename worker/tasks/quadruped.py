@@ -14,7 +14,7 @@ from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks import terms
 from worker.tasks.configs.quadruped import QuadrupedConfig
-from worker.tasks.declaration import Action, Command, Declaration, Event, Observation, Reward, Termination
+from worker.tasks.declaration import Action, Command, Declaration, Event, Metric, Observation, Reward, Termination
 from worker.tasks.declared import DeclaredTask
 
 wp.set_module_options({"enable_backward": False})
@@ -120,6 +120,10 @@ class Quadruped(DeclaredTask):
             terminations={
                 "trunk_down": Termination(trunk_down, half=TRUNK),
                 "tilted": Termination(terms.root_tilted, limit=config.tilt_limit),
+            },
+            metrics={
+                "error_vel_xy": Metric(terms.planar_velocity_error),
+                "error_vel_yaw": Metric(terms.turning_velocity_error),
             },
             commands={
                 "velocity": Command(

@@ -10,6 +10,23 @@ NEWER = ("broken", "last_actions", "earlier_actions", "activations")
 """What states of older versions do not have, and which may begin at 0."""
 
 
+def completed(
+    tensors: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor], metrics: int
+) -> dict[str, torch.Tensor]:
+    """A state with zeros for what an older version did not save: :data:`NEWER`, and the sums of all ``metrics``, which are the last ones.
+
+    Args:
+        tensors: Of the task.
+        state: As saved.
+        metrics: How many the task has.
+    """
+    found = {name: torch.zeros_like(tensors[name], device="cpu") for name in NEWER if name in tensors} | {**state}
+    sums, wanted = found.get("episode_sums"), tensors["episode_sums"].shape[1]
+    if sums is not None and sums.dim() == 2 and metrics and sums.shape[1] == wanted - metrics:
+        found["episode_sums"] = torch.nn.functional.pad(sums, (0, metrics))
+    return found
+
+
 def check_state(what: str, tensors: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor]) -> None:
     """Compare a saved state with the tensors that it is for.
 

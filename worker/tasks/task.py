@@ -31,7 +31,7 @@ from worker.tasks.checks import assert_replays, check_arguments, checked_interfa
 from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface, deviations
-from worker.tasks.saved import NEWER, check_state
+from worker.tasks.saved import check_state, completed
 
 
 class Task:
@@ -316,8 +316,7 @@ class Task:
         """
         tensors = self.state_tensors()
         # older states lack what is 0 when an episode begins, or nothing to go by
-        new = {name: torch.zeros_like(tensors[name], device="cpu") for name in NEWER if name in tensors}
-        state = {**new, **state}
+        state = completed(tensors, state, len(self.metric_names))
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])

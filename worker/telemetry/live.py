@@ -129,7 +129,7 @@ def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recordi
 
     from worker.learning.job import configure, user_errors
     from worker.tasks import find_task
-    from worker.telemetry.rollout import facts_of, job_attachment
+    from worker.telemetry.rollout import as_json, facts_of, job_attachment
     from worker.telemetry.stage import Stage
 
     warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
@@ -143,7 +143,9 @@ def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recordi
     told = history_of(run).last() or {}
     known = {**known, "iteration": str(told.get("iteration", 0)), "seed": str(train.get("seed", ""))}
     facts = facts_of(run, {"task": train["task"], "algorithm": train.get("algorithm", "ppo")})
-    return Recording(output, stage, {**facts, **known}, job_attachment(run))
+    contract = read_json(run.contract)
+    attached = {"contract.json": as_json(contract)} if contract else {}
+    return Recording(output, stage, {**facts, **known}, {**attached, **job_attachment(run)})
 
 
 def main() -> int:

@@ -122,9 +122,20 @@ class Rollout:
         }
 
     def attachments(self) -> dict[str, bytes]:
-        """The policy's contract as the checkpoint has it, and the job that trained it."""
-        policy = {"checkpoint": self.checkpoint.name, **self._own(), **self.checkpoint.manifest["policy"]}
-        return {"policy.json": _json(policy), **job_attachment(self.run)}
+        """The policy's contract, the policy as ONNX where its algorithm can export it, and the job that trained it."""
+        from worker.deploy.model import metadata_of, to_onnx
+        from worker.tasks.policy_contract import policy_contract
+
+        name, files = self.checkpoint.manifest["task"], {}
+        try:
+            exported = load_policy(self.checkpoint).module()
+            contract = policy_contract(self.task, name, exported)
+            files["policy.onnx"] = to_onnx(exported, metadata_of(contract, f"{self.run.name}/{self.checkpoint.name}"))
+        except Exception as error:  # of a user's own algorithm: what was recorded is worth more
+            what = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            print(f"warning: the recording is without policy.onnx, which can't be exported: {what}", flush=True)
+            contract = policy_contract(self.task, name)
+        return {"contract.json": as_json(contract.document()), **files, **job_attachment(self.run)}
 
 
 def facts_of(run: Run, known: Mapping[str, Any]) -> dict[str, str]:
@@ -141,8 +152,9 @@ def facts_of(run: Run, known: Mapping[str, Any]) -> dict[str, str]:
 def job_attachment(run: Run) -> dict[str, bytes]:
     """The YAML of the run's job as JSON; nothing where it had none."""
     spec = (run.description() or {}).get("spec")
-    return {"job.json": _json(spec)} if spec else {}
+    return {"job.json": as_json(spec)} if spec else {}
 
 
-def _json(value: object) -> bytes:
+def as_json(value: object) -> bytes:
+    """For an attachment."""
     return json.dumps(value, indent=1).encode()

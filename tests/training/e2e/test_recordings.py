@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import onnx
 from mcap.reader import make_reader
 from PIL import Image
 
@@ -29,6 +30,11 @@ def episodes(path: Path) -> list[dict[str, str]]:
         return [each.metadata for each in make_reader(file).iter_metadata() if each.name == "episode"]
 
 
+def attachments(path: Path) -> dict[str, bytes]:
+    with path.open("rb") as file:
+        return {each.name: each.data for each in make_reader(file).iter_attachments()}
+
+
 def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving, tmp_path: Path) -> None:
     options = [part for key, value in SMALL.items() for part in ("--set", f"{key}={json.dumps(value)}")]
     job = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)["jobId"]
@@ -49,12 +55,22 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     stopped = server.muster("stop", job, timeout=180)
     assert stopped.returncode == 0, stopped.stderr
     file = tmp_path / "policy.mcap"
-    done = server.muster("record", f"{run.name}@best", "-o", str(file), "--worlds", "2", "--episodes", "1", timeout=180)
+    done = server.muster(
+        "record", f"{run.name}@latest", "-o", str(file), "--worlds", "2", "--episodes", "1", timeout=180
+    )
     assert done.returncode == 0, done.stderr + done.stdout
     facts = episodes(file)
     assert [(each["world"], each["complete"], each["run"]) for each in facts] == [
         (world, "true", run.name) for world in sorted(each["world"] for each in facts)
     ]
+    [used] = [each for each in list_checkpoints(run) if each.name == facts[0]["checkpoint"]]
+    told = attachments(file)
+    contract, model = json.loads(told["contract.json"]), onnx.load_from_string(told["policy.onnx"])
+    assert contract == used.manifest["contract"] and json.loads(told["job.json"])["train"]["task"] == "Cartpole"
+    assert {each.key: each.value for each in model.metadata_props}["run_path"] == f"{run.name}/{used.name}"
+    assert set(told) == {"contract.json", "policy.onnx", "job.json", "robot.xml"}
+    while_training = attachments(live)
+    assert json.loads(while_training["contract.json"]) == contract and "policy.onnx" not in while_training
     held = {each.iteration: each.manifest["files"]["learner.pt"]["sha256"] for each in list_checkpoints(run)}
     assert all(held[int(each["iteration"])] == each["policy_sha256"] for each in facts)
 

@@ -34,7 +34,7 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     options = ("-o", str(output), "--worlds", "4", "--episodes", "4")
     done = run_muster("export", f"{run.name}@2", *options, home=home, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "of the bundle" in done.stdout and f"bundle:      {output} (8 files" in done.stdout, done.stdout
+    assert "of the bundle" in done.stdout and f"bundle:      {output} (9 files" in done.stdout, done.stdout
     assert verify(output)["iteration"] == 2
     report = json.loads((output / "report.json").read_text())
     assert report["judged"]["episodes"] == 4 and report["parity"]["observations"]["rollout"] >= 1000

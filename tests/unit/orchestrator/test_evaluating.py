@@ -9,7 +9,7 @@ import pytest
 
 from orchestrator.errors import SpecError
 from orchestrator.evaluating import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
-from orchestrator.spec import Evaluation
+from orchestrator.spec_sections import Evaluation
 from shared_store.checkpoints import Checkpoint
 
 TRAINED: dict[str, Any] = {

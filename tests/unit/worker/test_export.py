@@ -183,7 +183,7 @@ def test_a_second_export_replaces_the_first_as_a_whole(tmp_path: Path) -> None:
     first = verify(exported(run, policy, point()))
     assert first["run"] == "run" and first["reward"] == 1.5 and first["versions"]["muster"]
     assert set(first["files"]) == {
-        *("README.md", "contract.json", "parity.npz", "policy.onnx", "policy.pt", "report.json"),
+        *("README.md", "contract.json", "leapp.yaml", "parity.npz", "policy.onnx", "policy.pt", "report.json"),
     }
     second = verify(exported(run, policy, point(), rounds=0))
     assert second["created"] > first["created"]

@@ -89,7 +89,8 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
     assert seen["front_right_thigh_position"] == pytest.approx(0.2, abs=1e-6)
     assert seen["front_left_hip_velocity"] == pytest.approx(0.2)
     assert seen["front_left_hip_previous_action"] == 1.0
-    terms = dict(zip(Quadruped.reward_terms, quadruped.state_dict()["episode_sums"][0, 2:].tolist(), strict=True))
+    names = [*quadruped.reward_terms, *quadruped.metric_names]
+    terms = dict(zip(names, quadruped.state_dict()["episode_sums"][0, 2:].tolist(), strict=True))
     expected = {
         "track_linear": 2.0 * math.exp(-4 * (0.2**2 + 0.1**2)),
         "track_angular": math.exp(-4 * 0.25**2),
@@ -105,6 +106,22 @@ def test_observation_and_reward_by_hand(quadruped: Quadruped) -> None:
     for name, value in expected.items():
         assert terms[name] == pytest.approx(value / 50, abs=1e-6), name
     assert quadruped.rewards[0].item() == pytest.approx(sum(expected.values()) / 50, abs=1e-6)
+    assert terms["metric_error_vel_xy"] == pytest.approx(math.hypot(1.0 - 0.8, 0.1), abs=1e-5)
+    assert terms["metric_error_vel_yaw"] == pytest.approx(0.5 - 0.25, abs=1e-6)
+
+
+def test_a_state_that_was_saved_before_there_were_metrics_is_continued_with_zeros_for_their_sums(
+    quadruped: Quadruped,
+) -> None:
+    quadruped.step(torch.ones(12, 12))
+    state = quadruped.state_dict()
+    rewards = 2 + len(quadruped.reward_terms)
+    quadruped.load_state_dict({**state, "episode_sums": state["episode_sums"][:, :rewards]})
+    sums = quadruped.state_dict()["episode_sums"]
+    assert torch.equal(sums[:, :rewards], state["episode_sums"][:, :rewards]) and (sums[:, rewards:] == 0).all()
+    with pytest.raises(ValueError, match=r"episode_sums is \(12, 11\) torch\.float32, expected \(12, 14\)"):
+        quadruped.load_state_dict({**state, "episode_sums": state["episode_sums"][:, :11]})
+    quadruped.load_state_dict(state)
 
 
 def test_a_trunk_on_the_ground_or_tilted_ends_the_episode(quadruped: Quadruped) -> None:
