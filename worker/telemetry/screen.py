@@ -1,0 +1,176 @@
+"""What the live view shows, as Rerun has it: shapes on links in 3-D, curves, the log. Nothing else of Muster imports Rerun.
+
+On the timeline ``time`` are wall-clock times; of a recording its own ones. ``iteration`` and ``step`` (control steps) are beside it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+os.environ.setdefault("RUST_LOG", "error")  # before the import: one line a mishap, and those are said by us
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+_UPRIGHT = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""Turns glTF's y-up into z-up: a quaternion xyzw."""
+_RECENT = 20.0
+"""Seconds of the curves of the watched worlds."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is seen of a few worlds that are alike.
+
+    Attributes:
+        links: Names of the links that poses are given for, in order.
+        shapes: Binary glTF by link; ``""``: what is fixed to a world, ``"ground"``: what no world has for itself.
+        places: Origins of the worlds [m], shape ``(worlds, 3)``.
+        terms: Names of the reward terms.
+    """
+
+    links: tuple[str, ...]
+    shapes: Mapping[str, bytes]
+    places: np.ndarray
+    terms: tuple[str, ...]
+
+
+class Screen:
+    """A stream to Rerun's server.
+
+    Args:
+        server: Its URL, or the path of an .rrd file.
+        title: What is shown, in a few words.
+        look: Of the worlds.
+        start: Joint frames with which the eye is placed, shape ``(worlds, links, 7)``.
+        live: Whether the newest state is followed; otherwise it is played from its beginning.
+    """
+
+    def __init__(self, server: str | Path, title: str, look: Look, start: np.ndarray, live: bool) -> None:
+        self._look = look
+        self._rr = rr.RecordingStream("muster")
+        self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
+        self._rr.send_recording_name(title)
+        self._stand()
+        center, position = _eye(self._placed(start[None])[0])
+        self._center = center
+        self._rr.send_blueprint(_blueprint(center, position, live), make_default=True)
+
+    def frames(
+        self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
+    ) -> None:
+        """Show control steps.
+
+        Args:
+            times: Of each [ns since 1970], shape ``(steps,)``.
+            steps: Their numbers.
+            poses: Position [m] and quaternion xyzw of the links in their worlds, shape ``(steps, worlds, links, 7)``.
+            rewards: Weighted reward terms, mean of the worlds; shape ``(steps, terms)``.
+            iteration: Of the training, where there is one.
+        """
+        if not len(times):
+            return
+        index = [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]")), rr.TimeColumn("step", sequence=steps)]
+        if iteration is not None:
+            index.append(rr.TimeColumn("iteration", sequence=np.full(len(times), iteration)))
+        placed, worlds = self._placed(poses), poses.shape[1]
+        for number, link in enumerate(self._look.links):
+            if link in self._look.shapes:
+                where = placed[:, :, number].reshape(-1, 7)
+                columns = rr.InstancePoses3D.columns(translations=where[:, :3], quaternions=where[:, 3:])
+                self._rr.send_columns(_entity(link), index, columns.partition([worlds] * len(times)))
+        for number, name in enumerate(self._look.terms):
+            self._rr.send_columns(f"terms/{name}", index, rr.Scalars.columns(scalars=rewards[:, number]))
+
+    def curve(self, name: str, values: Sequence[float], times: np.ndarray | None, iterations: Sequence[int]) -> None:
+        """Add points to a curve of returns, at times [ns], where they belong on that timeline, and at iterations, if any."""
+        index = [] if times is None else [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]"))]
+        if len(iterations):
+            index.append(rr.TimeColumn("iteration", sequence=np.asarray(iterations)))
+        if len(values) and index:
+            self._rr.send_columns(f"return/{name}", index, rr.Scalars.columns(scalars=np.asarray(values, np.float64)))
+
+    def say(self, lines: Iterable[tuple[int, str, str]]) -> None:
+        """Add lines of the log: time [ns since 1970], who says it, text."""
+        found = list(lines)
+        for source in sorted({each[1] for each in found}):
+            times = np.array([time for time, own, _ in found if own == source]).astype("datetime64[ns]")
+            texts = [text for _, own, text in found if own == source]
+            columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
+            self._rr.send_columns(f"log/{source}", [rr.TimeColumn("time", timestamp=times)], columns)
+
+    def flush(self, patience: float = 5.0) -> None:
+        """Have the server get all of it, if it takes it within so many seconds."""
+        try:
+            self._rr.flush(timeout_sec=patience)
+        except (RuntimeError, ValueError):
+            pass  # the server is gone, which whoever owns it says
+
+    def _stand(self) -> None:
+        """What does not move."""
+        self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for name, data in self._look.shapes.items():
+            shape = rr.Asset3D(contents=data, media_type="model/gltf-binary")
+            self._rr.log(_entity(name), shape, static=True)
+            if name == "ground":
+                self._rr.log(_entity(name), rr.Transform3D(quaternion=_UPRIGHT), static=True)
+            elif name == "":
+                turns = np.tile(_UPRIGHT, (len(self._look.places), 1))
+                self._rr.log(
+                    _entity(name), rr.InstancePoses3D(translations=self._look.places, quaternions=turns), static=True
+                )
+
+    def _placed(self, poses: np.ndarray) -> np.ndarray:
+        """Poses of the shapes, which are y-up, with the worlds beside each other."""
+        x, y, z, w = np.moveaxis(poses[..., 3:].astype(np.float64), -1, 0)
+        half = np.sqrt(0.5)  # times _UPRIGHT, from the right
+        turned = np.stack([half * (x + w), half * (y + z), half * (z - y), half * (w - x)], -1)
+        return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
+
+
+def _entity(link: str) -> str:
+    return f"worlds/{link.replace('/', '_') or 'fixed'}" if link != "ground" else "ground"
+
+
+def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the eye looks, and where it is, so that all worlds fit; ``placed``: shape ``(worlds, links, 7)``."""
+    low, high = placed[..., :3].min((0, 1)), placed[..., :3].max((0, 1))
+    center = (low + high) / 2
+    span = max(1.0, float(np.linalg.norm(high - low)))
+    return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
+
+
+def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blueprint:
+    recent: Any = rrb.VisibleTimeRange(
+        "time",
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
+    )
+    worlds = rrb.Spatial3DView(
+        name="Worlds",
+        contents=["/worlds/**", "/ground/**"],
+        background=rrb.Background(kind=rrb.BackgroundKind.GradientDark),
+        eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=center),
+    )
+    curves = rrb.Vertical(
+        rrb.TimeSeriesView(name="Return", contents="/return/**"),
+        rrb.TimeSeriesView(name="Reward terms", contents="/terms/**", time_ranges=recent),
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(worlds, curves, column_shares=[3, 2]),
+            rrb.TextLogView(name="Log", contents="/log/**"),
+            row_shares=[3, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="following" if live else "playing"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
