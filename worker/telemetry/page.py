@@ -74,7 +74,7 @@ class Page:
         self.server = f"rerun+http://{LOOPBACK}:{stream}/proxy"
         self.url = f"http://{LOOPBACK}:{self._http.server_port}"
         options = {"--bind": LOOPBACK, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
-        command = [str(program), "--serve-web", *(str(part) for pair in options.items() for part in pair)]
+        command = [str(program), "--serve-web", "--newest-first", *(str(part) for pair in options.items() for part in pair)]
         self._log = (self._home / "log").open("w+")
         self._process = subprocess.Popen(
             tied([*command, str(file)] if file else command, [signal.SIGINT]),
@@ -117,7 +117,7 @@ class Page:
         self.close()
 
     def _query(self) -> str:
-        return urlencode({"url": self.server, "hide_welcome_screen": "1", "persist": "0"})
+        return urlencode({"url": self.server, "hide_welcome_screen": "1", "persist": "0", "theme": "dark"})
 
     def _wait(self, *ports: int) -> None:
         until = time.monotonic() + _STARTED_WITHIN
@@ -160,7 +160,7 @@ def _quiet(home: Path) -> dict[str, str]:
     own.mkdir()
     places = {"config_file_path": str(own / "analytics.json"), "data_dir_path": str(own)}
     (own / "analytics.json").write_text(json.dumps({**settings, **places}))
-    return {**os.environ, "XDG_CONFIG_HOME": str(home), "TELEMETRY_ENABLED": "false", "RUST_LOG": "error"}
+    return {**os.environ, "XDG_CONFIG_HOME": str(home), "TELEMETRY_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 def _ending(code: int) -> str:

@@ -5,6 +5,7 @@ On the timeline ``time`` are wall-clock times; of a recording its own ones. ``it
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +14,18 @@ from typing import Any
 
 import numpy as np
 
-os.environ.setdefault("RUST_LOG", "error")  # before the import: one line a mishap, and those are said by us
+os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is said in one line, by who started it
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 _UPRIGHT = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """Turns glTF's y-up into z-up: a quaternion xyzw."""
+_COLORS = (
+    *((114, 183, 255), (255, 183, 77), (129, 230, 150), (255, 121, 121), (200, 150, 255)),
+    *((96, 214, 214), (255, 150, 205), (222, 222, 110), (176, 190, 197), (188, 143, 95)),
+)
+"""Of curves, on a dark ground."""
 _RECENT = 20.0
 """Seconds of the curves of the watched worlds."""
 
@@ -85,8 +91,10 @@ class Screen:
                 where = placed[:, :, number].reshape(-1, 7)
                 columns = rr.InstancePoses3D.columns(translations=where[:, :3], quaternions=where[:, 3:])
                 self._rr.send_columns(_entity(link), index, columns.partition([worlds] * len(times)))
-        for number, name in enumerate(self._look.terms):
-            self._rr.send_columns(f"terms/{name}", index, rr.Scalars.columns(scalars=rewards[:, number]))
+        if self._look.terms:
+            # one entity for all: each chunk that is sent costs the browser about the same, whatever is in it
+            columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
+            self._rr.send_columns("terms", index, columns.partition([len(self._look.terms)] * len(times)))
 
     def curve(self, name: str, values: Sequence[float], times: np.ndarray | None, iterations: Sequence[int]) -> None:
         """Add points to a curve of returns, at times [ns], where they belong on that timeline, and at iterations, if any."""
@@ -99,22 +107,22 @@ class Screen:
     def say(self, lines: Iterable[tuple[int, str, str]]) -> None:
         """Add lines of the log: time [ns since 1970], who says it, text."""
         found = list(lines)
-        for source in sorted({each[1] for each in found}):
-            times = np.array([time for time, own, _ in found if own == source]).astype("datetime64[ns]")
-            texts = [text for _, own, text in found if own == source]
-            columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
-            self._rr.send_columns(f"log/{source}", [rr.TimeColumn("time", timestamp=times)], columns)
+        if found:
+            times = np.array([time for time, _, _ in found]).astype("datetime64[ns]")
+            texts = [f"{str(time)[11:19]}  {who}  {text}" for time, (_, who, text) in zip(times, found, strict=True)]
+            self._rr.send_columns("log", [rr.TimeColumn("time", timestamp=times)], rr.TextLog.columns(text=texts))
 
-    def flush(self, patience: float = 5.0) -> None:
-        """Have the server get all of it, if it takes it within so many seconds."""
-        try:
-            self._rr.flush(timeout_sec=patience)
-        except (RuntimeError, ValueError):
-            pass  # the server is gone, which whoever owns it says
+    def close(self) -> None:
+        """Send what was not sent yet, where the server is still there."""
+        with contextlib.suppress(RuntimeError, ValueError):
+            self._rr.flush(timeout_sec=5.0)
+            self._rr.disconnect()
 
     def _stand(self) -> None:
         """What does not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        colors = [_COLORS[number % len(_COLORS)] for number in range(len(self._look.terms))]
+        self._rr.log("terms", rr.SeriesLines(names=list(self._look.terms), colors=colors), static=True)
         for name, data in self._look.shapes.items():
             shape = rr.Asset3D(contents=data, media_type="model/gltf-binary")
             self._rr.log(_entity(name), shape, static=True)
@@ -155,17 +163,24 @@ def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blue
     worlds = rrb.Spatial3DView(
         name="Worlds",
         contents=["/worlds/**", "/ground/**"],
-        background=rrb.Background(kind=rrb.BackgroundKind.GradientDark),
+        background=rrb.Background(color=(30, 34, 40)),
         eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=center),
     )
     curves = rrb.Vertical(
         rrb.TimeSeriesView(name="Return", contents="/return/**"),
-        rrb.TimeSeriesView(name="Reward terms", contents="/terms/**", time_ranges=recent),
+        rrb.TimeSeriesView(name="Reward terms", contents="/terms", time_ranges=recent),
+    )
+    # each line begins with its time and who said it: the view's own columns for these are too narrow to be read
+    log = rrb.TextLogView(
+        name="Log",
+        contents="/log",
+        columns=rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"]),
+        format_options=rrb.TextLogFormat(monospace_body=True),
     )
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(worlds, curves, column_shares=[3, 2]),
-            rrb.TextLogView(name="Log", contents="/log/**"),
+            log,
             row_shares=[3, 1],
         ),
         rrb.TimePanel(state="collapsed", timeline="time", play_state="following" if live else "playing"),

@@ -13,6 +13,7 @@ import time
 import webbrowser
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,7 +73,7 @@ class Training:
     def show(self, start: Shown) -> None:
         """Until the user ends it. Raises UserError where the viewer's server ends, or the training goes on elsewhere."""
         try:
-            with start() as page:
+            with start() as page, ExitStack() as closing:
                 screen: Screen | None = None
                 looked = 0.0
                 while not self._stop:
@@ -83,6 +84,7 @@ class Training:
                         poses = self._stage.pose(rows.coordinates[-1])[None]
                         if screen is None:
                             screen = self._open(page, rows, poses[0])
+                            closing.callback(screen.close)
                         now, steps = np.array([time.time_ns()]), np.array([rows.first + len(rows)])
                         screen.frames(now, steps, poses, rows.terms[-1:].mean(1), self._iteration)
                         self.frames += 1
@@ -167,13 +169,14 @@ class Policy:
         """Until each world has ended its episodes, or the user ends it."""
         rate = self._rollout.config.control_hz
         every = max(1, int(np.ceil(rate / HZ)))
-        with start() as page:
+        with start() as page, ExitStack() as closing:
             screen: Screen | None = None
             began, late = time.monotonic(), False
             for number, rows in enumerate(self._rollout.steps(sys.maxsize)):
                 if screen is None:
                     began = time.monotonic()
                     screen = self._open(page, rows)
+                    closing.callback(screen.close)
                 if number % every == 0:
                     page.check()
                     poses = self._stage.pose(rows.coordinates[-1])[None]
@@ -187,8 +190,6 @@ class Policy:
                     late = True
                     print("note: this machine simulates slower than real time", flush=True)
                 time.sleep(max(0.0, ahead))
-            if screen is not None:
-                screen.flush()
 
     def _open(self, page: Page, rows: Rows) -> Screen:
         from worker.telemetry.screen import Screen
@@ -226,12 +227,13 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int])
     from worker.telemetry.screen import Screen
 
     replay = Replay(path)
-    with start(None) as page:
+    with start(None) as page, ExitStack() as closing:
         screen: Screen | None = None
         for part in replay.parts():
             page.check()
             if screen is None:
                 screen = Screen(page.server, path.name, replay.look, part.poses[0], live=False)
+                closing.callback(screen.close)
             screen.frames(part.times, part.steps, part.poses, part.rewards)
             screen.say(part.said)
             screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
@@ -271,7 +273,7 @@ def _wait(page: Page, stop: list[int]) -> None:
 def _line(line: LogLine) -> tuple[int, str, str]:
     """Time [ns], who says it, text."""
     when = datetime.fromisoformat(line.time)
-    who = f"node_{line.node}" if line.rank is None else f"rank_{line.rank}"
+    who = f"node {line.node}" if line.rank is None else f"rank {line.rank}"
     return int(when.timestamp() * 1e6) * 1000, who, line.text
 
 
