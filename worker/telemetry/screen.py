@@ -19,6 +19,8 @@ os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is s
 import rerun as rr
 import rerun.blueprint as rrb
 
+_ROOT, _MIDDLE = "world", "middle"
+"""Frames: of all worlds, and of what the eye follows."""
 _UPRIGHT = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """Turns glTF's y-up into z-up: a quaternion xyzw."""
 _COLORS = (
@@ -59,14 +61,13 @@ class Screen:
     """
 
     def __init__(self, server: str | Path, title: str, look: Look, start: np.ndarray, live: bool) -> None:
-        self._look = look
+        self._look, self._follows = look, True
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
         self._stand()
         center, position = _eye(self._placed(start[None])[0])
-        self._center = center
-        self._rr.send_blueprint(_blueprint(center, position, live), make_default=True)
+        self._rr.send_blueprint(_blueprint(center, position, live, self._follows), make_default=True)
 
     def frames(
         self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
@@ -85,14 +86,25 @@ class Screen:
         index = [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]")), rr.TimeColumn("step", sequence=steps)]
         if iteration is not None:
             index.append(rr.TimeColumn("iteration", sequence=np.full(len(times), iteration)))
-        placed, worlds = self._placed(poses), poses.shape[1]
-        for number, link in enumerate(self._look.links):
-            if link in self._look.shapes:
-                where = placed[:, :, number].reshape(-1, 7)
-                columns = rr.InstancePoses3D.columns(translations=where[:, :3], quaternions=where[:, 3:])
-                self._rr.send_columns(_entity(link), index, columns.partition([worlds] * len(times)))
+        placed = self._placed(poses)
+        frames = [_frame(world, link) for world in range(poses.shape[1]) for link in self._look.links]
+        if self._follows:
+            middle = np.zeros((len(times), 1, 7))
+            middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
+            placed, frames = np.concatenate([placed.reshape(len(times), -1, 7), middle], 1), [*frames, _MIDDLE]
+        rows = placed.reshape(-1, 7)
+        columns = rr.Transform3D.columns(
+            translation=rows[:, :3],
+            quaternion=rows[:, 3:],
+            child_frame=frames * len(times),
+            parent_frame=[_ROOT] * len(rows),
+        )
+        every = [rr.TimeColumn("time", timestamp=np.repeat(times, len(frames)).astype("datetime64[ns]"))]
+        every.append(rr.TimeColumn("step", sequence=np.repeat(steps, len(frames))))
+        if iteration is not None:
+            every.append(rr.TimeColumn("iteration", sequence=np.full(len(rows), iteration)))
+        self._rr.send_columns("tf", every, columns)
         if self._look.terms:
-            # one entity for all: each chunk that is sent costs the browser about the same, whatever is in it
             columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
             self._rr.send_columns("terms", index, columns.partition([len(self._look.terms)] * len(times)))
 
@@ -121,18 +133,25 @@ class Screen:
     def _stand(self) -> None:
         """What does not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._rr.log("worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True)
         colors = [_COLORS[number % len(_COLORS)] for number in range(len(self._look.terms))]
         self._rr.log("terms", rr.SeriesLines(names=list(self._look.terms), colors=colors), static=True)
         for name, data in self._look.shapes.items():
             shape = rr.Asset3D(contents=data, media_type="model/gltf-binary")
-            self._rr.log(_entity(name), shape, static=True)
             if name == "ground":
-                self._rr.log(_entity(name), rr.Transform3D(quaternion=_UPRIGHT), static=True)
-            elif name == "":
-                turns = np.tile(_UPRIGHT, (len(self._look.places), 1))
-                self._rr.log(
-                    _entity(name), rr.InstancePoses3D(translations=self._look.places, quaternions=turns), static=True
-                )
+                self._rr.log("ground", shape, rr.CoordinateFrame("ground"), static=True)
+                self._fix("ground", np.zeros(3))
+                continue
+            for world, place in enumerate(self._look.places):
+                entity = f"worlds/world_{world}/{name.replace('/', '_') or 'fixed'}"
+                self._rr.log(entity, shape, rr.CoordinateFrame(_frame(world, name)), static=True)
+                if not name:
+                    self._fix(_frame(world, name), place)
+
+    def _fix(self, frame: str, place: np.ndarray) -> None:
+        """A frame of shapes that do not move."""
+        where = rr.Transform3D(translation=place, quaternion=_UPRIGHT, child_frame=frame, parent_frame=_ROOT)
+        self._rr.log(f"fixed/{frame}", where, static=True)
 
     def _placed(self, poses: np.ndarray) -> np.ndarray:
         """Poses of the shapes, which are y-up, with the worlds beside each other."""
@@ -142,8 +161,8 @@ class Screen:
         return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
 
 
-def _entity(link: str) -> str:
-    return f"worlds/{link.replace('/', '_') or 'fixed'}" if link != "ground" else "ground"
+def _frame(world: int, link: str) -> str:
+    return f"world_{world}/{link}" if link else f"world_{world}"
 
 
 def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +173,7 @@ def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
 
 
-def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blueprint:
+def _blueprint(center: np.ndarray, position: np.ndarray, live: bool, follows: bool) -> rrb.Blueprint:
     recent: Any = rrb.VisibleTimeRange(
         "time",
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
@@ -164,7 +183,11 @@ def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blue
         name="Worlds",
         contents=["/worlds/**", "/ground/**"],
         background=rrb.Background(color=(30, 34, 40)),
-        eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=center),
+        spatial_information=rrb.SpatialInformation(_ROOT, show_axes=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=position, look_target=center, eye_up=(0, 0, 1),
+            tracking_entity="/worlds/middle" if follows else None,
+        ),
     )
     curves = rrb.Vertical(
         rrb.TimeSeriesView(name="Return", contents="/return/**"),

@@ -157,8 +157,11 @@ class Policy:
     def __init__(
         self, run: Run, checkpoint: int | str | None, worlds: int, episodes: int | None, stop: list[int]
     ) -> None:
+        import torch
+
         from worker.telemetry.rollout import Rollout
 
+        torch.set_num_threads(1)  # a few worlds: more threads would wait for each other
         self._rollout = Rollout.of(run, checkpoint, worlds, device="cpu")
         self._stage, self._episodes, self._stop = self._rollout.stage(), episodes, stop
         self._sums = np.zeros((worlds, 2))
