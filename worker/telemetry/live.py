@@ -27,6 +27,7 @@ from worker.telemetry.segment import Segment
 if TYPE_CHECKING:
     from worker.telemetry.stage import Stage
 
+
 def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patience: float = PATIENCE) -> Recording:
     """Record a running training until each world has ended so many episodes, the training ends, or SIGINT comes.
 

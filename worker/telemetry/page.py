@@ -74,7 +74,12 @@ class Page:
         self.server = f"rerun+http://{LOOPBACK}:{stream}/proxy"
         self.url = f"http://{LOOPBACK}:{self._http.server_port}"
         options = {"--bind": LOOPBACK, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
-        command = [str(program), "--serve-web", "--newest-first", *(str(part) for pair in options.items() for part in pair)]
+        command = [
+            str(program),
+            "--serve-web",
+            "--newest-first",
+            *(str(part) for pair in options.items() for part in pair),
+        ]
         self._log = (self._home / "log").open("w+")
         self._process = subprocess.Popen(
             tied([*command, str(file)] if file else command, [signal.SIGINT]),

@@ -133,7 +133,9 @@ class Replay:
         except (McapError, EOFError, ValueError, KeyError, struct.error):
             pass  # here it was cut
         if not begun:
-            raise UserError(f"{self.path}: it does not begin as an MCAP file does; give an .mcap, .mcap{PARTIAL} or .rrd file")
+            raise UserError(
+                f"{self.path}: it does not begin as an MCAP file does; give an .mcap, .mcap{PARTIAL} or .rrd file"
+            )
 
 
 @dataclass

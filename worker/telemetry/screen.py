@@ -28,6 +28,8 @@ _COLORS = (
     *((96, 214, 214), (255, 150, 205), (222, 222, 110), (176, 190, 197), (188, 143, 95)),
 )
 """Of curves, on a dark ground."""
+_TERMS = 5
+"""Control steps whose reward terms are sent together."""
 _RECENT = 20.0
 """Seconds of the curves of the watched worlds."""
 
@@ -61,13 +63,15 @@ class Screen:
     """
 
     def __init__(self, server: str | Path, title: str, look: Look, start: np.ndarray, live: bool) -> None:
-        self._look, self._follows = look, True
+        self._look = look
+        self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
+        """What :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
         self._stand()
         center, position = _eye(self._placed(start[None])[0])
-        self._rr.send_blueprint(_blueprint(center, position, live, self._follows), make_default=True)
+        self._rr.send_blueprint(_blueprint(center, position, live), make_default=True)
 
     def frames(
         self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
@@ -83,30 +87,33 @@ class Screen:
         """
         if not len(times):
             return
-        index = [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]")), rr.TimeColumn("step", sequence=steps)]
-        if iteration is not None:
-            index.append(rr.TimeColumn("iteration", sequence=np.full(len(times), iteration)))
         placed = self._placed(poses)
         frames = [_frame(world, link) for world in range(poses.shape[1]) for link in self._look.links]
-        if self._follows:
-            middle = np.zeros((len(times), 1, 7))
-            middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
-            placed, frames = np.concatenate([placed.reshape(len(times), -1, 7), middle], 1), [*frames, _MIDDLE]
-        rows = placed.reshape(-1, 7)
+        middle = np.zeros((len(times), 1, 7))
+        middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
+        frames.append(_MIDDLE)
+        rows = np.concatenate([placed.reshape(len(times), -1, 7), middle], 1).reshape(-1, 7)
         columns = rr.Transform3D.columns(
             translation=rows[:, :3],
             quaternion=rows[:, 3:],
             child_frame=frames * len(times),
             parent_frame=[_ROOT] * len(rows),
         )
-        every = [rr.TimeColumn("time", timestamp=np.repeat(times, len(frames)).astype("datetime64[ns]"))]
-        every.append(rr.TimeColumn("step", sequence=np.repeat(steps, len(frames))))
-        if iteration is not None:
-            every.append(rr.TimeColumn("iteration", sequence=np.full(len(rows), iteration)))
-        self._rr.send_columns("tf", every, columns)
-        if self._look.terms:
-            columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
-            self._rr.send_columns("terms", index, columns.partition([len(self._look.terms)] * len(times)))
+        self._rr.send_columns("tf", _index(times, steps, iteration, len(frames)), columns)
+        self._terms.append((times, steps, rewards, iteration))
+        if sum(len(each[0]) for each in self._terms) >= _TERMS:
+            self._send_terms()
+
+    def _send_terms(self) -> None:
+        """Several steps at once: each chunk that is sent costs the browser about the same, whatever is in it."""
+        pending, self._terms = self._terms, []
+        if not self._look.terms or not pending:
+            return
+        times, steps, rewards = (np.concatenate([each[part] for each in pending]) for part in range(3))
+        columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
+        self._rr.send_columns(
+            "terms", _index(times, steps, pending[-1][3]), columns.partition([len(self._look.terms)] * len(times))
+        )
 
     def curve(self, name: str, values: Sequence[float], times: np.ndarray | None, iterations: Sequence[int]) -> None:
         """Add points to a curve of returns, at times [ns], where they belong on that timeline, and at iterations, if any."""
@@ -127,13 +134,16 @@ class Screen:
     def close(self) -> None:
         """Send what was not sent yet, where the server is still there."""
         with contextlib.suppress(RuntimeError, ValueError):
+            self._send_terms()
             self._rr.flush(timeout_sec=5.0)
             self._rr.disconnect()
 
     def _stand(self) -> None:
         """What does not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._rr.log("worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True)
+        self._rr.log(
+            "worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True
+        )
         colors = [_COLORS[number % len(_COLORS)] for number in range(len(self._look.terms))]
         self._rr.log("terms", rr.SeriesLines(names=list(self._look.terms), colors=colors), static=True)
         for name, data in self._look.shapes.items():
@@ -161,6 +171,15 @@ class Screen:
         return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
 
 
+def _index(times: np.ndarray, steps: np.ndarray, iteration: int | None, rows: int = 1) -> list[rr.TimeColumn]:
+    """The place of control steps on the timelines, with so many rows of each."""
+    index = [rr.TimeColumn("time", timestamp=np.repeat(times, rows).astype("datetime64[ns]"))]
+    index.append(rr.TimeColumn("step", sequence=np.repeat(steps, rows)))
+    if iteration is not None:
+        index.append(rr.TimeColumn("iteration", sequence=np.full(len(times) * rows, iteration)))
+    return index
+
+
 def _frame(world: int, link: str) -> str:
     return f"world_{world}/{link}" if link else f"world_{world}"
 
@@ -173,7 +192,7 @@ def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
 
 
-def _blueprint(center: np.ndarray, position: np.ndarray, live: bool, follows: bool) -> rrb.Blueprint:
+def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blueprint:
     recent: Any = rrb.VisibleTimeRange(
         "time",
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
@@ -185,8 +204,11 @@ def _blueprint(center: np.ndarray, position: np.ndarray, live: bool, follows: bo
         background=rrb.Background(color=(30, 34, 40)),
         spatial_information=rrb.SpatialInformation(_ROOT, show_axes=False),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=position, look_target=center, eye_up=(0, 0, 1),
-            tracking_entity="/worlds/middle" if follows else None,
+            kind=rrb.Eye3DKind.Orbital,
+            position=position,
+            look_target=center,
+            eye_up=(0, 0, 1),
+            tracking_entity="/worlds/middle",
         ),
     )
     curves = rrb.Vertical(

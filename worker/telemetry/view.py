@@ -105,7 +105,9 @@ class Training:
         over = self._segment.closed or self._asking.is_answered_by_nobody
         rows = self._segment.newest()
         if over and rows is None:
-            self._say(screen, "the training stopped; the view goes on with its next attempt on this machine; Ctrl-C ends it")
+            self._say(
+                screen, "the training stopped; the view goes on with its next attempt on this machine; Ctrl-C ends it"
+            )
             self._segment = None
             self._asking.ask()
         if rows is None:
@@ -199,7 +201,9 @@ class Policy:
 
         checkpoint, run = self._rollout.checkpoint, self._rollout.run
         title = f"policy {run.name} {checkpoint.name}"
-        screen = Screen(page.server, title, look_of(self._stage, rows), self._stage.pose(rows.coordinates[-1]), live=True)
+        screen = Screen(
+            page.server, title, look_of(self._stage, rows), self._stage.pose(rows.coordinates[-1]), live=True
+        )
         text = f"checkpoint {checkpoint.name} of run {run.name}: {self._stage.worlds} worlds, seed {self._rollout.seed}"
         screen.say([(time.time_ns(), "muster", text)])
         known = [each for each in history_of(run).after() if each.get("reward") is not None]
@@ -244,7 +248,9 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int])
                 return
         if replay.cut:
             print(f"note: {path.name} was cut short; it is shown up to control step {replay.count}", flush=True)
-        print(f"shown: {replay.count} control steps of {len(replay.look.places)} worlds; Ctrl-C ends the view", flush=True)
+        print(
+            f"shown: {replay.count} control steps of {len(replay.look.places)} worlds; Ctrl-C ends the view", flush=True
+        )
         _wait(page, stop)
 
 
