@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import urllib.request
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ class Browser:
         listening = next(line for line in self._process.stderr if "DevTools listening" in line)
         with urllib.request.urlopen(f"http://{listening.split('ws://')[1].split('/')[0]}/json") as pages:
             own = next(each for each in json.load(pages) if each["type"] == "page")
-        self._socket = connect(own["webSocketDebuggerUrl"], max_size=1 << 28)
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(connect(own["webSocketDebuggerUrl"], max_size=1 << 28))
         self._sent = 0
         self.asked: set[str] = set()
         """All that the page asked for."""
@@ -49,7 +51,7 @@ class Browser:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def close(self) -> None:
-        self._socket.close()
+        self._open.close()
         self._process.terminate()
         self._process.wait()
 
