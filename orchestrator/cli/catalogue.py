@@ -66,6 +66,7 @@ ENTRIES = (
     Entry(
         "render", "recordings", _RUNS, "Film what a checkpoint's policy does, or show six moments of it in a picture."
     ),
+    Entry("view", "viewing", _RUNS, "See a training as it runs, a checkpoint's policy or a recording in a browser."),
     Entry(
         "verify-resume",
         "verify",

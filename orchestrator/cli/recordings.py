@@ -62,18 +62,20 @@ def record(
     if recover is not None:
         if source is not None or output is not None:
             raise UsageError("--recover: give the cut file alone; the recovered one lies beside it")
-        raise typer.Exit(_worker("worker.telemetry.live", "--recover", str(recover)))
+        raise typer.Exit(run_worker("worker.telemetry.live", "--recover", str(recover)))
     if source is None or output is None:
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
     _check_output(output, ".mcap")
     with controller(store, cpus) as connect:
         client = connect()
-        run, live = _find(client, source)
+        run, live = source_of(client, source)
         if live is not None:
             options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
             given = [text for pair in options.items() for text in pair]
-            raise typer.Exit(_worker("worker.telemetry.live", run["path"], "--job", live, *given))
-        section = Record(run=run["run"], checkpoint=_iteration(client, run, source), worlds=worlds, episodes=episodes)
+            raise typer.Exit(run_worker("worker.telemetry.live", run["path"], "--job", live, *given))
+        section = Record(
+            run=run["run"], checkpoint=checkpoint_of(client, run, source), worlds=worlds, episodes=episodes
+        )
         _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
 
 
@@ -98,8 +100,8 @@ def render(
         raise UsageError(f"--size {size}: expected WIDTHxHEIGHT, such as 640x360")
     with controller(store, cpus) as connect:
         client = connect()
-        run, _ = _find(client, source)
-        values: dict[str, Any] = {"run": run["run"], "checkpoint": _iteration(client, run, source), "worlds": worlds}
+        run, _ = source_of(client, source)
+        values: dict[str, Any] = {"run": run["run"], "checkpoint": checkpoint_of(client, run, source), "worlds": worlds}
         values |= {"seconds": seconds, "width": int(found[1]), "height": int(found[2])}
         try:
             section = Render.model_validate({**values, "format": output.suffix[1:]})
@@ -121,7 +123,7 @@ def _check_output(path: Path, *endings: str) -> None:
         raise UsageError(f"-o {path}: {above} can't be written to; choose another directory")
 
 
-def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
+def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
     """The run that is meant, and the job where one that is training now is meant. Raises ApiError, UsageError."""
     name = split_reference(source)[0]
     try:
@@ -141,7 +143,7 @@ def _find(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
     return run, None
 
 
-def _iteration(client: Client, run: dict[str, Any], source: str) -> int:
+def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
     """The iteration of the checkpoint that is meant. Raises UsageError where there is none."""
     iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
     return iteration
@@ -185,7 +187,7 @@ def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> Non
     echo(f"written: {output}")
 
 
-def _worker(module: str, *arguments: str) -> int:
+def run_worker(module: str, *arguments: str) -> int:
     """Run a part of the worker on this machine, since this package never imports it; returns its exit code. Raises ServerError."""
     if find_spec("newton") is None:
         raise ServerError("this needs the simulation on this machine: pip install 'muster[worker]'")

@@ -1,4 +1,4 @@
-"""The training's side of a live recording: a thread that sees a request, and brings the tap's rows to the one who asked.
+"""The training's side of a live recording or view: a thread that sees a request, and brings the tap's rows to the one who asked.
 
 A reader puts ``telemetry/request.json`` into the run's directory and finds the answer in ``telemetry/tap.json``. Both are on one
 machine: the rows go through its memory. Until somebody asks nothing is tapped; from then on the tap fills its ring to the end of the
@@ -28,6 +28,8 @@ LOOK_SECONDS = 1.0
 """Between two looks for a request."""
 DRAIN_SECONDS = 0.02
 """Between two looks at the tap, while somebody reads."""
+NEWEST_SECONDS = 0.05
+"""The same, for a reader to whom the newest control step is enough: a screen."""
 
 
 def request_of(run: Run) -> Path:
@@ -69,6 +71,8 @@ class Attending:
         """Worlds that a request asks for and the tap does not have yet."""
         self._segment: Segment | None = None
         self._reader: tuple[object, object] = ("", 0)
+        self._newest = False
+        """Whether the reader wants the newest control step alone."""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
         self._thread.start()
@@ -90,7 +94,7 @@ class Attending:
     def _work(self) -> None:
         reading: Reading | None = None
         waited = 0.0
-        while not self._over.wait(DRAIN_SECONDS if self._segment else LOOK_SECONDS):
+        while not self._over.wait(pause := self._pause()):
             # a volume that is away for a while, memory that is short: training goes on, and the reader says what it misses
             with contextlib.suppress(OSError, ValueError):
                 if self._segment is None:
@@ -98,18 +102,24 @@ class Attending:
                     continue
                 assert reading is not None
                 self._gate.wait()
-                rows = reading.take()
+                rows = reading.take(1 if self._newest else None)
                 if len(rows):
                     self._segment.append(rows)
-                waited += DRAIN_SECONDS
+                waited += pause
                 if waited >= LOOK_SECONDS:
                     waited = 0.0
                     if not is_alive(*self._reader):
                         self._leave()
         with contextlib.suppress(OSError, ValueError):
             if self._segment is not None and reading is not None:
-                self._segment.append(reading.take())
+                self._segment.append(reading.take(1 if self._newest else None))
                 self._leave()
+
+    def _pause(self) -> float:
+        """Seconds until the next look."""
+        if self._segment is None:
+            return LOOK_SECONDS
+        return NEWEST_SECONDS if self._newest else DRAIN_SECONDS
 
     def _answer(self) -> Reading | None:
         """Answer a request once the tap has as many worlds as it asks for."""
@@ -131,6 +141,7 @@ class Attending:
         reading.next = int(self._tap.count)
         segment = Segment.create(self._tap.layout)
         self._segment, self._reader = segment, (request["host"], request["process"])
+        self._newest = request.get("newest") is True
         self._say(path=str(segment.path), layout=self._tap.layout.to_json())
         return reading
 

@@ -6,29 +6,26 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
-import socket
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from shared_store.files import DamagedFile, read_json, write_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
 from shared_store.metrics import history_of
 from worker.errors import UserError
-from worker.telemetry.attending import answer_of, is_alive, request_of
+from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.recording import Recording, recover
 from worker.telemetry.rows import Layout, Rows
 from worker.telemetry.segment import Segment
 
-PATIENCE = 180.0
-"""Seconds in which a training answers: it does between two iterations."""
+if TYPE_CHECKING:
+    from worker.telemetry.stage import Stage
 
 
 def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patience: float = PATIENCE) -> Recording:
@@ -47,7 +44,13 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
     """
     stop: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: stop.append(number))
-    segment, there = _attach(run, worlds, patience, stop)
+    asking = Asking(run, worlds, f"record its newest checkpoint: muster record {run.name} -o FILE.mcap")
+    try:
+        segment = asking.attach(patience, stop)
+    except UserError:
+        signal.signal(signal.SIGINT, before)
+        raise
+    there = asking.worlds
     try:
         recording = _open(run, there, output, {"job": job})
         if there < worlds:
@@ -56,7 +59,7 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         for _ in log.drain():
             pass  # what was said before the recording began
         segment.skip()
-        for rows in _rows(segment, there, stop):
+        for rows in _rows(segment, asking, stop):
             recording.write(rows)
             for line in log.poll():
                 recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
@@ -66,53 +69,15 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         return recording
     finally:
         signal.signal(signal.SIGINT, before)
-        request_of(run).unlink(missing_ok=True)  # the training sees that nobody reads any more
+        asking.withdraw()
 
 
-def _attach(run: Run, worlds: int, patience: float, stop: list[int]) -> tuple[Segment, int]:
-    """Ask for the tap; returns it, and how many worlds are to be read. Raises UserError."""
-    request, answer = request_of(run), answer_of(run)
-    try:
-        earlier = read_json(request)
-        if earlier and is_alive(earlier.get("host"), earlier.get("process")):
-            raise UserError(
-                f"run {run.name} is being recorded already, by process {earlier['process']}; wait for its end"
-            )
-        answer.unlink(missing_ok=True)
-        write_json(request, {"host": socket.gethostname(), "process": os.getpid(), "worlds": worlds}, 0o600)
-        until = time.monotonic() + patience
-        while (told := read_json(answer)) is None:
-            if time.monotonic() > until:
-                raise UserError(
-                    f"run {run.name}: its training did not answer within {patience:.0f} s: it does not run on this machine, or not any "
-                    f"more; record its newest checkpoint: muster record {run.name} -o FILE.mcap"
-                )
-            if stop:
-                raise UserError(f"run {run.name}: interrupted before its training answered; nothing was recorded")
-            time.sleep(0.1)
-        if "problem" in told:
-            answer.unlink(missing_ok=True)
-            raise UserError(
-                f"run {run.name}: {told['problem']}; record it there, or its newest checkpoint: muster record {run.name} -o FILE.mcap"
-            )
-        layout = Layout.from_json(told["layout"])
-        segment = Segment.open(Path(told["path"]), layout)
-        segment.path.unlink(missing_ok=True)  # it lives as long as both map it, and no crash leaves it behind
-        return segment, min(worlds, layout.worlds)
-    except (OSError, DamagedFile, ValueError, KeyError, TypeError) as error:
-        request.unlink(missing_ok=True)
-        raise UserError(f"run {run.name}: its tap can't be read ({error})") from error
-    except UserError:
-        if not (earlier and is_alive(earlier.get("host"), earlier.get("process"))):
-            request.unlink(missing_ok=True)
-        raise
-
-
-def _rows(segment: Segment, worlds: int, stop: list[int]) -> Iterator[Rows]:
-    """The rows of the first ``worlds`` worlds as they come, numbered from 0."""
+def _rows(segment: Segment, asking: Asking, stop: list[int]) -> Iterator[Rows]:
+    """The rows of the first worlds as they come, numbered from 0, until the training ends or is killed."""
     first: int | None = None
+    worlds = asking.worlds
     while not stop:
-        over = segment.closed
+        over = segment.closed or asking.is_answered_by_nobody
         for rows in segment.take():
             first = rows.first if first is None else first
             layout = Layout(**{**vars(segment.layout), "worlds": worlds})
@@ -125,11 +90,23 @@ def _rows(segment: Segment, worlds: int, stop: list[int]) -> Iterator[Rows]:
 
 def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recording:
     """The recording, with what the run's description says of its training."""
+    from worker.telemetry.rollout import as_json, facts_of, job_attachment
+
+    stage, train = stage_of(run, worlds)
+    told = history_of(run).last() or {}
+    known = {**known, "iteration": str(told.get("iteration", 0)), "seed": str(train.get("seed", ""))}
+    facts = facts_of(run, {"task": train["task"], "algorithm": train.get("algorithm", "ppo")})
+    contract = read_json(run.contract)
+    attached = {"contract.json": as_json(contract)} if contract else {}
+    return Recording(output, stage, {**facts, **known}, {**attached, **job_attachment(run)})
+
+
+def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
+    """What the worlds of a run's training look like, and the ``train`` section of its job. Raises UserError."""
     import warp
 
     from worker.learning.job import configure, user_errors
     from worker.tasks import find_task
-    from worker.telemetry.rollout import as_json, facts_of, job_attachment
     from worker.telemetry.stage import Stage
 
     warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
@@ -139,13 +116,7 @@ def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recordi
         raise UserError(f"run {run.name}: its description names no task")
     with user_errors():
         task_type = find_task(train["task"])
-        stage = Stage(task_type, configure(task_type, train), worlds)
-    told = history_of(run).last() or {}
-    known = {**known, "iteration": str(told.get("iteration", 0)), "seed": str(train.get("seed", ""))}
-    facts = facts_of(run, {"task": train["task"], "algorithm": train.get("algorithm", "ppo")})
-    contract = read_json(run.contract)
-    attached = {"contract.json": as_json(contract)} if contract else {}
-    return Recording(output, stage, {**facts, **known}, {**attached, **job_attachment(run)})
+        return Stage(task_type, configure(task_type, train), worlds), train
 
 
 def main() -> int:

@@ -23,8 +23,6 @@ from worker.telemetry.rows import Rows
 if TYPE_CHECKING:
     from worker.telemetry.stage import Stage
 
-APART = 3.0
-"""Between the origins of two recorded worlds, along y [m]; a viewer shows them side by side."""
 _CHUNK = 256 << 10
 """Bytes after which a chunk is closed and compressed."""
 _FLUSH_SECONDS = 1.0
@@ -156,8 +154,8 @@ class Recording:
         worlds, now = self._stage.worlds, self._began
         names = [f"world_{world}" for world in range(worlds)]
         places = [
-            ("world", name, [0.0, APART * (world - (worlds - 1) / 2), 0.0, 0.0, 0.0, 0.0, 1.0])
-            for world, name in enumerate(names)
+            ("world", name, [*place, 0.0, 0.0, 0.0, 1.0])
+            for name, place in zip(names, self._stage.places().tolist(), strict=True)
         ]
         self._add("/tf_static", "tf2_msgs/msg/TFMessage", now, messages.transforms(now, places))
         name, text = self._stage.robot_file or ("", "")

@@ -50,7 +50,9 @@ class Rollout:
     seed: int
 
     @classmethod
-    def of(cls, run: Run, wanted: int | str | None, worlds: int, seed: int | None = None) -> Rollout:
+    def of(
+        cls, run: Run, wanted: int | str | None, worlds: int, seed: int | None = None, device: str | None = None
+    ) -> Rollout:
         """Build the worlds and read the policy.
 
         Args:
@@ -58,6 +60,7 @@ class Rollout:
             wanted: Iteration or name of the checkpoint; None: the newest.
             worlds: How many.
             seed: Of the worlds; by default one that is not that of the training.
+            device: ``"cpu"`` or ``"cuda:<n>"``; None: a GPU where there is one.
 
         Raises:
             UserError: There is no such checkpoint, or it does not fit the task as it is now.
@@ -70,7 +73,7 @@ class Rollout:
         seed = held_out_seed(facts["train"].get("seed", 0)) if seed is None else seed
         seed_generators(seed)
         warp.config.log_level = warp.LOG_WARNING
-        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+        device = device or ("cuda:0" if torch.cuda.is_available() else "cpu")
         with user_errors():
             task = task_type(config, worlds, seed=seed, device=device)
         begin_as_trained(task, checkpoint)

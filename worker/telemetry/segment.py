@@ -118,6 +118,14 @@ class Segment:
             self._step = step + end - start
             yield Rows(self.layout, step, values[start:end], marks[start:end], lost)
 
+    def newest(self) -> Rows | None:
+        """The newest control step; None where there is none since the last call. What it passes over counts as lost."""
+        self._next = max(self._next, int(self._header[_WRITTEN]) - 1)
+        newest = None
+        for rows in self.take():
+            newest = rows
+        return newest
+
     @property
     def closed(self) -> bool:
         """Whether no more rows will come."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from worker.tasks.config import TaskConfig
     from worker.tasks.task import Task
 
+APART = 3.0
+"""Between the origins of two worlds, along y [m]; a viewer shows them side by side."""
 _GROUND = (0.6, 0.62, 0.6)
 """Its colour."""
 
@@ -76,6 +78,13 @@ class Stage:
             self.model = scene.finalize(device=device)
         self.state = self.model.state()
         self.robot_file = _robot_file(sketch, config)
+        self._apart = 0.0 if isinstance(stands_on, Terrain) else APART
+
+    def places(self) -> np.ndarray:
+        """Where the worlds are shown [m], shape ``(worlds, 3)``: beside each other along y; on a terrain where they are."""
+        places = np.zeros((self.worlds, 3))
+        places[:, 1] = self._apart * (np.arange(self.worlds) - (self.worlds - 1) / 2)
+        return places
 
     def pose(self, coordinates: np.ndarray) -> np.ndarray:
         """Put the worlds where joint coordinates say.

@@ -139,12 +139,13 @@ class Reading:
         self.next = 0
         """Number of the step that is read next."""
 
-    def take(self) -> Rows:
-        """The steps since the last call, as copies. Those that the device overwrote meanwhile are left out and counted as lost."""
+    def take(self, most: int | None = None) -> Rows:
+        """The steps since the last call, the newest ``most`` of them, as copies. Those that are left out count as lost, as do those that
+        the device overwrote meanwhile."""
         size, started = self._tap.layout.rows, self.next
         self._on_stream(lambda: self._counts[0:1].copy_(self._tap.count, non_blocking=True))
         there = int(self._counts[0])
-        first = max(started, there - size + 1)
+        first = max(started, there - size + 1, there - (most or size))
         self._on_stream(lambda: self._copy(first, there))
         # of what was copied, the device may have written over the oldest rows, and be at work on one more
         first = min(there, max(first, int(self._counts[1]) - size + 1))

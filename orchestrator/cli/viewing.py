@@ -1,0 +1,98 @@
+"""``muster view``: see a training as it runs, a checkpoint's policy or a recording in a browser."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orchestrator.cli.recordings import checkpoint_of, run_worker, source_of
+from orchestrator.cli.serving import CpusOption, StoreOption, controller
+from orchestrator.errors import ServerError, UsageError
+
+_FILES = (".mcap", ".partial", ".rrd")
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        epilog="Examples:  muster view cartpole   muster view ant-1f2e3d4c@best --worlds 2   muster view ant.mcap --port 9100"
+    )(view)
+
+
+def view(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="JOB | RUN[@ITERATION|@best] | FILE",
+            help="A training that runs on this machine; a checkpoint's policy; a recording (.mcap, .mcap.partial, .rrd).",
+        ),
+    ],
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds, of a JOB or a RUN.")] = 4,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Of a RUN: end when each world has ended so many.", show_default=False)
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=65535, help="Of the page; by default 9090, or a free one where it is taken.", show_default=False
+        ),
+    ] = None,
+    browser: Annotated[
+        bool | None,
+        typer.Option(
+            "--browser/--no-browser",
+            help="Open the page; by default where there is a terminal and a display.",
+            show_default=False,
+        ),
+    ] = None,
+    memory: Annotated[
+        str, typer.Option(help="What is kept for a page that is opened later; then the oldest goes: 256MB, 1GB.")
+    ] = "256MB",
+    store: StoreOption = None,
+    cpus: CpusOption = None,
+) -> None:
+    """See a training as it runs, a checkpoint's policy or a recording in a browser.
+
+    The page has the worlds in 3-D, the curve of the return, the reward terms and the log. It is Rerun's web viewer, on this machine's
+    loopback, and needs no internet: pip install 'muster\\[viz]'.
+    """
+    if not re.fullmatch(r"[1-9][0-9]{0,5}(MB|GB)", memory):
+        raise UsageError(f"--memory {memory}: expected a number with MB or GB, such as 256MB")
+    given = ["--worlds", str(worlds), "--memory", memory]
+    given += ["--port", str(port)] if port is not None else []
+    given += ["--browser"] if (_has_display() if browser is None else browser) else []
+    if source.endswith(_FILES) or os.sep in source:
+        path = Path(source).absolute()
+        if not path.is_file():
+            raise UsageError(f"{source}: there is no such file")
+        if path.suffix not in _FILES:
+            raise UsageError(f"{source}: give a recording, which ends on .mcap, .mcap.partial or .rrd")
+        if episodes is not None:
+            raise UsageError("--episodes: it is for the policy of a RUN; a recording is shown whole")
+        raise typer.Exit(run_worker("worker.telemetry.view", "--file", str(path), *given))
+    with controller(store, cpus) as connect:
+        client = connect()
+        run, live = source_of(client, source)
+        if not Path(run["path"]).is_dir():
+            raise ServerError(
+                f"run {run['run']} lies at {run['path']}, which can't be seen from this machine; call muster view where the store is"
+            )
+        if live is not None:
+            if episodes is not None:
+                raise UsageError(
+                    f"--episodes: {source} is training; to see its newest policy: muster view {run['run']}"
+                )
+            raise typer.Exit(run_worker("worker.telemetry.view", "--training", run["path"], "--job", live, *given))
+        given += ["--checkpoint", str(checkpoint_of(client, run, source))]
+        given += ["--episodes", str(episodes)] if episodes is not None else []
+        raise typer.Exit(run_worker("worker.telemetry.view", "--policy", run["path"], *given))
+
+
+def _has_display() -> bool:
+    """Whether a browser that is opened would be seen by somebody."""
+    has = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
+    return bool(has) and sys.stdout.isatty() and not os.environ.get("SSH_CONNECTION")

@@ -1,0 +1,67 @@
+"""Chromium without a display, driven by its DevTools protocol: what a page asks for, and how it looks."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+import urllib.request
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.sync.client import connect
+
+_OPTIONS = (
+    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist --no-first-run "
+    "--remote-debugging-port=0 --disable-background-networking --window-size=640,400"
+)
+
+
+class Browser:
+    """A page in a browser of its own; skips the test where Chromium is not installed."""
+
+    def __init__(self, url: str, home: Path) -> None:
+        program = shutil.which("chromium")
+        if program is None:
+            pytest.skip("Chromium is not installed (apt-get install chromium): the page has not been looked at")
+        command = [program, *_OPTIONS.split(), f"--user-data-dir={home}", "about:blank"]
+        self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        assert self._process.stderr is not None
+        listening = next(line for line in self._process.stderr if "DevTools listening" in line)
+        with urllib.request.urlopen(f"http://{listening.split('ws://')[1].split('/')[0]}/json") as pages:
+            own = next(each for each in json.load(pages) if each["type"] == "page")
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(connect(own["webSocketDebuggerUrl"], max_size=1 << 28))
+        self._sent = 0
+        self.asked: set[str] = set()
+        """All that the page asked for."""
+        for domain in ("Network", "Page"):
+            self._call(f"{domain}.enable")
+        self._call("Page.navigate", url=url)
+
+    def picture(self) -> np.ndarray:
+        """What is seen, shape ``(height, width, 3)``, uint8."""
+        data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def close(self) -> None:
+        self._open.close()
+        self._process.terminate()
+        self._process.wait()
+
+    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._sent += 1
+        self._socket.send(json.dumps({"id": self._sent, "method": method, "params": parameters}))
+        while True:
+            got = json.loads(self._socket.recv(timeout=120))
+            if got.get("method") == "Network.requestWillBeSent":
+                self.asked.add(got["params"]["request"]["url"])
+            if got.get("id") == self._sent:
+                result: dict[str, Any] = got["result"]
+                return result

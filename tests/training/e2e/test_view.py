@@ -1,0 +1,238 @@
+"""The live view through the command: a training as it runs, which is killed meanwhile, and its policy afterwards; in a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from shared_store.checkpoints import list_checkpoints
+from shared_store.files import read_json
+from shared_store.layout import Run, Store
+from tests.conftest import MUSTER, Serving, wait_for
+from tests.support.browser import Browser
+
+SMALL = {
+    "nodes": 1,
+    "train.worlds": 8,
+    "train.iterations": 1000000,
+    "train.config": {"episode_seconds": 0.5},
+    "checkpoint.every": 10,
+    "retry.attempts": 3,
+    "train.ppo.hidden_sizes": [8],
+    "train.ppo.steps": 8,
+}
+RERUN = Path(sys.executable).parent / "rerun"
+
+
+class View:
+    """A ``muster view`` that runs."""
+
+    def __init__(self, server: Serving, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [MUSTER, "view", *arguments],
+            env={**os.environ, "MUSTER_HOME": str(server.home), "COLUMNS": "300"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.said: list[str] = []
+        self.url = self.until("the view is at ").split()[-1]
+
+    def until(self, words: str) -> str:
+        """The next line that has these words."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.said.append(line)
+            if words in line:
+                return line
+        raise AssertionError(f"it ended without {words!r}: {self.said}")
+
+    @property
+    def below(self) -> list[psutil.Process]:
+        return psutil.Process(self.process.pid).children(recursive=True)
+
+    def interrupt(self) -> int:
+        """Ctrl-C, as a terminal sends it to all of them; returns the exit code."""
+        for each in self.below:
+            each.send_signal(signal.SIGINT)
+        assert self.process.stdout is not None
+        self.said += self.process.stdout.readlines()
+        return self.process.wait()
+
+    def close(self) -> None:
+        for each in [*self.below, psutil.Process(self.process.pid)] if self.process.poll() is None else []:
+            each.kill()
+        self.process.wait()
+
+
+def stream_of(url: str) -> str:
+    """Where the page gets its data from."""
+    with urllib.request.urlopen(f"{url}/") as page:
+        return urllib.parse.parse_qs(urllib.parse.urlsplit(page.url).query)["url"][0]
+
+
+def saved(url: str, file: Path) -> dict[str, Any]:
+    """What a second client of Rerun's gets, by entity: tables with the rows of all chunks, after some seconds."""
+    import pyarrow as pa
+    from rerun.chunk import RrdReader
+
+    client = subprocess.Popen(
+        [RERUN, stream_of(url), "--save", file, "--bind", "127.0.0.1", "--port", "auto"], stderr=subprocess.DEVNULL
+    )
+    size = wait_for(lambda: file.exists() and file.stat().st_size, 60, "the stream")
+    wait_for(lambda: file.stat().st_size > size + 200_000, 60, "some frames of the stream")
+    client.send_signal(signal.SIGINT)
+    client.wait()
+    found: dict[str, list[Any]] = {}
+    for chunk in RrdReader(file).stream().to_chunks():
+        found.setdefault(chunk.entity_path, []).append(pa.Table.from_batches([chunk.to_record_batch()]))
+    return {name: pa.concat_tables(tables, promote_options="default") for name, tables in found.items()}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    server = Serving(tmp_path_factory.mktemp("view"), "--cpus", "4")
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def job(server: Serving) -> str:
+    options = [part for key, value in SMALL.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    job: str = json.loads(server.muster("submit", "job_specs/cartpole.yaml", "--json", *options).stdout)["jobId"]
+    wait_for(lambda: list_checkpoints(run_of(server, job)), timeout=300, what="the first checkpoint")
+    return job
+
+
+def run_of(server: Serving, job: str) -> Run:
+    return Store(server.home / "store").run(server.detail(job)["run"])
+
+
+@pytest.fixture(scope="module")
+def view(server: Serving, job: str) -> Iterator[View]:
+    view = View(server, job, "--worlds", "2")
+    yield view
+    view.close()
+
+
+def rank_of(run: Run) -> psutil.Process:
+    told = wait_for(lambda: read_json(run.telemetry / "tap.json"), 60, "the training's answer")
+    return psutil.Process(told["process"])
+
+
+def test_frames_curve_and_log_of_a_training_arrive_at_20_hz_at_most(view: View, job: str, tmp_path: Path) -> None:
+    tables = saved(view.url, tmp_path / "view.rrd")
+    frames = np.unique(tables["/tf"]["time"].to_numpy().astype(np.int64))
+    assert len(frames) > 5 and (len(frames) - 1) / (np.ptp(frames) / 1e9) < 20.5
+    assert tables["/tf"].num_rows == 5 * len(frames)  # cart and pole of two worlds, and what the eye follows
+    assert np.all(np.diff(np.unique(tables["/tf"]["step"].to_numpy())) > 0)
+    iterations = tables["/return/mean"]["iteration"].to_pylist()
+    assert len(iterations) > 3 and sorted(iterations) == list(range(min(iterations), max(iterations) + 1))
+    lines = [each[0] for each in tables["/log"]["TextLog:text"].to_pylist()]
+    assert any(re.match(r"\d\d:\d\d:\d\d  rank 0  iteration ", line) for line in lines)
+    shapes = {f"/worlds/world_{world}/{link}" for world in (0, 1) for link in ("cart", "pole", "fixed")}
+    assert shapes <= set(tables)
+
+
+def test_only_loopback_is_listened_on_and_no_rank_has_rerun_in_its_memory(
+    view: View, server: Serving, job: str
+) -> None:
+    listening = [
+        each.laddr.ip
+        for process in view.below
+        for each in process.net_connections("inet")
+        if each.status == psutil.CONN_LISTEN
+    ]
+    assert len(listening) >= 3 and set(listening) == {"127.0.0.1"}
+    rank = rank_of(run_of(server, job))
+    assert any("worker.train" in part for part in rank.cmdline())
+    assert not [each.path for each in rank.memory_maps() if "rerun" in each.path]
+
+
+def test_a_training_has_one_reader_and_a_second_one_is_told_in_one_line(view: View, server: Serving, job: str) -> None:
+    done = server.muster("view", job)
+    (line,) = done.stderr.strip().splitlines()
+    assert done.returncode == 1 and "is being recorded or viewed already, by process" in line
+
+
+def test_a_browser_shows_the_training_moving_and_asks_no_other_machine(view: View, tmp_path: Path) -> None:
+    browser = Browser(view.url, tmp_path)
+    try:
+
+        def worlds() -> np.ndarray:
+            return browser.picture()[40:220, 10:360].astype(int)
+
+        def is_drawn() -> bool:
+            blue = np.abs(worlds() - (110, 150, 215)).max(-1) < 60  # the carts
+            return bool(blue.sum() > 20)
+
+        wait_for(is_drawn, 120, "the carts on the screen")
+        first = worlds()
+        wait_for(lambda: (np.abs(worlds() - first).max(-1) > 40).sum() > 20, 120, "another frame")
+        assert {urllib.parse.urlsplit(url).hostname for url in browser.asked} == {"127.0.0.1"}
+    finally:
+        browser.close()
+
+
+def test_the_view_goes_on_with_the_next_attempt_and_says_where_its_server_is_gone(
+    view: View, server: Serving, job: str
+) -> None:
+    rank_of(run_of(server, job)).kill()
+    view.until("the training stopped; the view goes on with its next attempt")
+    view.until("the training goes on")
+    (rerun,) = [each for each in view.below if each.name() == "rerun"]
+    rerun.kill()
+    line = view.until("muster: the viewer's server ended (signal 9)")
+    assert "start the view again" in line
+    assert view.process.wait() == 1 and not view.process.stdout.read()  # type: ignore[union-attr]
+    assert not (run_of(server, job).telemetry / "request.json").exists()
+
+
+def test_a_checkpoint_s_policy_acts_until_its_episodes_are_over(server: Serving, job: str, tmp_path: Path) -> None:
+    server.muster("stop", job)
+    run = run_of(server, job)
+    done = server.muster("view", f"{run.name}@best", "--worlds", "2", "--episodes", "2", timeout=180)
+    assert done.returncode == 0, done.stderr
+    found = re.search(r"viewed: (\d+) frames", done.stdout)
+    assert found and int(found[1]) > 2
+    view = View(server, run.name, "--worlds", "1")
+    try:
+        tables = saved(view.url, tmp_path / "policy.rrd")
+        assert view.interrupt() == 0 and not [line for line in view.said if "Traceback" in line]
+    finally:
+        view.close()
+    lines = [each[0] for each in tables["/log"]["TextLog:text"].to_pylist()]
+    assert any(f"of run {run.name}: 1 worlds" in line for line in lines)
+    assert any("world 0: episode 0 ended by" in line for line in lines)
+
+
+def test_what_can_t_be_viewed_is_refused_in_one_line(server: Serving, job: str, tmp_path: Path) -> None:
+    run = run_of(server, job)
+    (tmp_path / "text.mcap").write_text("no recording")
+    (tmp_path / "text.rrd").write_text("no recording")
+    refused = {
+        ("view", "nothing"): "run nothing does not exist",
+        ("view", "nothing.mcap"): "nothing.mcap: there is no such file",
+        ("view", f"{run.name}@7"): "no checkpoint of iteration 7; the nearest is",
+        ("view", run.name, "--memory", "much"): "expected a number with MB or GB",
+        ("view", str(tmp_path / "text.mcap")): "it does not begin as an MCAP file does",
+        ("view", str(tmp_path / "text.rrd")): "it does not begin as an .rrd file does",
+        ("view", str(tmp_path / "text.rrd"), "--episodes", "1"): "it is for the policy of a RUN",
+    }
+    for arguments, words in refused.items():
+        done = server.muster(*arguments)
+        assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr

@@ -1,0 +1,125 @@
+"""What the live view shows of a recording, read back from Rerun's own file; the page, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.training.worker.test_recording import STEPS, Recorded
+from worker.errors import UserError
+from worker.telemetry.page import Page
+from worker.telemetry.replay import Replay
+from worker.telemetry.screen import Screen
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    return Recorded(tmp_path_factory.mktemp("recorded") / "two.mcap")
+
+
+@pytest.fixture(scope="module")
+def shown(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The chunks of each entity, of the whole recording."""
+    from rerun.chunk import RrdReader
+
+    replay = Replay(recorded.path)
+    (part,) = replay.parts()
+    file = tmp_path_factory.mktemp("shown") / "two.rrd"
+    screen = Screen(file, "two", replay.look, part.poses[0], live=False)
+    screen.frames(part.times, part.steps, part.poses, part.rewards)
+    screen.say(part.said)
+    screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
+    screen.close()
+    found: dict[str, Any] = {}
+    for chunk in RrdReader(file).stream().to_chunks():
+        found.setdefault(chunk.entity_path, chunk.to_record_batch())
+    return found
+
+
+def test_a_recording_reads_back_as_what_the_tap_saw(recorded: Recorded) -> None:
+    replay = Replay(recorded.path)
+    (part,) = replay.parts()
+    assert replay.look.links == ("cart", "pole") and set(replay.look.shapes) == {"", "cart", "pole"}
+    np.testing.assert_array_equal(replay.look.places, [[0.0, -1.5, 0.0], [0.0, 1.5, 0.0]])
+    assert part.steps.tolist() == list(range(1, STEPS + 1)) and not replay.cut and replay.count == STEPS
+    for number, rows in enumerate(recorded.rows):
+        np.testing.assert_allclose(part.poses[number, :, 0, 0], rows.coordinates[0, :, 0], atol=1e-6)
+        np.testing.assert_allclose(part.rewards[number], rows.terms[0].mean(0), rtol=1e-6, atol=1e-7)
+    returned = [sum(float(rows.rewards[0, world]) for rows in recorded.rows[:12]) for world in (0, 1)]
+    np.testing.assert_allclose([value for _, value in part.returns[:2]], returned, rtol=1e-5)
+    assert sum("ended by time_out after 12 steps" in text for _, _, text in part.said) == 4
+
+
+def test_a_recording_of_which_the_end_is_missing_is_shown_up_to_there(recorded: Recorded, tmp_path: Path) -> None:
+    whole = recorded.path.read_bytes()
+    cut = tmp_path / "cut.mcap.partial"
+    cut.write_bytes(whole[: whole.rindex(b"\x0f" + (4).to_bytes(8, "little"))])  # the record that ends the data
+    replay = Replay(cut)
+    assert sum(len(part.times) for part in replay.parts()) == STEPS and replay.cut
+    cut.write_bytes(whole[:500])
+    with pytest.raises(UserError, match="it ends before the first control step"):
+        Replay(cut)
+
+
+def test_every_link_of_every_world_is_where_the_simulation_has_it(recorded: Recorded, shown: dict[str, Any]) -> None:
+    table = shown["/tf"]
+    frames = [each[0] for each in table["Transform3D:child_frame"].to_pylist()]
+    assert frames[:5] == ["world_0/cart", "world_0/pole", "world_1/cart", "world_1/pole", "middle"]
+    places = np.array([each[0] for each in table["Transform3D:translation"].to_pylist()]).reshape(STEPS, 5, 3)
+    turns = np.array([each[0] for each in table["Transform3D:quaternion"].to_pylist()]).reshape(STEPS, 5, 4)
+    half = np.sqrt(0.5)
+    for number, rows in enumerate(recorded.rows):
+        slider, hinge = rows.coordinates[0, 1].tolist()
+        np.testing.assert_allclose(places[number, 3], [slider, 1.5, 1.0], atol=1e-6)
+        # about y by the hinge, after glTF's y-up was turned to z-up about x
+        sin, cos = np.sin(hinge / 2), np.cos(hinge / 2)
+        np.testing.assert_allclose(turns[number, 3], [half * cos, half * sin, -half * sin, half * cos], atol=1e-6)
+        np.testing.assert_allclose(places[number, 4], places[number, :4].mean(0), atol=1e-6)
+    assert {"/worlds/world_0/fixed", "/worlds/world_1/cart", "/worlds/world_1/pole"} <= set(shown)
+
+
+def test_terms_and_returns_are_drawn(recorded: Recorded, shown: dict[str, Any]) -> None:
+    drawn = np.array(shown["/terms"]["Scalars:scalars"].to_pylist())
+    np.testing.assert_allclose(drawn, [rows.terms[0].mean(0) for rows in recorded.rows], rtol=1e-6, atol=1e-7)
+    assert len(shown["/return/episodes"]["Scalars:scalars"]) == 4
+
+
+def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
+    with Page(None, "64MB") as page:
+        with urllib.request.urlopen(f"{page.url}/") as answer:
+            policy, text = answer.headers["Content-Security-Policy"], answer.read().decode()
+        assert f"connect-src 'self' {page.server.removeprefix('rerun+').removesuffix('/proxy')} " in policy
+        assert "fonts.googleapis.com" not in text and "re_viewer.js" in text
+        request = urllib.request.Request(f"{page.url}/", headers={"Host": "evil.example"})
+        for refused, code in ((request, 403), (f"{page.url}/etc/passwd", 404)):
+            with pytest.raises(urllib.error.HTTPError) as error:
+                urllib.request.urlopen(refused)
+            assert error.value.code == code
+        port = int(page.url.rpartition(":")[2])
+        with pytest.raises(UserError, match=f"--port {port}: the page can't be served there"):
+            Page(port, "64MB")
+        page._process.kill()
+        page._process.wait()
+        with pytest.raises(UserError, match=r"the viewer's server ended \(signal 9\)"):
+            page.check()
+    assert not page._home.exists()
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.telemetry.page.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"pip install 'muster\[viz\]'"):
+        Page(None, "64MB")
+
+
+def test_neither_the_command_nor_a_training_imports_rerun() -> None:
+    names = "orchestrator.cli orchestrator.cli.viewing worker.learning.loop worker.telemetry.attending worker.tasks.cartpole newton"
+    code = f"import importlib, sys; [importlib.import_module(name) for name in {names.split()}]; print('rerun' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"

@@ -1,0 +1,227 @@
+"""The page of the live view: Rerun's server in a process of its own, and its web viewer, on loopback and without calls to the internet.
+
+Rerun's own page asks fonts.googleapis.com for a font, and the viewer in it asks api.github.com and tel.rerun.io. The page is therefore
+served from here, with a Content-Security-Policy that lets the browser reach nothing but this page and Rerun's server.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+from urllib.parse import urlencode, urlsplit
+
+from shared_store.tied import tied
+from worker.errors import UserError
+
+LOOPBACK = "127.0.0.1"
+PORT = 9090
+"""Of the page, where it is free and no other one is asked for."""
+_STARTED_WITHIN = 30.0
+"""Seconds in which Rerun's server answers."""
+_ASSETS = {
+    "/re_viewer.js": "text/javascript",
+    "/re_viewer_bg.wasm": "application/wasm",
+    "/favicon.ico": "image/x-icon",
+    "/apple-touch-icon.png": "image/png",
+}
+_ELSEWHERE = re.compile(r"<link\b[^>]*https://[^>]*>")
+"""Links of the page to other servers."""
+
+
+def need_rerun() -> Path:
+    """Rerun's program. Raises UserError where the extra is not installed."""
+    found = find_spec("rerun_cli")
+    if found is None or not found.submodule_search_locations or find_spec("rerun") is None:
+        raise UserError("the live view needs Rerun (170 MB) on this machine: pip install 'muster[viz]'")
+    return Path(next(iter(found.submodule_search_locations))) / "rerun"
+
+
+class Page:
+    """Rerun's server and web viewer, until :meth:`close`.
+
+    Args:
+        port: Of the page; None: 9090, or a free one.
+        memory: What Rerun's server may keep for pages that are opened later, such as ``"256MB"``; then the oldest goes.
+        file: An .rrd file to be served as it is.
+
+    Attributes:
+        url: Of the page, for people.
+        server: Of Rerun's server, for the SDK and for viewers.
+
+    Raises:
+        UserError: Rerun is missing or does not start, or the port is taken.
+    """
+
+    def __init__(self, port: int | None, memory: str, file: Path | None = None) -> None:
+        program = need_rerun()
+        self._http = _listen(port)
+        self._home = Path(tempfile.mkdtemp(prefix="muster-view-"))
+        stream, assets = _free_port(), _free_port()
+        self.server = f"rerun+http://{LOOPBACK}:{stream}/proxy"
+        self.url = f"http://{LOOPBACK}:{self._http.server_port}"
+        options = {"--bind": LOOPBACK, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
+        command = [
+            str(program),
+            "--serve-web",
+            "--newest-first",
+            *(str(part) for pair in options.items() for part in pair),
+        ]
+        self._log = (self._home / "log").open("w+")
+        self._process = subprocess.Popen(
+            tied([*command, str(file)] if file else command, [signal.SIGINT]),
+            env=_quiet(self._home),
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=self._log,
+        )
+        self._http.__dict__.update(assets=f"http://{LOOPBACK}:{assets}", stream=stream, query=self._query())
+        try:
+            self._wait(stream, assets)
+        except UserError:
+            self.close()
+            raise
+        threading.Thread(target=self._http.serve_forever, name="page", daemon=True).start()
+
+    def check(self) -> None:
+        """Raises UserError where Rerun's server is gone."""
+        if self._process.poll() is not None:
+            raise UserError(
+                f"the viewer's server ended ({_ending(self._process.returncode)}){self._last_words()}; what it showed is lost: start the "
+                "view again"
+            )
+
+    def close(self) -> None:
+        """End the server and the page."""
+        self._process.kill()
+        self._process.wait()
+        self._http.server_close()
+        self._log.close()
+        shutil.rmtree(self._home, ignore_errors=True)
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._http.shutdown()
+        self.close()
+
+    def _query(self) -> str:
+        return urlencode({"url": self.server, "hide_welcome_screen": "1", "persist": "0", "theme": "dark"})
+
+    def _wait(self, *ports: int) -> None:
+        until = time.monotonic() + _STARTED_WITHIN
+        for port in ports:
+            while socket.socket().connect_ex((LOOPBACK, port)):
+                self.check()
+                if time.monotonic() > until:
+                    raise UserError(f"Rerun's server did not start within {_STARTED_WITHIN:.0f} s{self._last_words()}")
+                time.sleep(0.02)
+
+    def _last_words(self) -> str:
+        self._log.seek(0)
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", self._log.read()).strip().splitlines()
+        return f": {lines[-1][:200]}" if lines else ""
+
+
+def _listen(port: int | None) -> ThreadingHTTPServer:
+    """The page's server. Raises UserError where a port that was asked for can't be had."""
+    try:
+        return ThreadingHTTPServer((LOOPBACK, PORT if port is None else port), _Handler)
+    except OSError as error:
+        if port is None:
+            return ThreadingHTTPServer((LOOPBACK, 0), _Handler)
+        raise UserError(
+            f"--port {port}: the page can't be served there ({error.strerror or error}); leave --port out for a free one"
+        ) from error
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def _quiet(home: Path) -> dict[str, str]:
+    """The environment of Rerun's server: its reports about usage are off, whatever the user's own settings say."""
+    settings = {"analytics_enabled": False, "analytics_id": "", "metadata": {}}
+    own = home / "rerun"
+    own.mkdir()
+    places = {"config_file_path": str(own / "analytics.json"), "data_dir_path": str(own)}
+    (own / "analytics.json").write_text(json.dumps({**settings, **places}))
+    return {**os.environ, "XDG_CONFIG_HOME": str(home), "TELEMETRY_ENABLED": "false", "RUST_LOG": "warn"}
+
+
+def _ending(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Serves Rerun's page, and nothing to pages of other origins."""
+
+    server: ThreadingHTTPServer
+
+    def do_GET(self) -> None:
+        """One of the page's files; ``/`` leads to the page with the view in it."""
+        own = self.server.__dict__
+        if self.headers.get("Host") not in (f"{name}:{self.server.server_port}" for name in (LOOPBACK, "localhost")):
+            self.send_error(403, "this page is served to this machine alone")
+            return
+        asked = urlsplit(self.path)
+        try:
+            if asked.path == "/" and "url=" not in asked.query:
+                self.send_response(302)
+                self.send_header("Location", f"http://{LOOPBACK}:{self.server.server_port}/?{own['query']}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+            elif asked.path == "/":
+                with urllib.request.urlopen(f"{own['assets']}/") as page:
+                    content = _ELSEWHERE.sub("", page.read().decode()).replace("Rerun Viewer", "muster view").encode()
+                self._begin("text/html; charset=utf-8", str(len(content)))
+                self.wfile.write(content)
+            elif asked.path in _ASSETS:
+                with urllib.request.urlopen(f"{own['assets']}{asked.path}") as asset:
+                    self._begin(_ASSETS[asked.path], asset.headers["rerun-final-length"])
+                    shutil.copyfileobj(asset, self.wfile, 1 << 20)
+            else:
+                self.send_error(404)
+        except urllib.error.URLError:
+            self.send_error(502, "the viewer's server is gone")
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # the page was closed meanwhile
+
+    def _begin(self, kind: str, size: str | None) -> None:
+        stream = self.server.__dict__["stream"]
+        allowed = {
+            "default-src": "'self' 'unsafe-inline' blob: data:",
+            "script-src": "'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
+            "connect-src": f"'self' http://{LOOPBACK}:{stream} blob: data:",
+            "frame-ancestors": "'self'",
+        }
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        if size:
+            self.send_header("Content-Length", size)
+            self.send_header("rerun-final-length", size)  # what the page's progress goes by
+        self.send_header("Content-Security-Policy", "; ".join(f"{name} {value}" for name, value in allowed.items()))
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing is printed for each request."""

@@ -1,0 +1,169 @@
+"""A recording read back for the live view: whole, or as much as there is of one that was cut short."""
+
+from __future__ import annotations
+
+import struct
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worker.errors import UserError
+from worker.telemetry import messages
+from worker.telemetry.recording import PARTIAL
+from worker.telemetry.screen import Look
+
+BATCH = 256
+"""Control steps that are handed out together."""
+
+
+@dataclass
+class Part:
+    """Consecutive control steps of a recording.
+
+    Attributes:
+        times: [ns since 1970].
+        steps: Numbers, from 1.
+        poses: Shape ``(steps, worlds, links, 7)``: position [m] and quaternion xyzw in the frame of the world.
+        rewards: Weighted terms, mean of the worlds; shape ``(steps, terms)``.
+        said: Lines of the log: time [ns], who, text.
+        returns: Of episodes that ended: time [ns], return.
+    """
+
+    times: np.ndarray
+    steps: np.ndarray
+    poses: np.ndarray
+    rewards: np.ndarray
+    said: list[tuple[int, str, str]]
+    returns: list[tuple[int, float]]
+
+
+class Replay:
+    """A recording of Muster's, from its beginning.
+
+    Args:
+        path: ``.mcap``, or ``.mcap.partial`` of one that was cut short.
+
+    Attributes:
+        look: What is seen.
+        cut: Whether the file ends before its end; known once all :meth:`parts` were read.
+        count: Control steps that were read.
+
+    Raises:
+        UserError: It is no such file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.cut, self.count = path, False, 0
+        if not path.is_file():
+            raise UserError(f"{path}: there is no such file")
+        shapes: dict[str, bytes] = {}
+        places: list[tuple[float, float, float]] = []
+        links: list[str] = []
+        for kind, topic, _, data in self._messages():
+            if topic == "/tf_static":
+                for each in _decoded(kind, data).transforms:
+                    where = each.transform.translation
+                    places.append((where.x, where.y, where.z))
+            elif topic in ("/ground", "/world_0/scene"):
+                for entity in _decoded(kind, data).entities:
+                    frame = "ground" if topic == "/ground" else entity.frame_id.removeprefix("world_0").lstrip("/")
+                    shapes[frame] = bytes(entity.models[0].data)
+            elif topic == "/tf":
+                links = [each.child_frame_id for each in _decoded(kind, data).transforms]
+            elif topic == "/world_0/rl/step" and shapes and places:
+                own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
+                self.look = Look(own, shapes, np.array(places), tuple(_decoded(kind, data).reward_names))
+                self.cut = False
+                return
+        what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
+        raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
+
+    def parts(self) -> Iterator[Part]:
+        """All control steps, in order."""
+        found = _Gathered(self.look)
+        for kind, topic, time, data in self._messages():
+            if topic == "/tf":
+                if len(found.times) == BATCH:
+                    yield self._part(found)
+                    found = _Gathered(self.look, found.sums)
+                found.move(time, _decoded(kind, data).transforms)
+            elif topic == "/rosout":
+                line = _decoded(kind, data)
+                found.said.append((time, line.name, line.msg))
+            elif topic.endswith("/rl/step") and found.times:
+                found.step(time, _decoded(kind, data))
+        if found.times:
+            yield self._part(found)
+
+    def _part(self, found: _Gathered) -> Part:
+        first, self.count = self.count + 1, self.count + len(found.times)
+        steps = np.arange(first, self.count + 1)
+        rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
+        return Part(np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns)
+
+    def _messages(self) -> Iterator[tuple[str, str, int, bytes]]:
+        """Type, topic, time [ns] and content, as they were written. Sets :attr:`cut`. Raises UserError where it is no MCAP file."""
+        from mcap.exceptions import McapError
+        from mcap.records import Channel, DataEnd, Message, Schema
+        from mcap.stream_reader import StreamReader
+
+        kinds: dict[int, str] = {}
+        channels: dict[int, tuple[str, str]] = {}
+        self.cut = True
+        begun = False
+        try:
+            with self.path.open("rb") as file:
+                for record in StreamReader(file, emit_chunks=False).records:
+                    begun = True
+                    if isinstance(record, Schema):
+                        kinds[record.id] = record.name
+                    elif isinstance(record, Channel):
+                        channels[record.id] = kinds.get(record.schema_id, ""), record.topic
+                    elif isinstance(record, Message):
+                        yield *channels[record.channel_id], record.log_time, record.data
+                    elif isinstance(record, DataEnd):
+                        self.cut = False
+                        return
+        except OSError as error:
+            raise UserError(f"{self.path}: it can't be read ({error.strerror or error})") from error
+        except (McapError, EOFError, ValueError, KeyError, struct.error):
+            pass  # here it was cut
+        if not begun:
+            raise UserError(
+                f"{self.path}: it does not begin as an MCAP file does; give an .mcap, .mcap{PARTIAL} or .rrd file"
+            )
+
+
+@dataclass
+class _Gathered:
+    """Control steps that are being read."""
+
+    look: Look
+    sums: defaultdict[int, float] = field(default_factory=lambda: defaultdict(float))
+    """Return of each world's running episode."""
+    times: list[int] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    rewards: list[list[np.ndarray]] = field(default_factory=list)
+    said: list[tuple[int, str, str]] = field(default_factory=list)
+    returns: list[tuple[int, float]] = field(default_factory=list)
+
+    def move(self, time: int, transforms: list[Any]) -> None:
+        parts = [(each.transform.translation, each.transform.rotation) for each in transforms]
+        poses = np.array([(at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w) for at, turn in parts])
+        self.times.append(time)
+        self.poses.append(poses.reshape(len(self.look.places), len(self.look.links), 7))
+        self.rewards.append([])
+
+    def step(self, time: int, step: Any) -> None:
+        self.rewards[-1].append(np.asarray(step.reward_terms))
+        self.sums[step.world] += step.reward
+        if step.done:
+            self.returns.append((time, self.sums.pop(step.world)))
+
+
+def _decoded(kind: str, data: bytes) -> Any:
+    return messages.types().deserialize_cdr(data, kind)
