@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from shared_store.files import read_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
 from shared_store.metrics import history_of
