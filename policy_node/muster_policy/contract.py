@@ -51,6 +51,7 @@ class Term:
     parameters: Mapping[str, Sequence[float]]
     element: str
     elements: tuple[str, ...]
+    sensors: Mapping[str, str]
     command: str
     frame: Frame | None
 
@@ -212,6 +213,7 @@ def _term(found: Mapping[str, Any]) -> Term:
         parameters=found["parameters"],
         element=found["element"],
         elements=tuple(found["elements"]),
+        sensors=found["sensors"],
         command=found["command"],
         frame=None
         if frame is None

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
+import zenoh.ext
 
 from muster_policy.errors import Refused
 from muster_policy.messages import Messages
