@@ -49,7 +49,9 @@ class Commands:
                 f"task {contract.task} can't drive joints: the policy {what}{', '.join(contract.action_names[:5])}"
             )
         if ruled := [action for action in contract.actions if action.rule]:
-            raise Refused(f"task {contract.task}: the command of {ruled[0].name} has a rule that the node lacks: {ruled[0].rule}")
+            raise Refused(
+                f"task {contract.task}: the command of {ruled[0].name} has a rule that the node lacks: {ruled[0].rule}"
+            )
         self.actions = contract.actions
         renamed = names or {}
         self.joints = [renamed.get(action.name, action.name) for action in contract.actions]

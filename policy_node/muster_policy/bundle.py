@@ -112,6 +112,4 @@ def _read(path: Path, name: str) -> bytes:
 
 
 def _listed(path: Path) -> set[str]:
-    return {
-        str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names
-    }
+    return {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}

@@ -63,7 +63,7 @@ class Inputs:
         self._columns: dict[tuple[str, ...], np.ndarray] = {}
         self.all = [Input(JOINTS, JOINT_STATE, self._joint_state)]
         if IMU_TOPIC in observations.needs:
-            self.all.append(Input(IMU_TOPIC, IMU, _imu))
+            self.all.append(Input(IMU_TOPIC, IMU, _imu_for(observations.quantities)))
         if ODOMETRY_TOPIC in observations.needs:
             self.all.append(Input(ODOMETRY_TOPIC, ODOMETRY, _odometry))
         for command in observations.commands.values():
@@ -210,12 +210,24 @@ def _rotation(turn: Any) -> np.ndarray:
     return found / length
 
 
-def _imu(message: Any) -> Imu:
-    if message.orientation_covariance[0] == -1.0:
-        raise Refused("it has no orientation (orientation_covariance[0] is -1); run a filter that estimates it")
-    turn = matrix(_rotation(message.orientation))
-    angular = _xyz(message.angular_velocity, "angular velocity")
-    return Imu(turn, angular, _xyz(message.linear_acceleration, "linear acceleration"))
+def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
+    """Reads what these quantities need; a field whose covariance begins with -1 is not measured, as ROS has it."""
+    needs_turn = bool(quantities & {"projected_gravity", "root_uprightness", "imu_projected_gravity"})
+    needs_force = "imu_acceleration" in quantities
+
+    def read(message: Any) -> Imu:
+        turn, force = np.eye(3), np.zeros(3)
+        if needs_turn:
+            if message.orientation_covariance[0] == -1.0:
+                raise Refused("it has no orientation (orientation_covariance[0] is -1); run a filter that estimates it")
+            turn = matrix(_rotation(message.orientation))
+        if needs_force:
+            if message.linear_acceleration_covariance[0] == -1.0:
+                raise Refused("it has no acceleration (linear_acceleration_covariance[0] is -1)")
+            force = _xyz(message.linear_acceleration, "linear acceleration")
+        return Imu(turn, _xyz(message.angular_velocity, "angular velocity"), force)
+
+    return read
 
 
 def _odometry(message: Any) -> Odometry:

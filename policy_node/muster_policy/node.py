@@ -76,9 +76,7 @@ class PolicyNode:
         Refused: The policy needs what no message has, or a setting does not fit.
     """
 
-    def __init__(
-        self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print
-    ) -> None:
+    def __init__(self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print) -> None:
         self.settings, self._tell = settings, tell
         contract = bundle.contract
         self.rate = settings.rate or contract.control_hz
@@ -145,14 +143,15 @@ class PolicyNode:
         second, patience, report = begin + 1.0, begin + 1.0, begin + REPORT
         period, deadline = 1.0 / self.rate, begin
         while not self.stopping.is_set():
-            deadline = self._wait(deadline, period)
+            begun = self._wait(deadline, period)
+            deadline = deadline if begun is None else begun
             now = time.monotonic()
             if now > ends:
                 break
             if self._reset.is_set():
                 self._reset.clear()
                 self.runner.reset()
-            acted = self.runner.step(now)
+            acted = self.runner.step(now, due=begun is not None)
             self._measure(now, deadline, acted)
             self._flush()
             if now > second:
@@ -166,8 +165,8 @@ class PolicyNode:
                 self._tell(self.summary())
         self._tell(self.summary())
 
-    def _wait(self, deadline: float, period: float) -> float:
-        """Wait for the next control step; returns when it should have begun."""
+    def _wait(self, deadline: float, period: float) -> float | None:
+        """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""
         if self.settings.trigger == "timer":
             now = time.monotonic()
             deadline += period
@@ -176,12 +175,12 @@ class PolicyNode:
             sleep_until(deadline)
             return deadline
         joints, earliest = self.inputs.all[0], deadline + 0.75 * period
-        limit = time.monotonic() + min(period, 0.1)
+        limit = time.monotonic() + min(self.timeout, 0.1)
         with self.inputs.news:
             while joints.waiting is None or joints.waiting[1] < earliest:
                 left = limit - time.monotonic()
                 if left <= 0.0:
-                    return deadline  # nothing came: the step looks whether inputs are too old
+                    return None
                 self.inputs.news.wait(left)
             return joints.waiting[1]
 

@@ -40,6 +40,7 @@ class Observations:
         needs: Inputs that it reads, by topic.
         commands: Commands that it reads.
         images: Groups that are images.
+        quantities: Those that it reads, by name.
         unit: Frame of the inertial measurement unit; None: that of the root.
     """
 
@@ -50,6 +51,7 @@ class Observations:
             names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
         self.joints = tuple(dict.fromkeys(names))
         self.needs: set[str] = {JOINTS}
+        self.quantities: set[str] = set()
         self.commands: dict[str, Command] = {}
         self.images = {group.name: group for group in contract.groups if group.image is not None}
         self._problems: list[str] = []
@@ -120,7 +122,9 @@ class Observations:
     def _check_group(self, group: Group) -> None:
         image = group.image
         if image is None and not group.terms:
-            self._problems.append(f"the contract does not say what the numbers of {group.name} are (a task of kernels by hand)")
+            self._problems.append(
+                f"the contract does not say what the numbers of {group.name} are (a task of kernels by hand)"
+            )
         if image is None or image.channels in (("red", "green", "blue"), ("grey",)):
             return
         self._problems.append(
@@ -138,7 +142,9 @@ class Observations:
         """What reads the quantity of a term. Raises Refused with what would be needed."""
         if not term.library:
             what = term.quantity or "a quantity that is not declared"
-            raise Refused(f"{what} is none of Muster's library (or the contract is of format 1: export the policy again)")
+            raise Refused(
+                f"{what} is none of Muster's library (or the contract is of format 1: export the policy again)"
+            )
         if term.kind == "command":
             return self._command(term)
         if term.kind == "previous_action":
@@ -158,10 +164,13 @@ class Observations:
             raise Refused(f"the contract does not say where {term.quantity} is measured; export the policy again")
         if term.quantity not in OF_UNIT:
             if not frame.root:
-                raise Refused(f"{term.quantity} is measured on {frame.body}, the node knows the motion of the root alone")
+                raise Refused(
+                    f"{term.quantity} is measured on {frame.body}, the node knows the motion of the root alone"
+                )
             if topic == IMU and unit is not None and not unit.root:
                 raise Refused(f"{term.quantity} is of the root, and the inertial measurement unit is on {unit.body}")
         self.needs.add(topic)
+        self.quantities.add(term.quantity)
         place = place_of(frame, unit if unit is not None and unit.root else None)
         quantity = (FROM_IMU if topic == IMU else FROM_ODOMETRY)[term.quantity]
         return lambda snapshot: quantity(snapshot, place)
@@ -175,7 +184,9 @@ class Observations:
         if term.quantity in _JOINT_OFFSETS:
             defaults = {action.name: action.default_position for action in self._contract.actions}
             if unknown := [name for name in term.elements if name not in defaults]:
-                raise Refused(f"the contract has no default position of {', '.join(unknown[:3])}, which no action drives")
+                raise Refused(
+                    f"the contract has no default position of {', '.join(unknown[:3])}, which no action drives"
+                )
             start = np.array([defaults[name] for name in term.elements])
             return lambda snapshot: snapshot.position[columns] - start
         raise Refused(f"{term.quantity} of joints is in no message that the node reads")

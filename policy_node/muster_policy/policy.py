@@ -38,9 +38,13 @@ class Policy:
             reason = " ".join(str(error).split())
             raise Refused(f"{bundle.path}: policy.onnx can't be run by onnxruntime: {reason[:200]}") from None
         given = {each.name: tuple(each.shape[1:]) for each in self._session.get_inputs()}
-        wanted = {each.input: each.shape for each in contract.groups} | {each.name: each.shape for each in contract.states}
+        wanted = {each.input: each.shape for each in contract.groups} | {
+            each.name: each.shape for each in contract.states
+        }
         if given != wanted:
-            raise Refused(f"{bundle.path}: policy.onnx takes {given}, contract.json says {wanted}; export the policy again")
+            raise Refused(
+                f"{bundle.path}: policy.onnx takes {given}, contract.json says {wanted}; export the policy again"
+            )
         self._outputs = ["actions", *(state.output for state in contract.states)]
         self._states: dict[str, np.ndarray] = {}
         self.reset()

@@ -68,11 +68,12 @@ class Runner:
         """Give the full names of the inputs' topics, for the lines."""
         self._topics = topics
 
-    def step(self, now: float) -> bool:
+    def step(self, now: float, due: bool = True) -> bool:
         """Do one control step.
 
         Args:
             now: [s, monotonic].
+            due: Whether to act; else it only looks whether inputs are too old.
 
         Returns:
             Whether a command was given.
@@ -86,6 +87,8 @@ class Runner:
             if self.mode is Mode.ACTING:
                 each, age = max(stale, key=lambda entry: entry[1])
                 self._stop(f"{self._topic(each.topic)} is silent for {age * 1e3:.0f} ms", Mode.WAITING)
+            return False
+        if not due:
             return False
         if self.mode is Mode.WAITING:
             self._forget()
