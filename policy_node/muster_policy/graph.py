@@ -58,6 +58,7 @@ class Publisher:
     """Publishes messages of one type on a topic, with what rmw_zenoh wants beside them."""
 
     def __init__(self, node: Node, topic: str, kind: str, qos: Qos) -> None:
+        self.topic = topic
         self._type, self._messages, self._sequence = kind, node.messages, 0
         self._lock = threading.Lock()
         token, key = node.declare("MP", topic, kind, qos)

@@ -231,7 +231,7 @@ class PolicyNode:
         for each in self.inputs.missing():
             topic = self._topics[each.topic]
             there = self._node.publishers_of(topic)
-            others = [name for name in self._node.topics_of(each.kind) if name != topic]
+            others = [name for name in self._node.topics_of(each.kind) if name not in (topic, self._out.topic)]
             if wrong := [other for other in there if other.type != each.kind]:
                 how = f"{wrong[0].node} publishes {wrong[0].type} there"
             elif there:

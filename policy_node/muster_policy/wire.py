@@ -148,7 +148,7 @@ def parse_token(key: str) -> Endpoint | None:
 
 def gid_of(token: str) -> bytes:
     """The 16 bytes by which an endpoint is known: XXH3-128 of its liveliness token, low half first."""
-    return xxhash.xxh3_128_intdigest(token).to_bytes(16, "little")
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def attachment(sequence: int, nanoseconds: int, gid: bytes) -> bytes:
