@@ -65,7 +65,7 @@ class Publisher:
         self._gid = gid_of(token)
         if qos.transient_local:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
-            detection = zenoh.ext.MissDetectionConfig(sporadic_heartbeat=0.5)
+            detection = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
             self._publisher: Any = zenoh.ext.declare_advanced_publisher(
                 node.session, key, cache=cache, publisher_detection=True, sample_miss_detection=detection
             )

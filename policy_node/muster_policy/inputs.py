@@ -188,7 +188,8 @@ def _limited(each: Input, now: float) -> np.ndarray:
     value: np.ndarray = np.zeros(len(each.command.names)) if _is_silent(each, now) else each.value
     ends = [(-np.inf, np.inf) if pair is None else pair for pair in each.command.ranges]
     low, high = np.array(ends).T
-    return np.clip(value, low, high)
+    within: np.ndarray = np.clip(value, low, high)
+    return within
 
 
 def _finite(values: Any, what: str) -> np.ndarray:

@@ -86,7 +86,7 @@ class Observations:
 
     def _term(self, group: str, each: _Read, snapshot: Snapshot) -> np.ndarray:
         term = each.term
-        value = np.atleast_1d(np.asarray(each.read(snapshot), dtype=np.float32)) - term.offset
+        value: np.ndarray = np.atleast_1d(np.asarray(each.read(snapshot), dtype=np.float32)) - term.offset
         if term.clip is not None:
             value = np.clip(value, *term.clip)
         value = value * term.scale

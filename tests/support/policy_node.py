@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from onnx import TensorProto, helper, numpy_helper
+
 from muster_policy.actions import Commands
 from muster_policy.contract import Contract as NodeContract
 from muster_policy.contract import read
 from muster_policy.inputs import Inputs
 from muster_policy.messages import Messages
 from muster_policy.observations import Observations
-from onnx import TensorProto, helper, numpy_helper
-
 from shared_store.bundles import seal
 from shared_store.policy_contract import Contract
 

@@ -22,7 +22,6 @@ from worker.learning.job import configure, run_command, user_errors
 
 if TYPE_CHECKING:
     from muster_policy.messages import Messages
-
     from worker.tasks.declared import DeclaredTask
 
 Message = tuple[str, str, Any]
@@ -232,7 +231,9 @@ def play(
         total += float(task.rewards[0])
         if bool(task.dones[0]):
             returns.append(total)
-            told(f"episode {len(returns)} of {episodes}: return {total:.2f}, {steps} steps, {late} without a new command")
+            told(
+                f"episode {len(returns)} of {episodes}: return {total:.2f}, {steps} steps, {late} without a new command"
+            )
             total, late, steps = 0.0, 0, 0
             actions = torch.zeros_like(actions)
             newest.clear()
