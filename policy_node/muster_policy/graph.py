@@ -43,10 +43,10 @@ def open_session(connect: str | None, listen: str | None) -> zenoh.Session:
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps("router" if listen else "peer"))
     config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps([listen or "tcp/localhost:0"]))
-    config.insert_json5("connect/endpoints", json.dumps([connect] if connect else []))
     config.insert_json5("transport/shared_memory/enabled", "false")
     try:
+        config.insert_json5("listen/endpoints", json.dumps([listen or "tcp/localhost:0"]))
+        config.insert_json5("connect/endpoints", json.dumps([connect] if connect else []))
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = f"--listen {listen}" if listen else f"--connect {connect}"

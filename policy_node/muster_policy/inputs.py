@@ -89,7 +89,7 @@ class Inputs:
 
         def received(data: bytes, kind: str, type_hash: str) -> None:
             if kind != each.kind:
-                self._complain(topic, f"a {kind}, and the node reads {each.kind}")
+                self._complain(topic, f"it is a {kind}, and the node reads {each.kind}")
             elif type_hash != wanted:
                 what = f"{kind} of another definition ({type_hash[:20]}…, here {wanted[:20]}…)"
                 self._complain(topic, f"{what}; give --distro as the robot has it")
@@ -172,7 +172,7 @@ class Inputs:
 
     def _complain(self, topic: str, problem: str) -> None:
         self.ignored[topic] += 1
-        line = f"{topic}: ignored {problem}" if problem.startswith("a ") else f"{topic}: message ignored: {problem}"
+        line = f"{topic}: message ignored: {problem}"
         if line not in self._told and len(self._told) < _DIFFERENT:
             self._told.add(line)
             self._complaints.append(line)
@@ -195,7 +195,7 @@ def _limited(each: Input, now: float) -> np.ndarray:
 def _finite(values: Any, what: str) -> np.ndarray:
     found = np.asarray(values, dtype=np.float64)
     if not np.isfinite(found).all():
-        raise Refused(f"its {what} are not finite")
+        raise Refused(f"not finite: its {what}")
     return found
 
 

@@ -82,7 +82,8 @@ class Policy:
             for state in self._states.values():
                 state[fresh] = 0.0
             actions = self.act({name: np.ascontiguousarray(each[step]) for name, each in inputs.items()})
-            apart = np.abs(actions - wanted[step]) / np.maximum(1.0, np.abs(wanted[step]))
+            with np.errstate(invalid="ignore"):
+                apart = np.abs(actions - wanted[step]) / np.maximum(1.0, np.abs(wanted[step]))
             greatest = max(greatest, float(np.nan_to_num(apart, nan=np.inf).max()))
         self.reset()
         if not greatest <= TOLERANCE:

@@ -115,7 +115,8 @@ class Runner:
         for topic in sorted(silent - self._silent):
             self._say(f"{self._topic(topic)} is silent: velocity 0 is asked for", True)
         self._silent = silent
-        seen = self.observations.build(self.inputs.snapshot(now))
+        with np.errstate(over="ignore"):  # what 32 bits do not hold is found below
+            seen = self.observations.build(self.inputs.snapshot(now))
         for name, numbers in seen.items():
             if not np.isfinite(numbers).all():
                 self._stop(f"the observation {name} is not finite", Mode.STOPPED)
