@@ -19,7 +19,7 @@ def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
         what: Begins the list of names.
     """
     there = sorted(names)
-    close = difflib.get_close_matches(name, there, 1, 0.6)
+    close = difflib.get_close_matches(name, there, 1, 0.5)
     if close:
         return f"did you mean {close[0]}?"
     return f"{what}: {', '.join(there[:8])}{', …' if len(there) > 8 else ''}" if there else f"{what} none"

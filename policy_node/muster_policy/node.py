@@ -116,6 +116,7 @@ class PolicyNode:
             finally:
                 self.runner.end("the node ends")
                 self._flush()
+                self._tell(self.summary())
                 node.close()
 
     def _connect(self, node: Node) -> None:
@@ -163,7 +164,6 @@ class PolicyNode:
             if now > report:
                 report = now + REPORT
                 self._tell(self.summary())
-        self._tell(self.summary())
 
     def _wait(self, deadline: float, period: float) -> float | None:
         """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""

@@ -107,7 +107,8 @@ class Runner:
     def end(self, why: str) -> None:
         """Hold the robot where it is, if the node commands it; then nothing more."""
         if self.mode is Mode.ACTING:
-            self._stop(why, Mode.STOPPED)
+            self._hold()
+            self._say(f"{why}: one last command holds the joints where they are", False)
         self.mode = Mode.STOPPED
 
     def _act(self, now: float) -> bool:
@@ -134,12 +135,15 @@ class Runner:
         return True
 
     def _stop(self, why: str, then: Mode) -> None:
-        positions, _ = self.inputs.all[0].value
-        self._give(self.commands.hold(dict(zip(self.observations.joints, positions, strict=True))))
+        self._hold()
         self.mode = then
         self.counts.stops += 1
-        goes_on = "; it goes on when all inputs are fresh" if then is Mode.WAITING else "; ~/reset lets it go on"
-        self._say(f"{why}: one last command holds the joints where they are, and no further one follows{goes_on}", True)
+        goes_on = "when all inputs are fresh" if then is Mode.WAITING else "after ~/reset"
+        self._say(f"{why}: one last command holds the joints where they are; it goes on {goes_on}", True)
+
+    def _hold(self) -> None:
+        positions, _ = self.inputs.all[0].value
+        self._give(self.commands.hold(dict(zip(self.observations.joints, positions, strict=True))))
 
     def _forget(self) -> None:
         self.policy.reset()

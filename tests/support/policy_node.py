@@ -122,7 +122,7 @@ def assert_sees_what_the_task_sees(wired: Wired, steps: int, size: float) -> int
     Args:
         wired: Robot and node.
         steps: How many control steps.
-        size: Standard deviation of the random actions.
+        size: Greatest of the random actions, which are evenly distributed; within their clips.
     """
     task, random, ended = wired.robot.task, np.random.default_rng(3), 0
     names = {group.input: group.name for group in wired.contract.groups}
@@ -131,7 +131,7 @@ def assert_sees_what_the_task_sees(wired: Wired, steps: int, size: float) -> int
             wanted = task.groups[names[name]][:1].numpy()
             assert found.dtype == wanted.dtype and found.shape == wanted.shape
             np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5, err_msg=f"{name} in step {step}")
-        action = size * random.standard_normal(task.action_size)
+        action = random.uniform(-size, size, task.action_size)
         wired.act(action)
         np.testing.assert_allclose(task.actions[0].numpy(), action, rtol=1e-5, atol=1e-5)
         ended += int(task.dones[0])

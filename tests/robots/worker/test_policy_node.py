@@ -1,0 +1,68 @@
+"""What the policy node sees of a robot's messages is what the task sees, and its commands do what the task's actions do."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from muster_policy.messages import Messages
+
+from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
+from worker.deploy.simulated_robot import SimulatedRobot
+from worker.tasks import Observation, find_task, terms
+from worker.tasks.declaration import Declaration
+from worker.tasks.policy_contract import policy_contract
+from worker.tasks.quadruped import Quadruped, QuadrupedConfig
+
+EXACT = {
+    f"observations.{name}.noise": 0.0
+    for name in ("base_lin_vel", "base_ang_vel", "projected_gravity", "joint_pos", "joint_vel")
+}
+
+
+class Everything(Quadruped):
+    """A quadruped that sees all that the node can measure of a root and its joints, with history, clips and offsets."""
+
+    def declare(self, config: QuadrupedConfig) -> Declaration:
+        """Its observations alone are other ones."""
+        shown: Mapping[str, Observation] = {
+            "height": Observation(terms.root_height, offset=0.3, scale=2.0),
+            "place": Observation(terms.root_position),
+            "turn": Observation(terms.root_orientation),
+            "heading": Observation(terms.heading),
+            "up": Observation(terms.root_uprightness),
+            "down": Observation(terms.projected_gravity, history=3),
+            "speed": Observation(terms.root_linear_velocity, clip=(-0.3, 0.3)),
+            "centre": Observation(terms.root_com_linear_velocity),
+            "speed_there": Observation(terms.root_linear_velocity_in_world),
+            "centre_there": Observation(terms.root_com_linear_velocity_in_world),
+            "turning": Observation(terms.root_angular_velocity, scale=(0.25, 0.5, 1.0)),
+            "legs": Observation(terms.joint_offset, joints="*_knee"),
+            "rates": Observation(terms.joint_velocity, joints="front_*", history=2, clip=(-5.0, 5.0)),
+            "asked": Observation(terms.last_action, history=2),
+            "command": Observation(terms.command_vector),
+        }
+        return dataclasses.replace(super().declare(config), observations=shown)
+
+
+def wired(task: Any, name: str) -> Wired:
+    contract = policy_contract(task, name)
+    seen = tuple(group for group in contract.groups if group.name != "critic")
+    return Wired(SimulatedRobot(task, dataclasses.replace(contract, groups=seen), Messages()))
+
+
+@pytest.mark.parametrize("name", ["Go1Flat", "G1Flat"])
+def test_the_node_sees_what_a_robot_s_task_sees(name: str) -> None:
+    """Noise is off; episodes of half a second end in between, and the motors' encoders have their bias."""
+    task_type = find_task(name)
+    task = task_type(task_type.config_type(numbers=EXACT, episode_seconds=0.5), 1, seed=3)
+    there = wired(task, name)
+    assert there.observations.needs == {"joint_states", "imu", "odom"}
+    assert assert_sees_what_the_task_sees(there, 60, 0.3) >= 2
+
+
+def test_the_node_sees_all_that_odometry_and_an_imu_tell() -> None:
+    task = Everything(QuadrupedConfig(episode_seconds=0.5), 1, seed=4)
+    assert assert_sees_what_the_task_sees(wired(task, "Everything"), 60, 0.5) >= 2
