@@ -214,7 +214,7 @@ class PolicyNode:
         make, counts = self.messages.make, self.runner.counts
         mode, values = self.runner.mode, {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
         values["ignored"] = sum(self.inputs.ignored.values())
-        level = {Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2}[mode]
+        level = {Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode]
         pairs = [make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         status = make(
             "diagnostic_msgs/msg/DiagnosticStatus",

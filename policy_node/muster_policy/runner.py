@@ -20,6 +20,7 @@ class Mode(enum.Enum):
     WAITING = "waiting for inputs"
     ACTING = "acting"
     STOPPED = "stopped until it is reset"
+    ENDED = "ended"
 
 
 @dataclass
@@ -81,7 +82,7 @@ class Runner:
         self.inputs.update(self._topics)
         for line in self.inputs.complaints():
             self._say(line, True)
-        if self.mode is Mode.STOPPED or self.inputs.missing():
+        if self.mode in (Mode.STOPPED, Mode.ENDED) or self.inputs.missing():
             return False
         if stale := self.inputs.stale(now, self.timeout):
             if self.mode is Mode.ACTING:
@@ -109,7 +110,7 @@ class Runner:
         if self.mode is Mode.ACTING:
             self._hold()
             self._say(f"{why}: one last command holds the joints where they are", False)
-        self.mode = Mode.STOPPED
+        self.mode = Mode.ENDED
 
     def _act(self, now: float) -> bool:
         silent = {each.topic for each in self.inputs.silent_commands(now)}

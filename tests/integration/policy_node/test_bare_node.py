@@ -45,7 +45,7 @@ def test_the_node_runs_bare_and_is_small(bare: Path, tmp_path: Path, capsys: pyt
     assert checked.returncode == 0 and "self-test passed" in checked.stdout, checked.stderr
     alone = ["--connect", "tcp/127.0.0.1:9", "--duration", "0.5"]
     ran = subprocess.run([*command, *alone], env=env, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert ran.returncode == 0 and "waiting for inputs: 0 steps at 50 Hz" in ran.stdout, ran.stderr
+    assert ran.returncode == 0 and "ended: 0 steps at 50 Hz" in ran.stdout, ran.stderr
     code = (
         "import sys, json, pkgutil, importlib, muster_policy\n"
         "for each in pkgutil.iter_modules(muster_policy.__path__): importlib.import_module('muster_policy.' + each.name)\n"

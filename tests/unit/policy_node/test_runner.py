@@ -126,12 +126,15 @@ def test_a_reset_forgets_the_recurrent_state(tmp_path: Path) -> None:
 
 
 def test_the_end_holds_the_joints_where_the_node_commands_them(rig: Rig) -> None:
-    rig.runner.end("the node ends")
-    assert rig.given == [], "it commanded nothing yet"
-    rig.runner.reset()
     rig.step(0.0, knee=0.4)
     rig.runner.end("the node ends")
+    assert rig.lines[-1] == "the node ends: one last command holds the joints where they are"
     assert rig.given[-1] == pytest.approx(0.1) and not rig.step(0.01, knee=0.4)
+
+
+def test_a_node_that_ends_before_it_commanded_anything_says_nothing(rig: Rig) -> None:
+    rig.runner.end("the node ends")
+    assert rig.given == [] and rig.lines == [] and not rig.step(0.01, knee=0.4)
 
 
 def test_commands_stay_within_limits() -> None:
