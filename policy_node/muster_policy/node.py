@@ -142,18 +142,18 @@ class PolicyNode:
         begin = time.monotonic()
         ends = begin + (self.settings.duration or float("inf"))
         second, patience, report = begin + 1.0, begin + 1.0, begin + REPORT
-        period, deadline = 1.0 / self.rate, begin
+        self._deadline = begin
         while not self.stopping.is_set():
-            begun = self._wait(deadline, period)
-            deadline = deadline if begun is None else begun
+            due = self._wait(1.0 / self.rate)
             now = time.monotonic()
             if now > ends:
                 break
             if self._reset.is_set():
                 self._reset.clear()
                 self.runner.reset()
-            acted = self.runner.step(now, due=begun is not None)
-            self._measure(now, deadline, acted)
+            acted = self.runner.step(now, due=due is not None)
+            if due is not None and acted:
+                self._measure(due, now)
             self._flush()
             if now > second:
                 second = now + 1.0
@@ -165,16 +165,14 @@ class PolicyNode:
                 report = now + REPORT
                 self._tell(self.summary())
 
-    def _wait(self, deadline: float, period: float) -> float | None:
+    def _wait(self, period: float) -> float | None:
         """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""
         if self.settings.trigger == "timer":
-            now = time.monotonic()
-            deadline += period
-            if now > deadline + period:  # steps that were missed are not made up for
-                deadline = now
-            sleep_until(deadline)
-            return deadline
-        joints, earliest = self.inputs.all[0], deadline + 0.75 * period
+            due, now = self._deadline + period, time.monotonic()
+            self._deadline = now if now > due + period else due  # steps that were missed are not made up for
+            sleep_until(due)
+            return due
+        joints, earliest = self.inputs.all[0], self._deadline + 0.75 * period
         limit = time.monotonic() + min(self.timeout, 0.1)
         with self.inputs.news:
             while joints.waiting is None or joints.waiting[1] < earliest:
@@ -182,13 +180,12 @@ class PolicyNode:
                 if left <= 0.0:
                     return None
                 self.inputs.news.wait(left)
-            return joints.waiting[1]
+            self._deadline = joints.waiting[1]
+        return self._deadline
 
-    def _measure(self, now: float, deadline: float, acted: bool) -> None:
-        if not acted:
-            return
+    def _measure(self, due: float, now: float) -> None:
         done = time.monotonic()
-        self.figures.add("late", now - deadline)
+        self.figures.add("late", now - due)
         self.figures.add("step", done - now)
         self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
 

@@ -45,7 +45,7 @@ class Figures:
         for name in self._kept:
             found = self.percentiles(name)
             if found:
-                parts.append(f"{name} p50 {found[0] * 1e3:.2f}, p99 {found[1] * 1e3:.2f}, max {found[2] * 1e3:.2f} ms")
+                parts.append(f"{name} p50 {found[0] * 1e3:.3f}, p99 {found[1] * 1e3:.3f}, max {found[2] * 1e3:.2f} ms")
         return "; ".join(parts) or "no step yet"
 
     def clear(self) -> None:

@@ -41,7 +41,7 @@ class SimulatedRobot:
     """
 
     def __init__(self, task: DeclaredTask, contract: Contract, messages: Messages) -> None:
-        self.task, self.contract, self._messages = task, contract, messages
+        self.task, self.contract, self.messages = task, contract, messages
         self._view = task.views["robot"]
         self._arrays = task.robots["robot"]
         units = [term.frame for group in contract.groups for term in group.terms if term.quantity.startswith("imu_")]
@@ -61,9 +61,9 @@ class SimulatedRobot:
             if group.image is not None:
                 topic = "image_raw" if group.name == "policy" else f"{group.name}/image_raw"
                 found.append((topic, "sensor_msgs/msg/Image", self._image(group.name, len(group.image.channels))))
-        header, view, arrays = self._messages.header(nanoseconds), self._view, self.task.worlds.arrays
+        header, view, arrays = self.messages.header(nanoseconds), self._view, self.task.worlds.arrays
         positions = arrays.joint_q.numpy()[0, view.coordinates] + self._arrays.encoder_bias.numpy()[0]
-        joints = self._messages.make(
+        joints = self.messages.make(
             "sensor_msgs/msg/JointState",
             header=header,
             name=list(view.joint_names),
@@ -90,7 +90,7 @@ class SimulatedRobot:
 
     def _root(self, nanoseconds: int) -> list[Message]:
         """IMU and odometry from the pose and velocities of the free root."""
-        make, view, arrays = self._messages.make, self._view, self.task.worlds.arrays
+        make, view, arrays = self.messages.make, self._view, self.task.worlds.arrays
         pose = arrays.joint_q.numpy()[0, view.root_coordinate : view.root_coordinate + 7].astype(np.float64)
         velocity = arrays.joint_qd.numpy()[0, view.root_dof : view.root_dof + 6].astype(np.float64)
         com = self.task.worlds.model.body_com.numpy().reshape(-1, 3)[view.root_body].astype(np.float64)
@@ -98,31 +98,31 @@ class SimulatedRobot:
         angular = turn.T @ velocity[3:]
         linear = turn.T @ velocity[:3] - np.cross(angular, com)
         mount, zeros = _matrix(self._mount), np.zeros(9)
-        header = self._messages.header(nanoseconds, "imu")
+        header = self.messages.header(nanoseconds, "imu")
         imu = make(
             "sensor_msgs/msg/Imu",
             header=header,
-            orientation=self._messages.quaternion(_times(pose[3:], self._mount)),
+            orientation=self.messages.quaternion(_times(pose[3:], self._mount)),
             orientation_covariance=zeros,
-            angular_velocity=self._messages.vector(mount.T @ angular),
+            angular_velocity=self.messages.vector(mount.T @ angular),
             angular_velocity_covariance=zeros,
-            linear_acceleration=self._messages.vector(np.zeros(3)),
+            linear_acceleration=self.messages.vector(np.zeros(3)),
             linear_acceleration_covariance=NOT_MEASURED,
         )
         x, y, z = pose[:3].tolist()
         placed = make(
             "geometry_msgs/msg/Pose",
             position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=self._messages.quaternion(pose[3:]),
+            orientation=self.messages.quaternion(pose[3:]),
         )
         odometry = make(
             "nav_msgs/msg/Odometry",
-            header=self._messages.header(nanoseconds, "odom"),
+            header=self.messages.header(nanoseconds, "odom"),
             child_frame_id=view.body_names[0],
             pose=make("geometry_msgs/msg/PoseWithCovariance", pose=placed, covariance=np.zeros(36)),
             twist=make(
                 "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._messages.twist(linear, angular),
+                twist=self.messages.twist(linear, angular),
                 covariance=np.zeros(36),
             ),
         )
@@ -136,19 +136,19 @@ class SimulatedRobot:
             memory = self.task.state_tensors()["memory"][0, told.first : told.first + len(command.names)]
             numbers = memory.double().tolist()
             if command.library and command.quantity in TWISTS:
-                twist = self._messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
+                twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
                 found.append(("cmd_vel", "geometry_msgs/msg/Twist", twist))
             else:
-                array = self._messages.array(numbers)
+                array = self.messages.array(numbers)
                 found.append((f"commands/{command.name}", "std_msgs/msg/Float64MultiArray", array))
         return found
 
     def _image(self, group: str, channels: int) -> Any:
         pixels = self.task.groups[group][0, :channels].numpy().transpose(1, 2, 0)
         height, width, _ = pixels.shape
-        return self._messages.make(
+        return self.messages.make(
             "sensor_msgs/msg/Image",
-            header=self._messages.header(0, "camera"),
+            header=self.messages.header(0, "camera"),
             height=height,
             width=width,
             encoding="rgb8" if channels == 3 else "mono8",

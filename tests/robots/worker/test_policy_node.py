@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from muster_policy.messages import Messages
 
+from muster_policy.messages import Messages
 from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
 from worker.deploy.simulated_robot import SimulatedRobot
 from worker.tasks import Observation, find_task, terms
