@@ -47,6 +47,23 @@ class Everything(Quadruped):
         return dataclasses.replace(super().declare(config), observations=shown)
 
 
+def test_the_contract_says_where_things_are_measured_and_what_is_of_the_library() -> None:
+    """As the files of the robots have it: the Go1's unit sits on the trunk, to the right; the quadruped's centre of mass is its origin."""
+    task = find_task("Go1Flat")
+    (group, *_) = policy_contract(task(task.config_type(), 1), "Go1Flat").groups
+    terms_of = {term.name: term for term in group.terms}
+    unit = terms_of["base_lin_vel"].frame
+    assert unit is not None and (unit.name, unit.body, unit.root) == ("imu", "trunk", True)
+    assert unit.position == pytest.approx((-0.01592, -0.06659, -0.00617), abs=1e-6)
+    down = terms_of["projected_gravity"].frame
+    assert down is not None and (down.name, down.position) == ("trunk", (0.0, 0.0, 0.0))
+    assert terms_of["joint_pos"].frame is None and all(term.library for term in group.terms)
+    ant = find_task("Ant")
+    (group, *_) = policy_contract(ant(ant.config_type(), 1), "Ant").groups
+    told = {term.quantity: term.library for term in group.terms}
+    assert told["root_height"] and not told["attitude"], "the task's own function"
+
+
 def wired(task: Any, name: str) -> Wired:
     contract = policy_contract(task, name)
     seen = tuple(group for group in contract.groups if group.name != "critic")

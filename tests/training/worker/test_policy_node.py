@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import socket
@@ -20,11 +21,14 @@ from muster_policy.graph import Node, open_session
 from muster_policy.messages import Messages
 from shared_store.layout import Run
 from tests.conftest import REPOSITORY, wait_for
+from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
 from worker.deploy import bundle
 from worker.deploy.simulated_robot import SimulatedRobot, open_robot, play
 from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.cartpole_pixels import CartpolePixels
+from worker.tasks.configs.cartpole import CartpolePixelsConfig
 from worker.tasks.policy_contract import policy_contract
 
 SECONDS, EPISODES, SEED = 2.0, 3, 11
@@ -124,6 +128,15 @@ def test_the_node_reaches_the_return_of_the_direct_evaluation_in_real_time(
     assert found == pytest.approx(wanted, rel=0.05), said
 
 
+def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:
+    """Two frames, the present one first; episodes of a fifth of a second end in between."""
+    task = CartpolePixels(CartpolePixelsConfig(episode_seconds=0.2), 1, seed=2)
+    contract = policy_contract(task, "CartpolePixels")
+    seen = tuple(group for group in contract.groups if group.name == "policy")
+    wired = Wired(SimulatedRobot(task, dataclasses.replace(contract, groups=seen), Messages()))
+    assert assert_sees_what_the_task_sees(wired, 30, 1.0) >= 2
+
+
 def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,8 +144,6 @@ def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
     from shared_store.bundles import read_contract
 
     assert isinstance(open_robot(exported, Messages()), SimulatedRobot)
-    import dataclasses
-
     changed = dataclasses.replace(read_contract(exported), control_hz=30.0)
     monkeypatch.setattr(contracts, "policy_contract", lambda *_: changed)
     with pytest.raises(
