@@ -141,10 +141,9 @@ class Observations:
     def _measured(self, term: Term) -> Reader:
         """What reads the quantity of a term. Raises Refused with what would be needed."""
         if not term.library:
-            what = term.quantity or "a quantity that is not declared"
-            raise Refused(
-                f"{what} is none of Muster's library (or the contract is of format 1: export the policy again)"
-            )
+            if self._contract.format < 2:
+                raise Refused("the contract is of format 1, which does not say what it is; export the policy again")
+            raise Refused(f"{term.quantity or 'a quantity that is not declared'} is no function of Muster's library")
         if term.kind == "command":
             return self._command(term)
         if term.kind == "previous_action":

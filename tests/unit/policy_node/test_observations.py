@@ -254,7 +254,7 @@ LEG = Frame("foot", "foot", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), False)
     [
         (
             (term("attitude", 0, 4, library=False),),
-            "attitude: attitude is none of Muster's library (or the contract is of format 1: export the policy again)",
+            "attitude: attitude is no function of Muster's library",
         ),
         (
             (term("scanned_height", 0, 2, sensors={"scan": "HeightScan, bodies trunk"}),),
@@ -290,7 +290,7 @@ LEG = Frame("foot", "foot", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), False)
         ),
         (
             (term("a", 0, 1, quantity="x", library=False), term("b", 1, 1, quantity="y", library=False)),
-            "a: x is none of Muster's library (or the contract is of format 1: export the policy again); b: y is none of Muster's",
+            "a: x is no function of Muster's library; b: y is no function of Muster's library",
         ),
     ],
 )
@@ -334,5 +334,8 @@ def test_a_contract_of_format_1_is_read_and_refused_with_what_to_do() -> None:
         del each["range"]
     for each in document["commands"]:
         del each["quantity"], each["library"]
-    with pytest.raises(Refused, match="the contract is of format 1: export the policy again"):
+    with pytest.raises(
+        Refused,
+        match="joint_velocity: the contract is of format 1, which does not say what it is; export the policy again",
+    ):
         Observations(read(json.dumps(document).encode(), "contract.json"))
