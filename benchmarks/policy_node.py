@@ -30,7 +30,7 @@ from shared_store.bundles import seal
 from shared_store.policy_contract import Contract
 
 REPOSITORY = Path(__file__).parent.parent
-REPEATS, SECONDS = 5, 4.0
+REPEATS, SECONDS = 3, 4.0
 RATES = (50.0, 500.0)
 LAYERS = (512, 256, 128)
 BRIDGE = 16.7

@@ -180,8 +180,10 @@ class PolicyNode:
                 if left <= 0.0:
                     return None
                 self.inputs.news.wait(left)
-            self._deadline = joints.waiting[1]
-        return self._deadline
+            arrived = joints.waiting[1]
+        due = self._deadline + period
+        self._deadline = arrived if arrived > due + period else due  # one that comes late does not put off the next
+        return arrived
 
     def _measure(self, due: float, now: float) -> None:
         done = time.monotonic()
