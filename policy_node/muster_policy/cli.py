@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -103,15 +104,15 @@ def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
         trigger=given.trigger,
         timeout=given.timeout,
         strict=given.strict_limits,
-        controller=given.controller,
+        controller=given.controller and _ros_name("--controller", given.controller),
         joints=read_joints(given.joints, names) if given.joints else {},
         remap=dict(_remapping(each) for each in given.remap),
         distribution=given.distro,
         domain=_domain(given.domain),
         connect=given.connect or (None if given.listen else "tcp/localhost:7447"),
         listen=given.listen,
-        namespace=given.namespace,
-        name=given.name,
+        namespace=_ros_name("--namespace", given.namespace) if given.namespace.strip("/") else "/",
+        name=_ros_name("--name", given.name),
         duration=given.duration,
     )
 
@@ -160,7 +161,17 @@ def _remapping(text: str) -> tuple[str, str]:
     topic, sign, name = text.partition(":=")
     if not (topic and sign and name):
         raise Refused(f"--remap {text}: expected TOPIC:=NAME, such as imu:=/imu/data")
-    return topic, name
+    return topic, _ros_name("--remap", name)
+
+
+def _ros_name(option: str, text: str) -> str:
+    """A name as ROS has them. Raises Refused."""
+    parts = text.removeprefix("/").split("/")
+    if not all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", part) for part in parts):
+        raise Refused(f"{option} {text}: a name of ROS has letters, digits and _ between its slashes, no digit first")
+    if option == "--name" and "/" in text:
+        raise Refused(f"--name {text}: a node's name has no slash; give --namespace besides")
+    return text
 
 
 def _domain(given: int | None) -> int:
@@ -174,7 +185,10 @@ def _domain(given: int | None) -> int:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"expected a number above 0, found {text}")
     return value

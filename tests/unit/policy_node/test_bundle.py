@@ -148,6 +148,13 @@ def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, t
     [
         (("--remap", "imu"), "--remap imu: expected TOPIC:=NAME, such as imu:=/imu/data"),
         (("--remap", "imu:=/x"), "--remap imu: the node has no such topic; it has joint_commands, joint_states"),
+        (
+            ("--remap", "joint_states:=/a/*"),
+            "--remap /a/*: a name of ROS has letters, digits and _ between its slashes",
+        ),
+        (("--namespace", "/left arm"), "--namespace /left arm: a name of ROS has letters"),
+        (("--name", "a/b"), "--name a/b: a node's name has no slash; give --namespace besides"),
+        (("--controller", "2nd"), "--controller 2nd: a name of ROS has letters"),
         (("--domain", "233"), "domain 233: expected 0 to 232"),
         (("--listen", "nonsense"), "--listen nonsense: Zenoh can't open it"),
         (("--joints", "JOINTS"), "line 2: the policy has no joint kne; did you mean knee?"),
