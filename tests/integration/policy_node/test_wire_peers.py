@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xxhash
 import zenoh
 from mcap_ros2._dynamic import generate_dynamic as dynamic
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
@@ -157,8 +158,6 @@ def test_what_the_node_says_is_read_by_another_cdr_reader_and_has_rmw_zenoh_s_at
         (token,) = (key for key in keys if "/MP/%/%/muster_policy/%joint_commands/" in key)
         ear.undeclare()
         node.close()
-    import xxhash
-
     numbers = []
     for sample in got:
         assert sample.attachment is not None

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import numpy as np
 import pytest
 
+from muster_policy.contract import read
 from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
 from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
@@ -323,10 +325,6 @@ def test_a_joint_of_another_name_on_the_robot_is_found_by_it() -> None:
 
 def test_a_contract_of_format_1_is_read_and_refused_with_what_to_do() -> None:
     document = contract(dataclasses.replace(term("joint_velocity", 0, 2, **JOINTS), library=False)).document()
-    import json
-
-    from muster_policy.contract import read
-
     document["format"] = 1
     for each in document["groups"][0]["terms"]:
         del each["library"], each["frame"]
