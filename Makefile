@@ -110,12 +110,13 @@ env: $(READY)
 # torch first and alone: an environment that has it installs nothing more for the packages that want it
 # mjlab (Apache-2.0) for the files of real robots that it brings along, which the tests and the jobs of those robots read: none of its code
 # is imported, and so nothing that it depends on is needed
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml policy_node/pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Muster needs Python 3.11 or newer; set PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[worker,aws,dev]'
 	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --no-deps mjlab
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable policy_node
 	touch $(READY)
 
 # the image, and a cluster of containers of it: containers/compose.yaml

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from shared_store.documents import DocumentError, parse
 
-FORMAT = 1
+FORMAT = 2
 """Version of the document; a newer one is refused."""
 CLOSE = 1e-6
 """Relative difference up to which two numbers are the same: a model that is compiled anew rounds."""
@@ -28,6 +28,22 @@ class _Part:
     """What the parts of a contract have in common: JSON Schema takes the texts under their fields."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"use_attribute_docstrings": True, "extra": "forbid"}
+
+
+@dataclass(frozen=True)
+class Frame(_Part):
+    """A frame on a body of the robot, in which a vector is measured."""
+
+    name: str
+    """Of the site or body."""
+    body: str
+    """The body that it is on."""
+    position: tuple[float, float, float]
+    """Of its origin in the body's frame [m]."""
+    rotation: tuple[float, float, float, float]
+    """From it to the body's frame, a quaternion xyzw."""
+    root: bool
+    """Whether the body is the robot's root."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +87,10 @@ class Term(_Part):
     """Sensors that it reads, each with its kind and what it is on."""
     command: str = ""
     """The command that it tells, by name."""
+    library: bool = False
+    """Whether ``quantity`` is a function of Muster's library, so that its name says what it computes."""
+    frame: Frame | None = None
+    """Where a quantity of the robot's root or of a sensor is measured, and along which axes; null: not known, or it has no such place."""
 
     @property
     def size(self) -> int:
@@ -135,6 +155,8 @@ class Action(_Part):
     """Gain on the velocity, which the actuator works against [N s/m, N m s/rad]."""
     effort_limit: float | None = None
     """Greatest force or torque of the actuator [N, N m]; null: not limited."""
+    range: Pair | None = None
+    """Least and greatest position of the joint [m, rad]; null: not limited, or not known."""
     rule: str = ""
     """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
 
@@ -153,6 +175,10 @@ class Command(_Part):
     """Least and greatest value of each in training [unit]; null: not known."""
     seconds: Pair
     """Least and greatest time for which it held in training [s]."""
+    quantity: str = ""
+    """Name of the function that draws it; empty: not declared."""
+    library: bool = False
+    """Whether that is a function of Muster's library."""
 
 
 @dataclass(frozen=True)
@@ -298,6 +324,7 @@ def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
             "command": term.command,
             **{f"parameter {name}": value for name, value in term.parameters.items()},
             **{f"sensor {name}": value for name, value in term.sensors.items()},
+            "frame": term.frame and (term.frame.body, *term.frame.position, *term.frame.rotation),
         }
         if ranges:
             common["delay"] = term.delay
@@ -319,7 +346,7 @@ def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
 def _actions(contract: Contract) -> dict[str, dict[str, Any]]:
     if not contract.actions:
         return {name: {} for name in contract.action_names}
-    fields = [field.name for field in dataclasses.fields(Action) if field.name != "name"]
+    fields = [field.name for field in dataclasses.fields(Action) if field.name not in ("name", "range")]
     return {action.name: {name: getattr(action, name) for name in fields} for action in contract.actions}
 
 
@@ -353,6 +380,8 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]
         old, new = before.get(name), now.get(name)
         if (name in before) != (name in now):
             yield f"{name} {_value(new if name in now else old)} is {'new' if name in now else 'gone'}"
+        elif name == "frame" and None in (old, new):
+            continue  # a contract of format 1 does not say it
         elif not _same(old, new):
             yield f"{name} {_value(old)} became {_value(new)}"
 

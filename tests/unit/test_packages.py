@@ -17,6 +17,7 @@ FORBIDDEN = {
     "orchestrator": HEAVY | {"worker"},
     "shared_store": HEAVY | {"worker", "orchestrator"},
     "worker": {"orchestrator"},
+    "policy_node": HEAVY | {"worker", "orchestrator", "shared_store"},
 }
 LIGHT_IN_WORKER = (
     "supervisor.py",

@@ -55,6 +55,7 @@ class RobotView:
         root_coordinate: First column of the free root in ``joint_q``; -1: it is fixed.
         root_dof: First column of the free root in ``joint_qd``; -1: it is fixed.
         root_body: Column of its first body.
+        root_com: Centre of mass of its first body, in the body's frame [m].
         start: Pose of the root at the start, in the world frame.
     """
 
@@ -78,6 +79,8 @@ class RobotView:
         self.dofs: list[int] = []
         self.root_coordinate = self.root_dof = -1
         self.root_body = self.bodies[0]
+        x, y, z = (float(each) for each in template.body_com[self.root_body])
+        self.root_com = (x, y, z)
         self.start = wp.transform(*template.body_q[self.root_body])
         for joint in self._mine(template.joint_label):
             first, dof = template.joint_q_start[joint], template.joint_qd_start[joint]

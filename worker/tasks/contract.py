@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -130,11 +131,17 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
                 clip=_both(clip, limits),
                 stiffness=stiffness,
                 damping=0.0 if is_effort else damping,
+                range=_range(view, joint),
                 effort_limit=effort if effort != float("inf") else abs(gain) if is_effort else None,
                 rule=_rule(term),
             )
         )
     return found
+
+
+def _range(view: RobotView, joint: int) -> tuple[float, float] | None:
+    low, high = (float(end) for end in view.ranges[joint])
+    return (low, high) if math.isfinite(low) and math.isfinite(high) else None
 
 
 _GAINS = ("stiffness", "damping", "effort_limit")

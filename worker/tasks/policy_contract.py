@@ -10,6 +10,7 @@ from shared_store import __version__
 from shared_store.policy_contract import Command, Contract, Group, Image, State, Term
 from worker.tasks.contract import described, range_of
 from worker.tasks.images import described as images_of
+from worker.tasks.measured import frame_of, is_library
 from worker.tasks.tables import settings
 
 if TYPE_CHECKING:
@@ -144,6 +145,8 @@ def _term(plan: Plan, seen: Seen, first: int) -> Term:
         elements=tuple(bound.element_names) if bound.elements is not None else (),
         sensors={name: _sensor(plan.declaration.sensors[name]) for name in sensors},
         command=command,
+        library=is_library(term),
+        frame=frame_of(plan, term, sensors),
     )
 
 
@@ -160,7 +163,8 @@ def _commands(plan: Plan | None) -> tuple[Command, ...]:
         name, command = told.bound.name, plan.declaration.commands[told.bound.name]
         ranges: Sequence[Any] = [range_of(plan, name, command, column) for column in command.names]
         seconds = (plan.numbers.values[told.seconds], plan.numbers.values[told.seconds + 1])
-        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds))
+        drawn = (command.function_name, is_library(command))
+        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds, *drawn))
     return tuple(found)
 
 

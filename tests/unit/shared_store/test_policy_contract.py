@@ -17,6 +17,7 @@ from shared_store.policy_contract import (
     Action,
     Command,
     Contract,
+    Frame,
     Group,
     Image,
     State,
@@ -88,8 +89,8 @@ def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schem
     ("change", "said"),
     [
         (
-            lambda found: found.update(format=2),
-            "contract.json: has format 2, this Muster reads up to 1; upgrade Muster",
+            lambda found: found.update(format=3),
+            "contract.json: has format 3, this Muster reads up to 2; upgrade Muster",
         ),
         (lambda found: found.pop("task"), "contract.json: task is missing"),
         (
@@ -156,6 +157,35 @@ def test_each_change_of_meaning_is_a_line() -> None:
         "the recurrent state h [1, 64] became h [1, 32]"
     ]
     assert after(lambda found: found["commands"].clear()) == ["the command velocity is gone"]
+
+
+def test_where_a_quantity_is_measured_counts_where_both_contracts_say_it() -> None:
+    def placed(*position: float) -> Contract:
+        frame = Frame("imu", "trunk", position, (0.0, 0.0, 0.0, 1.0), True)  # type: ignore[arg-type]
+        group = dataclasses.replace(CONTRACT.groups[0], terms=(ANGLES, dataclasses.replace(SPEED, frame=frame)))
+        return dataclasses.replace(CONTRACT, groups=(group, CONTRACT.groups[1]))
+
+    first, second = placed(0.0, 0.0, 0.0), placed(0.0, 0.0, 0.1)
+    assert differences(first, first) == [] == differences(CONTRACT, first) == differences(first, CONTRACT)
+    (line,) = differences(first, second)
+    assert (
+        line.startswith("observation 4: speed frame [trunk, 0.0, 0.0, 0.0") and "became [trunk, 0.0, 0.0, 0.1" in line
+    )
+
+
+def test_a_contract_of_format_1_is_read_as_one_that_says_less() -> None:
+    def older(found: dict[str, Any]) -> None:
+        found["format"] = 1
+        for each in found["groups"][0]["terms"]:
+            del each["frame"], each["library"]
+        for each in found["actions"]:
+            del each["range"]
+        for each in found["commands"]:
+            del each["quantity"], each["library"]
+
+    there = read(document(older))
+    assert there.format == 1 and not there.groups[0].terms[0].library and there.actions[0].range is None
+    assert differences(there, CONTRACT) == [] == differences(CONTRACT, there)
 
 
 def test_names_that_come_go_and_move_are_told_by_name() -> None:

@@ -1,0 +1,118 @@
+"""From the policy's actions to joint commands, within limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from muster_policy.contract import Action, Contract
+from muster_policy.errors import Refused
+from muster_policy.messages import Messages
+
+KINDS = ("position", "velocity", "effort")
+"""What a joint can be commanded, named as the fields of a ``sensor_msgs/JointState``."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Joint commands of one moment.
+
+    Attributes:
+        values: One for each action, in their order [unit of each].
+        limited: How many of them the limits changed.
+    """
+
+    values: np.ndarray
+    limited: int
+
+
+class Commands:
+    """Makes joint commands.
+
+    Args:
+        contract: Of the policy.
+        names: Name of a joint on the robot by its name in the contract, where it differs.
+        strict: Keep position targets within the joints' ranges; else beyond them by ``effort_limit / stiffness``, as far as a target
+            can still change the actuator's torque.
+
+    Raises:
+        Refused: An action is no joint command, or more than a scale and an offset.
+    """
+
+    def __init__(self, contract: Contract, names: Mapping[str, str] | None = None, strict: bool = False) -> None:
+        if contract.discrete or not contract.actions:
+            what = "chooses among " if contract.discrete else "does not say what its actions are: "
+            raise Refused(
+                f"task {contract.task} can't drive joints: the policy {what}{', '.join(contract.action_names[:5])}"
+            )
+        if ruled := [action for action in contract.actions if action.rule]:
+            raise Refused(
+                f"task {contract.task}: the command of {ruled[0].name} has a rule that the node lacks: {ruled[0].rule}"
+            )
+        self.actions = contract.actions
+        renamed = names or {}
+        self.joints = [renamed.get(action.name, action.name) for action in contract.actions]
+        self.kinds = {
+            kind: [index for index, action in enumerate(contract.actions) if action.kind == kind] for kind in KINDS
+        }
+        self.kinds = {kind: columns for kind, columns in self.kinds.items() if columns}
+        self._scale = np.array([action.scale for action in contract.actions])
+        self._offset = np.array([action.offset for action in contract.actions])
+        clips = [action.clip or (-np.inf, np.inf) for action in contract.actions]
+        self._least, self._most = np.array(clips).T
+        self._low, self._high = np.array([limits(action, strict) for action in contract.actions]).T
+
+    def command(self, action: np.ndarray) -> Command:
+        """Commands for what the policy asked for, shape ``(actions,)``, finite."""
+        value = self._offset + self._scale * np.clip(action.astype(np.float64), self._least, self._most)
+        limited = np.clip(value, self._low, self._high)
+        return Command(limited, int((limited != value).sum()))
+
+    def hold(self, positions: Mapping[str, float]) -> Command:
+        """What stops the robot where it is: the measured positions as targets, no velocity, no force.
+
+        Args:
+            positions: Measured, by joint as the contract names it [m, rad].
+        """
+        held = [positions[action.name] if action.kind == "position" else 0.0 for action in self.actions]
+        return Command(np.array(held), 0)
+
+    def joint_states(self, command: Command, messages: Messages, nanoseconds: int) -> list[Any]:
+        """A command as ``sensor_msgs/JointState``: one message of each kind of command, with its joints alone."""
+        header, found = messages.header(nanoseconds), []
+        for kind, columns in self.kinds.items():
+            values = dict.fromkeys(KINDS, np.zeros(0)) | {kind: command.values[columns]}
+            names = [self.joints[column] for column in columns]
+            found.append(messages.make("sensor_msgs/msg/JointState", header=header, name=names, **values))
+        return found
+
+    def table(self) -> list[str]:
+        """The joints with their default positions, gains and limits, a line each, for who sets up the robot's controllers."""
+        width = max(map(len, self.joints))
+        lines = []
+        for name, action in zip(self.joints, self.actions, strict=True):
+            low, high = limits(action, False)
+            unit = action.unit
+            gains = f"stiffness {action.stiffness:.4g}, damping {action.damping:.4g}"
+            effort = "" if action.effort_limit is None else f", effort up to {action.effort_limit:.4g}"
+            lines.append(
+                f"  {name:{width}}  {action.kind} [{unit}] {low:.3f} to {high:.3f}, default position "
+                f"{action.default_position:.4f}, {gains}{effort}"
+            )
+        return lines
+
+
+def limits(action: Action, strict: bool) -> tuple[float, float]:
+    """Least and greatest command of a joint; infinite where the contract knows none."""
+    if action.kind == "effort":
+        most = np.inf if action.effort_limit is None else action.effort_limit
+        return -most, most
+    if action.kind == "velocity" or action.range is None:
+        return -np.inf, np.inf
+    beyond = 0.0
+    if not strict and action.stiffness > 0.0:
+        beyond = np.inf if action.effort_limit is None else action.effort_limit / action.stiffness
+    return action.range[0] - beyond, action.range[1] + beyond

@@ -1,0 +1,115 @@
+"""A policy bundle: read whole, and refused where a byte of it is not as it was sealed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from muster_policy.contract import Contract, read
+from muster_policy.errors import Refused
+
+FORMAT = 1
+"""The newest version of the manifest that the node reads."""
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What the node needs of a bundle, in memory: nothing is read again after it was verified.
+
+    Attributes:
+        path: Of the directory.
+        manifest: ``manifest.json``.
+        contract: ``contract.json``.
+        model: ``policy.onnx``.
+        parity: ``parity.npz``.
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+    contract: Contract
+    model: bytes
+    parity: bytes
+
+    @property
+    def origin(self) -> str:
+        """Run and checkpoint that it is of."""
+        return f"{self.manifest.get('run', 'unknown run')}, checkpoint {self.manifest.get('checkpoint', 'unknown')}"
+
+
+def open_bundle(path: Path) -> Bundle:
+    """Read and verify a bundle: every file is listed and as it was sealed, none is missing and none was added.
+
+    Args:
+        path: Its directory.
+
+    Raises:
+        Refused: It is none, or something in it differs.
+    """
+    if not path.is_dir():
+        raise Refused(f"{path}: it is no directory; name a bundle that `muster export` made")
+    manifest = _manifest(path)
+    content: dict[str, bytes] = {}
+    for name, entry in sorted(manifest["files"].items()):
+        data = _read(path, name)
+        if len(data) != entry["size"]:
+            raise Refused(
+                f"{path}: {name} has {len(data)} bytes, {entry['size']} were written; copy the bundle once more"
+            )
+        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+            raise Refused(f"{path}: {name} was altered (SHA-256 differs); copy the bundle once more")
+        if name in ("contract.json", "policy.onnx", "parity.npz"):
+            content[name] = data
+    for name in sorted(_listed(path) - set(manifest["files"]) - {MANIFEST}):
+        raise Refused(f"{path}: {name} was added, {MANIFEST} does not list it; remove it")
+    for name in ("contract.json", "policy.onnx", "parity.npz"):
+        if name not in content:
+            raise Refused(f"{path}: {MANIFEST} lists no {name}; export the policy again")
+    contract = read(content["contract.json"], f"{path}: contract.json")
+    return Bundle(path, manifest, contract, content["policy.onnx"], content["parity.npz"])
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    data = _read(path, MANIFEST)
+    try:
+        manifest: dict[str, Any] = json.loads(data)
+        if manifest["format"] > FORMAT:
+            raise Refused(
+                f"{path}: {MANIFEST} has format {manifest['format']}, this node reads up to {FORMAT}; upgrade muster-policy"
+            )
+        bare = {name: value for name, value in manifest.items() if name != "digest"}
+        sound = data == _written(manifest) and manifest["digest"] == hashlib.sha256(_written(bare)).hexdigest()
+        for name, entry in manifest["files"].items():
+            parts = Path(name).parts
+            sound &= isinstance(entry["size"], int) and isinstance(entry["sha256"], str)
+            sound &= bool(parts) and not Path(name).is_absolute() and ".." not in parts
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise Refused(f"{path}: {MANIFEST} is no manifest of a bundle; export the policy again") from None
+    if not sound:
+        raise Refused(f"{path}: {MANIFEST} was altered (SHA-256 differs); copy the bundle once more")
+    return manifest
+
+
+def _written(manifest: dict[str, Any]) -> bytes:
+    return (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode()
+
+
+def _read(path: Path, name: str) -> bytes:
+    file = path / name
+    if file.is_symlink() or (file.exists() and not file.is_file()):
+        raise Refused(f"{path}: {name} is not a regular file; copy the bundle once more")
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        hint = "name a bundle that `muster export` made" if name == MANIFEST else "copy the bundle once more"
+        raise Refused(f"{path}: {name} is missing; {hint}") from None
+    except OSError as error:
+        raise Refused(f"{path}: {name} can't be read ({error.strerror})") from None
+
+
+def _listed(path: Path) -> set[str]:
+    return {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}

@@ -1,0 +1,202 @@
+"""``muster-policy BUNDLE``: run a policy bundle on a robot."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from muster_policy import __version__
+from muster_policy.bundle import Bundle, open_bundle
+from muster_policy.errors import Refused, nearest
+from muster_policy.messages import DISTRIBUTIONS
+from muster_policy.node import PolicyNode, Settings
+from muster_policy.policy import Policy
+
+EXAMPLES = """\
+examples:
+  muster-policy go1-policy --check                     the bundle is whole and acts as it should; nothing is opened
+  muster-policy go1-policy                             with a router (rmw_zenohd) on this host
+  muster-policy go1-policy --listen tcp/0.0.0.0:7447   be the router; the robot's nodes connect to this host
+  muster-policy go1-policy --remap imu:=/imu/data --joints names.txt --controller forward_position_controller
+
+It reads joint_states (sensor_msgs/JointState) and, where the policy needs them, imu (sensor_msgs/Imu), odom
+(nav_msgs/Odometry), cmd_vel (geometry_msgs/Twist), commands/NAME (std_msgs/Float64MultiArray) and images
+(sensor_msgs/Image). It publishes joint_commands (sensor_msgs/JointState), /rosout and /diagnostics, and begins a fresh
+episode when std_msgs/Empty comes on ~/reset. docs/policy-node.md says more.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status: 0 after a clean end, 1 where something does not fit, 2 for wrong use."""
+    given = parser().parse_args(arguments)
+    try:
+        bundle = open_bundle(given.bundle)
+        policy = Policy(bundle)
+        greatest = policy.self_test(bundle.parity)
+        _say(f"{bundle.contract.task} of {bundle.origin}: self-test passed, actions differ by {greatest:.1e} at most")
+        node = PolicyNode(bundle, _settings(given, bundle), policy, _say)
+        _introduce(node, bundle)
+        if given.check:
+            return 0
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: node.stopping.set())
+        node.run()
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return 1
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Of the command line."""
+    found = argparse.ArgumentParser(
+        prog="muster-policy",
+        description="Run a policy that `muster export` wrote on a robot, as a ROS 2 node on rmw_zenoh's wire.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = found.add_argument
+    add("bundle", type=Path, help="directory of the bundle")
+    add("--check", action="store_true", help="verify the bundle, run its self-test, show the joints, and end")
+    add("--rate", type=_positive, metavar="HZ", help="control steps a second (default: as in training)")
+    add(
+        "--trigger",
+        choices=("timer", "joint_states"),
+        default="timer",
+        help="act by the clock, or when a joint state has come (default: timer)",
+    )
+    add(
+        "--timeout",
+        type=_positive,
+        metavar="SECONDS",
+        help="age from which on sensors are too old (default: three control steps, at least 0.02)",
+    )
+    add("--joints", type=Path, metavar="FILE", help="lines `policy_joint = robot_joint`, for joints of another name")
+    add("--remap", action="append", default=[], metavar="TOPIC:=NAME", help="use another topic; may be repeated")
+    add("--controller", metavar="NAME", help="publish std_msgs/Float64MultiArray on NAME/commands, too")
+    add("--strict-limits", action="store_true", help="keep position targets within the joints' ranges")
+    add("--domain", type=int, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
+    add("--namespace", default="/", help="of the node")
+    add("--name", default="muster_policy", help="of the node (default: muster_policy)")
+    add("--distro", choices=DISTRIBUTIONS, default="jazzy", help="ROS 2 of the robot (default: jazzy)")
+    add(
+        "--connect",
+        metavar="ENDPOINT",
+        help="the router (default: tcp/localhost:7447, none with --listen)",
+    )
+    add("--listen", metavar="ENDPOINT", help="be a router on this endpoint, so that no rmw_zenohd is needed")
+    add("--duration", type=_positive, metavar="SECONDS", help="end after this time (default: run until it is stopped)")
+    add("--version", action="version", version=f"muster-policy {__version__}")
+    return found
+
+
+def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
+    names = [action.name for action in bundle.contract.actions]
+    for group in bundle.contract.groups:
+        names += [name for term in group.terms if term.element == "joint" for name in term.elements]
+    return Settings(
+        rate=given.rate,
+        trigger=given.trigger,
+        timeout=given.timeout,
+        strict=given.strict_limits,
+        controller=given.controller and _ros_name("--controller", given.controller),
+        joints=read_joints(given.joints, names) if given.joints else {},
+        remap=dict(_remapping(each) for each in given.remap),
+        distribution=given.distro,
+        domain=_domain(given.domain),
+        connect=given.connect or (None if given.listen else "tcp/localhost:7447"),
+        listen=given.listen,
+        namespace=_ros_name("--namespace", given.namespace) if given.namespace.strip("/") else "/",
+        name=_ros_name("--name", given.name),
+        duration=given.duration,
+    )
+
+
+def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
+    """The robot's names of joints from a file of lines ``policy_joint = robot_joint``; ``#`` begins a comment.
+
+    Args:
+        path: Of the file.
+        known: Joints of the policy.
+
+    Raises:
+        Refused: A line is of another form, or names no joint of the policy.
+    """
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise Refused(f"--joints {path}: it can't be read ({reason})") from None
+    found: dict[str, str] = {}
+    for number, line in enumerate(lines, 1):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        ours, equals, theirs = (part.strip() for part in text.partition("="))
+        if not (ours and equals and theirs):
+            raise Refused(f"--joints {path}, line {number}: expected policy_joint = robot_joint, found {text[:60]!r}")
+        if ours not in known:
+            raise Refused(f"--joints {path}, line {number}: the policy has no joint {ours}; {nearest(ours, known)}")
+        found[ours] = theirs
+    return found
+
+
+def _introduce(node: PolicyNode, bundle: Bundle) -> None:
+    trained = bundle.contract.control_hz
+    if node.rate != trained:
+        _say(f"warning: --rate {node.rate:g}: the policy was trained at {trained:g} Hz")
+    if (unit := node.observations.unit) is not None:
+        _say(f"imu: in the frame of {unit.name}, on {unit.body}")
+    _say("joints, whose controllers must have these gains:")
+    for line in node.commands.table():
+        _say(line)
+
+
+def _remapping(text: str) -> tuple[str, str]:
+    topic, sign, name = text.partition(":=")
+    if not (topic and sign and name):
+        raise Refused(f"--remap {text}: expected TOPIC:=NAME, such as imu:=/imu/data")
+    return topic, _ros_name("--remap", name)
+
+
+def _ros_name(option: str, text: str) -> str:
+    """A name as ROS has them. Raises Refused."""
+    parts = text.removeprefix("/").split("/")
+    if not all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", part) for part in parts):
+        raise Refused(f"{option} {text}: a name of ROS has letters, digits and _ between its slashes, no digit first")
+    if option == "--name" and "/" in text:
+        raise Refused(f"--name {text}: a node's name has no slash; give --namespace besides")
+    return text
+
+
+def _domain(given: int | None) -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if given is None and not text.isdigit():
+        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
+    domain = int(text) if given is None else given
+    if not 0 <= domain <= 232:
+        raise Refused(f"domain {domain}: expected 0 to 232")
+    return domain
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, found {text}")
+    return value
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,25 @@
+"""What ends the node in one line, and the nearest of several names."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class Refused(Exception):
+    """The node can't run, or won't; the message is one line that says what differs and what to do."""
+
+
+def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
+    """``did you mean NAME?`` where one is close, else the names that there are.
+
+    Args:
+        name: What was looked for.
+        names: What there is.
+        what: Begins the list of names.
+    """
+    there = sorted(names)
+    close = difflib.get_close_matches(name, there, 1, 0.5)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"{what}: {', '.join(there[:8])}{', …' if len(there) > 8 else ''}" if there else f"{what} none"

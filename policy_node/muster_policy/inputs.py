@@ -1,0 +1,274 @@
+"""The node's inputs: the newest message of each topic, decoded, checked, and how old it is."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from muster_policy.contract import Command, Group
+from muster_policy.errors import Refused, nearest
+from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
+from muster_policy.observations import Observations, command_topic, image_topic, is_twist
+from muster_policy.snapshot import IMU as IMU_TOPIC
+from muster_policy.snapshot import JOINTS, Imu, Odometry, Snapshot, matrix
+from muster_policy.snapshot import ODOMETRY as ODOMETRY_TOPIC
+
+COMMAND_TIMEOUT = 0.5
+"""Age from which on a commanded velocity no longer counts: the policy is then asked to stand [s]."""
+_DIFFERENT = 32
+"""Different complaints that are told, each once."""
+
+
+@dataclass
+class Input:
+    """A topic that the node hears.
+
+    Attributes:
+        topic: Its name in the node's namespace, before remapping.
+        kind: ROS type of its messages.
+        read: Gives the value of a message; raises Refused where it can't be used.
+        command: The command that it is; None of what is measured.
+        value: That of the last good message; None before the first.
+        arrived: When that came [s, monotonic].
+    """
+
+    topic: str
+    kind: str
+    read: Callable[[Any], Any]
+    command: Command | None = None
+    value: Any = None
+    arrived: float = -float("inf")
+    waiting: tuple[bytes, float] | None = None
+
+
+class Inputs:
+    """All inputs of a policy.
+
+    Args:
+        observations: What it needs.
+        messages: Types of the distribution.
+        names: Name of a joint on the robot by its name in the contract, where it differs.
+    """
+
+    def __init__(self, observations: Observations, messages: Messages, names: Mapping[str, str] | None = None) -> None:
+        self._observations, self._messages = observations, messages
+        renamed = names or {}
+        self._joints = [renamed.get(joint, joint) for joint in observations.joints]
+        self._columns: dict[tuple[str, ...], np.ndarray] = {}
+        self.all = [Input(JOINTS, JOINT_STATE, self._joint_state)]
+        if IMU_TOPIC in observations.needs:
+            self.all.append(Input(IMU_TOPIC, IMU, _imu_for(observations.quantities)))
+        if ODOMETRY_TOPIC in observations.needs:
+            self.all.append(Input(ODOMETRY_TOPIC, ODOMETRY, _odometry))
+        for command in observations.commands.values():
+            kind, read = (TWIST, _twist) if is_twist(command) else (ARRAY, _numbers_of(command))
+            self.all.append(Input(command_topic(command), kind, read, command))
+        for group in observations.images.values():
+            self.all.append(Input(image_topic(group.name), IMAGE, _image_of(group)))
+        self.news = threading.Condition()
+        """Told when a joint state has come."""
+        self.ignored: Counter[str] = Counter()
+        """Messages that could not be used, by topic."""
+        self._complaints: deque[str] = deque(maxlen=100)
+        self._told: set[str] = set()
+
+    def hear(self, each: Input, topic: str) -> Callable[[bytes, str, str], None]:
+        """What to call with each message of an input, on any thread.
+
+        Args:
+            each: The input.
+            topic: Its full name, for complaints.
+        """
+        wanted = self._messages.type_hash(each.kind)
+
+        def received(data: bytes, kind: str, type_hash: str) -> None:
+            if kind != each.kind:
+                self._complain(topic, f"it is a {kind}, and the node reads {each.kind}")
+            elif type_hash != wanted:
+                what = f"{kind} of another definition ({type_hash[:20]}…, here {wanted[:20]}…)"
+                self._complain(topic, f"{what}; give --distro as the robot has it")
+            elif each is self.all[0]:
+                with self.news:
+                    each.waiting = data, time.monotonic()
+                    self.news.notify_all()
+            else:
+                each.waiting = data, time.monotonic()
+
+        return received
+
+    def update(self, topics: Mapping[str, str] | None = None) -> None:
+        """Decode what has come since the last call; what can't be used is counted, and the value before stays.
+
+        Args:
+            topics: Full names, for complaints.
+        """
+        for each in self.all:
+            if each.waiting is None:
+                continue
+            (data, arrived), each.waiting = each.waiting, None
+            try:
+                each.value = each.read(self._messages.decode(data, each.kind))
+                each.arrived = arrived
+            except Refused as problem:
+                self._complain((topics or {}).get(each.topic, each.topic), str(problem))
+
+    def complaints(self) -> list[str]:
+        """What could not be used, one line for each different problem, since the last call."""
+        found = []
+        while self._complaints:
+            found.append(self._complaints.popleft())
+        return found
+
+    def missing(self) -> list[Input]:
+        """Inputs of which no good message has come yet."""
+        return [each for each in self.all if each.value is None]
+
+    def stale(self, now: float, timeout: float) -> list[tuple[Input, float]]:
+        """What is measured, and too old, with its age [s]; commands do not count."""
+        ages = [(each, now - each.arrived) for each in self.all if each.command is None]
+        return [(each, age) for each, age in ages if age > timeout]
+
+    def snapshot(self, now: float) -> Snapshot:
+        """What is known now; nothing may be missing. A commanded velocity that is too old is 0."""
+        values = {each.topic: each.value for each in self.all}
+        commands = {each.command.name: _limited(each, now) for each in self.all if each.command is not None}
+        position, velocity = values[JOINTS]
+        images = {name: values[image_topic(name)] for name in self._observations.images}
+        return Snapshot(position, velocity, values.get(IMU_TOPIC), values.get(ODOMETRY_TOPIC), commands, images)
+
+    def silent_commands(self, now: float) -> list[Input]:
+        """Commanded velocities that are too old to count."""
+        return [each for each in self.all if _is_silent(each, now)]
+
+    def _joint_state(self, message: Any) -> tuple[np.ndarray, np.ndarray]:
+        names = tuple(message.name)
+        columns = self._columns.get(names)
+        if columns is None:
+            columns = self._columns[names] = self._find(names)
+        found = []
+        for what, values in (("positions", message.position), ("velocities", message.velocity)):
+            if len(values) != len(names):
+                raise Refused(f"{len(values)} {what} of {len(names)} joints; the policy needs each joint's")
+            found.append(_finite(values[columns], what))
+        return found[0], found[1]
+
+    def _find(self, names: Sequence[str]) -> np.ndarray:
+        for joint, robot_name in zip(self._observations.joints, self._joints, strict=True):
+            if robot_name not in names:
+                alias = "" if joint == robot_name else f" ({joint} of the policy)"
+                raise Refused(
+                    f"no joint is called {robot_name}{alias}; {nearest(robot_name, names, 'there are')} "
+                    "(--joints FILE gives the robot's names)"
+                )
+        if len(set(names)) != len(names):
+            raise Refused("a joint is named twice")
+        return np.array([names.index(name) for name in self._joints])
+
+    def _complain(self, topic: str, problem: str) -> None:
+        self.ignored[topic] += 1
+        line = f"{topic}: message ignored: {problem}"
+        if line not in self._told and len(self._told) < _DIFFERENT:
+            self._told.add(line)
+            self._complaints.append(line)
+
+
+def _is_silent(each: Input, now: float) -> bool:
+    return each.command is not None and is_twist(each.command) and now - each.arrived > COMMAND_TIMEOUT
+
+
+def _limited(each: Input, now: float) -> np.ndarray:
+    """A command within what was commanded in training."""
+    assert each.command is not None
+    value: np.ndarray = np.zeros(len(each.command.names)) if _is_silent(each, now) else each.value
+    ends = [(-np.inf, np.inf) if pair is None else pair for pair in each.command.ranges]
+    low, high = np.array(ends).T
+    within: np.ndarray = np.clip(value, low, high)
+    return within
+
+
+def _finite(values: Any, what: str) -> np.ndarray:
+    found = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(found).all():
+        raise Refused(f"not finite: its {what}")
+    return found
+
+
+def _xyz(vector: Any, what: str) -> np.ndarray:
+    return _finite((vector.x, vector.y, vector.z), what)
+
+
+def _rotation(turn: Any) -> np.ndarray:
+    found = _finite((turn.x, turn.y, turn.z, turn.w), "orientation")
+    length = float(np.sqrt((found * found).sum()))
+    if abs(length - 1.0) > 0.01:
+        raise Refused(f"its orientation is no rotation: a quaternion of length {length:.3g}")
+    return found / length
+
+
+def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
+    """Reads what these quantities need; a field whose covariance begins with -1 is not measured, as ROS has it."""
+    needs_turn = bool(quantities & {"projected_gravity", "root_uprightness", "imu_projected_gravity"})
+    needs_force = "imu_acceleration" in quantities
+
+    def read(message: Any) -> Imu:
+        turn, force = np.eye(3), np.zeros(3)
+        if needs_turn:
+            if message.orientation_covariance[0] == -1.0:
+                raise Refused("it has no orientation (orientation_covariance[0] is -1); run a filter that estimates it")
+            turn = matrix(_rotation(message.orientation))
+        if needs_force:
+            if message.linear_acceleration_covariance[0] == -1.0:
+                raise Refused("it has no acceleration (linear_acceleration_covariance[0] is -1)")
+            force = _xyz(message.linear_acceleration, "linear acceleration")
+        return Imu(turn, _xyz(message.angular_velocity, "angular velocity"), force)
+
+    return read
+
+
+def _odometry(message: Any) -> Odometry:
+    pose, twist = message.pose.pose, message.twist.twist
+    return Odometry(
+        _xyz(pose.position, "position"),
+        _rotation(pose.orientation),
+        _xyz(twist.linear, "linear velocity"),
+        _xyz(twist.angular, "angular velocity"),
+    )
+
+
+def _twist(message: Any) -> np.ndarray:
+    return _finite((message.linear.x, message.linear.y, message.angular.z), "velocities")
+
+
+def _numbers_of(command: Command) -> Callable[[Any], np.ndarray]:
+    def read(message: Any) -> np.ndarray:
+        if len(message.data) != len(command.names):
+            raise Refused(f"{len(message.data)} numbers, the command {command.name} has {', '.join(command.names)}")
+        return _finite(message.data, "numbers")
+
+    return read
+
+
+def _image_of(group: Group) -> Callable[[Any], np.ndarray]:
+    assert group.image is not None
+    _, height, width = group.shape
+    count = len(group.image.channels)
+    orders = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0)} if count == 3 else {"mono8": (0,)}
+
+    def read(message: Any) -> np.ndarray:
+        if message.encoding not in orders:
+            raise Refused(f"an image of encoding {message.encoding}; the policy takes {' or '.join(orders)}")
+        if (message.height, message.width) != (height, width):
+            raise Refused(f"an image of {message.width} x {message.height}, the policy takes {width} x {height}")
+        if message.step < width * count or len(message.data) != message.step * height:
+            raise Refused(f"an image of {len(message.data)} bytes in rows of {message.step}")
+        rows = np.asarray(message.data, np.uint8).reshape(height, message.step)[:, : width * count]
+        pixels = rows.reshape(height, width, count)[:, :, orders[message.encoding]]
+        return np.ascontiguousarray(pixels.transpose(2, 0, 1))
+
+    return read

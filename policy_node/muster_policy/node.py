@@ -1,0 +1,250 @@
+"""The policy node: a bundle's policy between the topics of a robot, step by step at its rate."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from muster_policy.actions import Command, Commands
+from muster_policy.bundle import Bundle
+from muster_policy.errors import Refused
+from muster_policy.graph import Node, open_session
+from muster_policy.inputs import Inputs
+from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, Messages
+from muster_policy.observations import Observations
+from muster_policy.policy import Policy
+from muster_policy.runner import Mode, Runner
+from muster_policy.timing import Figures, sleep_until
+from muster_policy.wire import Qos
+
+REPORT = 10.0
+"""Time between two lines about the loop [s]."""
+PATIENCE = 5.0
+"""Time between two lines about inputs that are missing [s]."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the node runs.
+
+    Attributes:
+        rate: Control steps a second; None: as in training.
+        trigger: ``timer``: at the rate, by the clock; ``joint_states``: when a joint state has come, at most at the rate.
+        timeout: Age from which on what is measured is too old [s]; None: three control steps, 20 ms at least.
+        strict: Keep position targets within the joints' ranges.
+        controller: Publish to this ros2_control controller, too.
+        joints: Name of a joint on the robot by its name in the contract, where it differs.
+        remap: Other topics by those of the node.
+        distribution: Of ROS 2.
+        domain: ROS domain.
+        connect: Endpoint of a router; None: none.
+        listen: Be a router on this endpoint.
+        namespace: Of the node.
+        name: Of the node.
+        duration: Time after which it ends by itself [s]; None: never.
+    """
+
+    rate: float | None = None
+    trigger: str = "timer"
+    timeout: float | None = None
+    strict: bool = False
+    controller: str | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
+    remap: Mapping[str, str] = field(default_factory=dict)
+    distribution: str = "jazzy"
+    domain: int = 0
+    connect: str | None = "tcp/localhost:7447"
+    listen: str | None = None
+    namespace: str = "/"
+    name: str = "muster_policy"
+    duration: float | None = None
+
+
+class PolicyNode:
+    """A node from a bundle; nothing is opened before :meth:`run`.
+
+    Args:
+        bundle: Verified.
+        settings: How it runs.
+        policy: Of the bundle, after its self-test.
+        tell: Called with each line of text.
+
+    Raises:
+        Refused: The policy needs what no message has, or a setting does not fit.
+    """
+
+    def __init__(self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print) -> None:
+        self.settings, self._tell = settings, tell
+        contract = bundle.contract
+        self.rate = settings.rate or contract.control_hz
+        self.messages = Messages(settings.distribution)
+        self.observations = Observations(contract)
+        self.commands = Commands(contract, settings.joints, settings.strict)
+        if settings.controller and len(self.commands.kinds) > 1:
+            raise Refused(
+                f"--controller {settings.controller}: the policy commands {' and '.join(self.commands.kinds)}, a "
+                "controller takes one kind; leave it out and use joint_commands"
+            )
+        self.inputs = Inputs(self.observations, self.messages, settings.joints)
+        known = {each.topic for each in self.inputs.all} | {"joint_commands"}
+        for topic in settings.remap:
+            if topic not in known:
+                raise Refused(f"--remap {topic}: the node has no such topic; it has {', '.join(sorted(known))}")
+        self.timeout = settings.timeout or max(3.0 / self.rate, 0.02)
+        self.figures = Figures()
+        self.stopping, self._reset = threading.Event(), threading.Event()
+        self.runner = Runner(
+            self.inputs, self.observations, policy, self.commands, self.timeout, self._publish, self._say
+        )
+        self._lines: list[tuple[str, bool]] = []
+
+    def run(self) -> None:
+        """Be a node until :attr:`stopping` is set, or the duration is over. Raises Refused where Zenoh can't be opened."""
+        settings = self.settings
+        with open_session(settings.connect, settings.listen) as session:
+            self._node = node = Node(session, self.messages, settings.domain, settings.namespace, settings.name)
+            try:
+                self._connect(node)
+                if settings.listen is None and not session.info.routers_zid():
+                    self._tell(
+                        f"no router answers at {settings.connect}; it is tried again (start rmw_zenohd, or give --listen)"
+                    )
+                self._loop()
+            finally:
+                self.runner.end("the node ends")
+                self._flush()
+                self._tell(self.summary())
+                node.close()
+
+    def _connect(self, node: Node) -> None:
+        remap = self.settings.remap
+        topics = {each.topic: node.full_name(remap.get(each.topic, each.topic)) for each in self.inputs.all}
+        self._topics = topics
+        self.runner.name_topics(topics)
+        out = node.full_name(remap.get("joint_commands", "joint_commands"))
+        self._out = node.publisher(out, JOINT_STATE)
+        controller = self.settings.controller
+        self._controller = node.publisher(f"{controller}/commands", ARRAY) if controller else None
+        self._log = node.publisher("/rosout", LOG, Qos(depth=1000, transient_local=True))
+        self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
+        node.watch_graph()
+        node.subscribe("~/reset", EMPTY, lambda data, kind, type_hash: self._reset.set())
+        for each in self.inputs.all:
+            node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
+        self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
+
+    def _loop(self) -> None:
+        gc.collect()
+        gc.freeze()  # what lives for ever is not looked through again and again
+        begin = time.monotonic()
+        ends = begin + (self.settings.duration or float("inf"))
+        second, patience, report = begin + 1.0, begin + 1.0, begin + REPORT
+        self._deadline = begin
+        while not self.stopping.is_set():
+            due = self._wait(1.0 / self.rate)
+            now = time.monotonic()
+            if now > ends:
+                break
+            if self._reset.is_set():
+                self._reset.clear()
+                self.runner.reset()
+            acted = self.runner.step(now, due=due is not None)
+            if due is not None and acted:
+                self._measure(due, now)
+            self._flush()
+            if now > second:
+                second = now + 1.0
+                self._diagnose()
+            if self.runner.mode is Mode.WAITING and now > patience:
+                patience = now + PATIENCE
+                self._tell_missing()
+            if now > report:
+                report = now + REPORT
+                self._tell(self.summary())
+
+    def _wait(self, period: float) -> float | None:
+        """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""
+        if self.settings.trigger == "timer":
+            due, now = self._deadline + period, time.monotonic()
+            self._deadline = now if now > due + period else due  # steps that were missed are not made up for
+            sleep_until(due)
+            return due
+        joints, earliest = self.inputs.all[0], self._deadline + 0.75 * period
+        limit = time.monotonic() + min(self.timeout, 0.1)
+        with self.inputs.news:
+            while joints.waiting is None or joints.waiting[1] < earliest:
+                left = limit - time.monotonic()
+                if left <= 0.0:
+                    return None
+                self.inputs.news.wait(left)
+            arrived = joints.waiting[1]
+        due = self._deadline + period
+        self._deadline = arrived if arrived > due + period else due  # one that comes late does not put off the next
+        return arrived
+
+    def _measure(self, due: float, now: float) -> None:
+        done = time.monotonic()
+        self.figures.add("late", now - due)
+        self.figures.add("step", done - now)
+        self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
+
+    def _publish(self, command: Command) -> None:
+        for message in self.commands.joint_states(command, self.messages, time.time_ns()):
+            self._out.publish(message)
+        if self._controller is not None:
+            self._controller.publish(self.messages.array(command.values))
+
+    def _say(self, line: str, warning: bool) -> None:
+        """Keep a line until the step is over."""
+        self._lines.append((line, warning))
+
+    def _flush(self) -> None:
+        lines, self._lines = self._lines, []
+        for line, warning in lines:
+            self._tell(line)
+            place = {"name": self._node.name, "file": "", "function": "", "line": 0}
+            stamp = self.messages.stamp(time.time_ns())
+            self._log.publish(self.messages.make(LOG, stamp=stamp, level=30 if warning else 20, msg=line, **place))
+
+    def _diagnose(self) -> None:
+        make, counts = self.messages.make, self.runner.counts
+        mode, values = self.runner.mode, {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
+        values["ignored"] = sum(self.inputs.ignored.values())
+        level = {Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode]
+        pairs = [make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()]
+        status = make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=f"{self._node.name}: policy",
+            message=mode.value,
+            hardware_id="",
+            values=pairs,
+        )
+        header = self.messages.header(time.time_ns())
+        self._diagnostics.publish(make(DIAGNOSTICS, header=header, status=[status]))
+
+    def _tell_missing(self) -> None:
+        for each in self.inputs.missing():
+            topic = self._topics[each.topic]
+            there = self._node.publishers_of(topic)
+            others = [name for name in self._node.topics_of(each.kind) if name not in (topic, self._out.topic)]
+            if wrong := [other for other in there if other.type != each.kind]:
+                how = f"{wrong[0].node} publishes {wrong[0].type} there"
+            elif there:
+                how = f"{there[0].node} publishes it, and no message could be used yet"
+            elif others:
+                how = f"nobody publishes it; it may be {others[0]}: --remap {each.topic}:={others[0]}"
+            else:
+                how = "nobody publishes it"
+            self._tell(f"waiting for {topic} ({each.kind}): {how}")
+
+    def summary(self) -> str:
+        """One line about the loop so far."""
+        counts, ignored = self.runner.counts, sum(self.inputs.ignored.values())
+        return (
+            f"{self.runner.mode.value}: {counts.steps} steps at {self.rate:g} Hz, {counts.limited} commands limited, "
+            f"{counts.stops} stops, {counts.resets} resets, {ignored} messages ignored; {self.figures.line()}"
+        )

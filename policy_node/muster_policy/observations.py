@@ -1,0 +1,234 @@
+"""The policy's inputs, made from what is measured as the contract says: scale, clip, offsets, history, frames of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from muster_policy.contract import Command, Contract, Frame, Group, Term
+from muster_policy.errors import Refused
+from muster_policy.snapshot import FROM_IMU, FROM_ODOMETRY, IMU, JOINTS, ODOMETRY, OF_UNIT, Snapshot, place_of
+
+Reader = Callable[[Snapshot], "np.ndarray | float"]
+VELOCITIES = frozenset({"velocity_command", "moving_velocity_command", "heading_velocity_command"})
+"""Commands of Muster's library that are velocities forward, to the left [m/s] and turning left [rad/s]: a ``geometry_msgs/Twist``."""
+_JOINT_POSITIONS = ("joint_position", "measured_joint_position")
+_JOINT_OFFSETS = ("joint_offset", "measured_joint_offset")
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A term and what reads its quantity."""
+
+    term: Term
+    read: Reader
+
+
+class Observations:
+    """Builds the policy's inputs, step by step.
+
+    Args:
+        contract: Of the policy.
+
+    Raises:
+        Refused: A term can't be measured with the inputs that the node has; one line names all such terms.
+
+    Attributes:
+        joints: The joints that it reads or drives, by name, in the order of a snapshot.
+        needs: Inputs that it reads, by topic.
+        commands: Commands that it reads.
+        images: Groups that are images.
+        quantities: Those that it reads, by name.
+        unit: Frame of the inertial measurement unit; None: that of the root.
+    """
+
+    def __init__(self, contract: Contract) -> None:
+        self._contract = contract
+        names = [action.name for action in contract.actions if action.kind != "choice"]
+        for group in contract.groups:
+            names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
+        self.joints = tuple(dict.fromkeys(names))
+        self.needs: set[str] = {JOINTS}
+        self.quantities: set[str] = set()
+        self.commands: dict[str, Command] = {}
+        self.images = {group.name: group for group in contract.groups if group.image is not None}
+        self._problems: list[str] = []
+        self.unit = self._find_unit()
+        self._terms = {group.name: [self._reader(term) for term in group.terms] for group in contract.groups}
+        for group in contract.groups:
+            self._check_group(group)
+        if self._problems:
+            raise Refused(f"task {contract.task} can't run on a robot: " + "; ".join(self._problems))
+        self._last = np.zeros(len(contract.action_names), np.float32)
+        self._past: dict[str, np.ndarray] = {}
+
+    def reset(self) -> None:
+        """Begin an episode: no last action, no history."""
+        self._last[:] = 0.0
+        self._past.clear()
+
+    def acted(self, action: np.ndarray) -> None:
+        """Take in what the policy asked for, shape ``(actions,)``."""
+        self._last[:] = action
+
+    def build(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
+        """The policy's inputs by name, each of shape ``(1, …)``, of the dtype that the policy takes."""
+        found = {}
+        for group in self._contract.groups:
+            if group.image is not None:
+                found[group.input] = self._stacked(group, snapshot)
+            else:
+                parts = [self._term(group.name, each, snapshot) for each in self._terms[group.name]]
+                found[group.input] = np.concatenate(parts)[None]
+        return found
+
+    def _term(self, group: str, each: _Read, snapshot: Snapshot) -> np.ndarray:
+        term = each.term
+        value: np.ndarray = np.atleast_1d(np.asarray(each.read(snapshot), dtype=np.float32)) - term.offset
+        if term.clip is not None:
+            value = np.clip(value, *term.clip)
+        value = value * term.scale
+        if term.history == 1:
+            return value
+        key = f"{group}/{term.name}"
+        past = self._past.get(key)
+        past = np.tile(value, (term.history, 1)) if past is None else np.concatenate([past[1:], value[None]])
+        self._past[key] = past
+        return past.ravel()
+
+    def _stacked(self, group: Group, snapshot: Snapshot) -> np.ndarray:
+        assert group.image is not None
+        image, past = snapshot.images[group.name], self._past.get(group.name)
+        if past is None:
+            past = np.tile(image, (group.image.frames, 1, 1))
+        else:
+            past = np.concatenate([image, past[: -len(image)]])
+        self._past[group.name] = past
+        return past[None]
+
+    def _find_unit(self) -> Frame | None:
+        found: dict[tuple[str, str], Frame] = {}
+        for group in self._contract.groups:
+            for term in group.terms:
+                if term.library and term.quantity in OF_UNIT and term.frame is not None:
+                    found[term.frame.body, term.frame.name] = term.frame
+        if len(found) > 1:
+            there = ", ".join(f"{name} on {body}" for body, name in found)
+            self._problems.append(f"it has several inertial measurement units ({there}), the node reads one")
+        return next(iter(found.values()), None)
+
+    def _check_group(self, group: Group) -> None:
+        image = group.image
+        if image is None and not group.terms:
+            self._problems.append(
+                f"the contract does not say what the numbers of {group.name} are (a task of kernels by hand)"
+            )
+        if image is None or image.channels in (("red", "green", "blue"), ("grey",)):
+            return
+        self._problems.append(
+            f"the images of {group.name} have the channels {', '.join(image.channels)}, the node reads red, green, blue or grey"
+        )
+
+    def _reader(self, term: Term) -> _Read:
+        try:
+            return _Read(term, self._measured(term))
+        except Refused as problem:
+            self._problems.append(f"{term.name}: {problem}")
+            return _Read(term, lambda snapshot: np.zeros(len(term.names), np.float32))
+
+    def _measured(self, term: Term) -> Reader:
+        """What reads the quantity of a term. Raises Refused with what would be needed."""
+        if not term.library:
+            if self._contract.format < 2:
+                raise Refused("the contract is of format 1, which does not say what it is; export the policy again")
+            raise Refused(f"{term.quantity or 'a quantity that is not declared'} is no function of Muster's library")
+        if term.kind == "command":
+            return self._command(term)
+        if term.kind == "previous_action":
+            return self._action(term)
+        if term.element == "joint":
+            return self._joint(term)
+        if term.quantity in FROM_IMU:
+            return self._placed(term, IMU)
+        if term.quantity in FROM_ODOMETRY:
+            return self._placed(term, ODOMETRY)
+        sensors = ", ".join(term.sensors.values()) or "the simulation"
+        raise Refused(f"{term.quantity} (of {sensors}) is in no message that the node reads")
+
+    def _placed(self, term: Term, topic: str) -> Reader:
+        frame, unit = term.frame, self.unit
+        if frame is None:
+            raise Refused(f"the contract does not say where {term.quantity} is measured; export the policy again")
+        if term.quantity not in OF_UNIT:
+            if not frame.root:
+                raise Refused(
+                    f"{term.quantity} is measured on {frame.body}, the node knows the motion of the root alone"
+                )
+            if topic == IMU and unit is not None and not unit.root:
+                raise Refused(f"{term.quantity} is of the root, and the inertial measurement unit is on {unit.body}")
+        self.needs.add(topic)
+        self.quantities.add(term.quantity)
+        place = place_of(frame, unit if unit is not None and unit.root else None)
+        quantity = (FROM_IMU if topic == IMU else FROM_ODOMETRY)[term.quantity]
+        return lambda snapshot: quantity(snapshot, place)
+
+    def _joint(self, term: Term) -> Reader:
+        columns = np.array([self.joints.index(name) for name in term.elements])
+        if term.quantity in _JOINT_POSITIONS:
+            return lambda snapshot: snapshot.position[columns]
+        if term.quantity == "joint_velocity":
+            return lambda snapshot: snapshot.velocity[columns]
+        if term.quantity in _JOINT_OFFSETS:
+            defaults = {action.name: action.default_position for action in self._contract.actions}
+            if unknown := [name for name in term.elements if name not in defaults]:
+                raise Refused(
+                    f"the contract has no default position of {', '.join(unknown[:3])}, which no action drives"
+                )
+            start = np.array([defaults[name] for name in term.elements])
+            return lambda snapshot: snapshot.position[columns] - start
+        raise Refused(f"{term.quantity} of joints is in no message that the node reads")
+
+    def _command(self, term: Term) -> Reader:
+        command = self._contract.command(term.command)
+        if command is None:
+            raise Refused(f"the contract has no command {term.command}")
+        whole = term.quantity == "command_number" and len(term.names) == len(command.names)
+        if not whole and not (term.quantity == "command_vector" and len(command.names) >= 3):
+            raise Refused(f"{term.quantity} of the command {command.name} is more than its numbers")
+        self.commands[command.name] = command
+        count, name = len(term.names), command.name
+        return lambda snapshot: snapshot.commands[name][:count]
+
+    def _action(self, term: Term) -> Reader:
+        names = list(self._contract.action_names)
+        columns = np.array([names.index(name) for name in term.elements])
+        if term.quantity == "last_action":
+            return lambda snapshot: self._last[columns]
+        if term.quantity == "clipped_last_action":
+            (limit,) = term.parameters.get("limit", (1.0,))
+            return lambda snapshot: np.clip(self._last[columns], -limit, limit)
+        raise Refused(f"{term.quantity} is none of the actions that the node keeps")
+
+
+def is_twist(command: Command) -> bool:
+    """Whether a command comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
+    return command.library and command.quantity in VELOCITIES
+
+
+def needed_topics(found: Observations) -> Mapping[str, str]:
+    """Topics of the node's inputs, and what each is for."""
+    topics = {name: "measured" for name in (JOINTS, IMU, ODOMETRY) if name in found.needs}
+    topics |= {command_topic(command): f"command {name}" for name, command in found.commands.items()}
+    return topics | {image_topic(name): f"image {name}" for name in found.images}
+
+
+def command_topic(command: Command) -> str:
+    """Topic of a command, in the node's namespace."""
+    return "cmd_vel" if is_twist(command) else f"commands/{command.name}"
+
+
+def image_topic(group: str) -> str:
+    """Topic of an image, in the node's namespace."""
+    return "image_raw" if group == "policy" else f"{group}/image_raw"

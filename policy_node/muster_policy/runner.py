@@ -1,0 +1,154 @@
+"""The control step: from what is measured to a command, or to none; it knows nothing of clocks and networks."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from muster_policy.actions import Command, Commands
+from muster_policy.inputs import Inputs
+from muster_policy.observations import Observations
+from muster_policy.policy import Policy
+
+
+class Mode(enum.Enum):
+    """What the node does."""
+
+    WAITING = "waiting for inputs"
+    ACTING = "acting"
+    STOPPED = "stopped until it is reset"
+    ENDED = "ended"
+
+
+@dataclass
+class Counts:
+    """What happened so far."""
+
+    steps: int = 0
+    limited: int = 0
+    stops: int = 0
+    resets: int = 0
+
+
+class Runner:
+    """Decides in each control step whether to command, and what.
+
+    It commands only while all that is measured is there and fresh, and the policy's actions are numbers. Where that ends it gives one
+    last command, which holds the robot where it is, and no further one.
+
+    Args:
+        inputs: What is measured.
+        observations: Builds what the policy sees.
+        policy: After its self-test.
+        commands: Makes commands.
+        timeout: Age from which on what is measured is too old [s].
+        give: Called with each command.
+        say: Called with each line of text, and whether it is a warning.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        observations: Observations,
+        policy: Policy,
+        commands: Commands,
+        timeout: float,
+        give: Callable[[Command], None],
+        say: Callable[[str, bool], None],
+    ) -> None:
+        self.inputs, self.observations, self.policy, self.commands = inputs, observations, policy, commands
+        self.timeout, self._give, self._say = timeout, give, say
+        self.mode, self.counts = Mode.WAITING, Counts()
+        self._silent: set[str] = set()
+        self._topics: Mapping[str, str] = {}
+
+    def name_topics(self, topics: Mapping[str, str]) -> None:
+        """Give the full names of the inputs' topics, for the lines."""
+        self._topics = topics
+
+    def step(self, now: float, due: bool = True) -> bool:
+        """Do one control step.
+
+        Args:
+            now: [s, monotonic].
+            due: Whether to act; else it only looks whether inputs are too old.
+
+        Returns:
+            Whether a command was given.
+        """
+        self.inputs.update(self._topics)
+        for line in self.inputs.complaints():
+            self._say(line, True)
+        if self.mode in (Mode.STOPPED, Mode.ENDED) or self.inputs.missing():
+            return False
+        if stale := self.inputs.stale(now, self.timeout):
+            if self.mode is Mode.ACTING:
+                each, age = max(stale, key=lambda entry: entry[1])
+                self._stop(f"{self._topic(each.topic)} is silent for {age * 1e3:.0f} ms", Mode.WAITING)
+            return False
+        if not due:
+            return False
+        if self.mode is Mode.WAITING:
+            self._forget()
+            self.mode = Mode.ACTING
+            self._say("all inputs are there: it commands the joints now, with a fresh episode", False)
+        return self._act(now)
+
+    def reset(self) -> None:
+        """Begin an episode: forget last action, history and recurrent state; a stopped node goes on."""
+        self._forget()
+        self.counts.resets += 1
+        if self.mode is Mode.STOPPED:
+            self.mode = Mode.WAITING
+            self._say("reset: it waits for its inputs", False)
+
+    def end(self, why: str) -> None:
+        """Hold the robot where it is, if the node commands it; then nothing more."""
+        if self.mode is Mode.ACTING:
+            self._hold()
+            self._say(f"{why}: one last command holds the joints where they are", False)
+        self.mode = Mode.ENDED
+
+    def _act(self, now: float) -> bool:
+        silent = {each.topic for each in self.inputs.silent_commands(now)}
+        for topic in sorted(silent - self._silent):
+            self._say(f"{self._topic(topic)} is silent: velocity 0 is asked for", True)
+        self._silent = silent
+        with np.errstate(over="ignore"):  # what 32 bits do not hold is found below
+            seen = self.observations.build(self.inputs.snapshot(now))
+        for name, numbers in seen.items():
+            if not np.isfinite(numbers).all():
+                self._stop(f"the observation {name} is not finite", Mode.STOPPED)
+                return False
+        action = self.policy.act(seen)[0]
+        if not np.isfinite(action).all():
+            worst = self.commands.actions[int(np.flatnonzero(~np.isfinite(action))[0])].name
+            self._stop(f"the policy's action for {worst} is not finite", Mode.STOPPED)
+            return False
+        self.observations.acted(action)
+        command = self.commands.command(action)
+        self._give(command)
+        self.counts.steps += 1
+        self.counts.limited += command.limited
+        return True
+
+    def _stop(self, why: str, then: Mode) -> None:
+        self._hold()
+        self.mode = then
+        self.counts.stops += 1
+        goes_on = "when all inputs are fresh" if then is Mode.WAITING else "after ~/reset"
+        self._say(f"{why}: one last command holds the joints where they are; it goes on {goes_on}", True)
+
+    def _hold(self) -> None:
+        positions, _ = self.inputs.all[0].value
+        self._give(self.commands.hold(dict(zip(self.observations.joints, positions, strict=True))))
+
+    def _forget(self) -> None:
+        self.policy.reset()
+        self.observations.reset()
+
+    def _topic(self, topic: str) -> str:
+        return self._topics.get(topic, topic)

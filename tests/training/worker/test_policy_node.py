@@ -1,0 +1,154 @@
+"""The loop is closed: a bundle's policy in the node, as a process, balances the simulated robot over Zenoh, in real time."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from muster_policy.graph import Node, open_session
+from muster_policy.messages import Messages
+from shared_store.layout import Run
+from tests.conftest import REPOSITORY, wait_for
+from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
+from worker.deploy import bundle
+from worker.deploy.simulated_robot import SimulatedRobot, open_robot, play
+from worker.errors import UserError
+from worker.learning.algorithm import ExportedPolicy
+from worker.tasks.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.cartpole_pixels import CartpolePixels
+from worker.tasks.configs.cartpole import CartpolePixelsConfig
+from worker.tasks.policy_contract import policy_contract
+
+SECONDS, EPISODES, SEED = 2.0, 3, 11
+GAINS = (1.0, 10.0, 1.5, 2.0)
+"""Of a linear policy that balances: on the cart's and the pole's position, on their velocities."""
+
+
+class Linear(nn.Module):
+    """``action = gains . observation``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("gains", torch.tensor(GAINS)[:, None])
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs @ self.gains
+
+
+class Balancing:
+    """That policy, as an algorithm gives it."""
+
+    def __init__(self) -> None:
+        self.network = Linear()
+
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        return self.network(observations["policy"])
+
+    def reset(self, worlds: Any = None) -> None:
+        """It remembers nothing."""
+
+    def module(self) -> ExportedPolicy:
+        sample = torch.randn(16, 4)
+        return ExportedPolicy(
+            self.network, {"obs": sample[:1]}, ["actions"], TensorDict({"policy": sample}, batch_size=[16])
+        )
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its bundle, as ``muster export`` writes it."""
+    torch.set_num_threads(1)
+    task, policy = Cartpole(CartpoleConfig(episode_seconds=SECONDS), 4, seed=1), Balancing()
+    train = {"task": "Cartpole", "config": {"episode_seconds": SECONDS}}
+    facts = {"task": "Cartpole", "algorithm": "mine:Balancing", "train": train, "settings": {}, "files": {}}
+    checkpoint: Any = SimpleNamespace(name="00000001-e1", iteration=1, manifest=facts)
+    run = Run(tmp_path_factory.mktemp("runs") / "cart")
+    run.path.mkdir()
+    contract = policy_contract(task, "Cartpole", policy.module())
+    both: Any = (policy, policy)
+    return bundle.export(run, checkpoint, task, both, contract, rounds=0)
+
+
+def direct(path: Path) -> list[float]:
+    """Returns of the episodes that the simulated robot will live through, with the policy in the simulation's own process."""
+    task, policy = open_robot(path, Messages(), SEED).task, Balancing()
+    returns, total = [], 0.0
+    while len(returns) < EPISODES:
+        task.step(policy.act(TensorDict(dict(task.groups), batch_size=[1])))
+        total += float(task.rewards[0])
+        if bool(task.dones[0]):
+            returns.append(total)
+            total = 0.0
+    return returns
+
+
+@pytest.mark.parametrize("trigger", ["joint_states", "timer"])
+def test_the_node_reaches_the_return_of_the_direct_evaluation_in_real_time(
+    exported: Path, tmp_path: Path, trigger: str
+) -> None:
+    wanted = direct(exported)
+    assert min(wanted) > 0.85 * SECONDS * 6.0, "a policy that balances earns up to 6 a second"
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+    options = ["--listen", endpoint, "--trigger", trigger, "--timeout", "2"]
+    log = tmp_path / "log"
+    env = {**os.environ, "PYTHONPATH": str(REPOSITORY / "policy_node")}
+    with log.open("w") as out:
+        command = [sys.executable, "-m", "muster_policy.cli", str(exported), *options]
+        process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=env)
+    try:
+        wait_for(lambda: "node /muster_policy" in log.read_text(), 30, "the node")
+        messages = Messages()
+        robot = open_robot(exported, messages, SEED)
+        with open_session(endpoint, None) as session:
+            node = Node(session, messages, name="simulated_robot")
+            lines: list[str] = []
+            found = play(robot, node, EPISODES, told=lines.append)
+            node.close()
+    finally:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+    said = log.read_text()
+    assert " 0 messages ignored" in said.splitlines()[-1] and f" {EPISODES} resets" in said.splitlines()[-1], said
+    assert len(lines) == EPISODES + 2
+    # a command now and then comes a control step later on a machine that others use, too
+    assert found == pytest.approx(wanted, rel=0.05), said
+
+
+def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:
+    """Two frames, the present one first; episodes of a fifth of a second end in between."""
+    task = CartpolePixels(CartpolePixelsConfig(episode_seconds=0.2), 1, seed=2)
+    contract = policy_contract(task, "CartpolePixels")
+    seen = tuple(group for group in contract.groups if group.name == "policy")
+    wired = Wired(SimulatedRobot(task, dataclasses.replace(contract, groups=seen), Messages()))
+    assert assert_sees_what_the_task_sees(wired, 30, 1.0) >= 2
+
+
+def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
+    exported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import worker.tasks.policy_contract as contracts
+    from shared_store.bundles import read_contract
+
+    assert isinstance(open_robot(exported, Messages()), SimulatedRobot)
+    changed = dataclasses.replace(read_contract(exported), control_hz=30.0)
+    monkeypatch.setattr(contracts, "policy_contract", lambda *_: changed)
+    with pytest.raises(
+        UserError, match=r"does not fit task Cartpole as it is now: the control rate 60 Hz became 30 Hz"
+    ):
+        open_robot(exported, Messages())
+    with pytest.raises(UserError, match=r"manifest\.json is missing"):
+        open_robot(exported.parent, Messages())

@@ -1,0 +1,179 @@
+"""A bundle that is not as it was sealed, or does not act as it should, is refused in one line; so is wrong use of the command."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from muster_policy.bundle import open_bundle
+from muster_policy.cli import main
+from muster_policy.errors import Refused
+from muster_policy.policy import Policy
+from shared_store.bundles import seal
+from tests.support.policy_node import write_bundle
+from tests.unit.policy_node.walker import JOINTS, contract, term
+
+SPEED = term("joint_velocity", 0, 2, **JOINTS)
+WEIGHTS = np.array([[1.0], [-0.5]])
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    return write_bundle(tmp_path / "bundle", contract(SPEED), WEIGHTS)
+
+
+def resealed(bundle: Path, change: Callable[[Path], None]) -> None:
+    """As if the bundle had been made with that change."""
+    (bundle / "manifest.json").unlink()
+    change(bundle)
+    seal(bundle, {"run": "by-hand", "checkpoint": "00000001-e1", "train": {}})
+
+
+def flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def test_a_bundle_passes_its_self_test_and_shows_its_joints(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(bundle), "--check"]) == 0
+    said = capsys.readouterr().out
+    assert "Walker of by-hand, checkpoint 00000001-e1: self-test passed, actions differ by" in said
+    assert "knee  position [rad] -1.500 to 1.500, default position 0.3000, stiffness 20, damping 1" in said
+
+
+def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: Path) -> None:
+    path = write_bundle(tmp_path / "bundle", contract(SPEED, recurrent=True), WEIGHTS)
+    opened = open_bundle(path)
+    assert Policy(opened).self_test(opened.parity) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda path: flipped(path / "policy.onnx"), "policy.onnx was altered (SHA-256 differs)"),
+        (lambda path: flipped(path / "contract.json"), "contract.json was altered (SHA-256 differs)"),
+        (lambda path: flipped(path / "parity.npz"), "parity.npz was altered (SHA-256 differs)"),
+        (lambda path: (path / "policy.onnx").write_bytes(b"x"), "policy.onnx has 1 bytes"),
+        (lambda path: (path / "policy.onnx").unlink(), "policy.onnx is missing; copy the bundle once more"),
+        (lambda path: (path / "more.py").write_text("x"), "more.py was added, manifest.json does not list it"),
+        (
+            lambda path: (path / "manifest.json").unlink(),
+            "manifest.json is missing; name a bundle that `muster export` made",
+        ),
+        (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is no manifest of a bundle"),
+        (
+            lambda path: (path / "manifest.json").write_text(
+                (path / "manifest.json").read_text().replace("by-hand", "by-tool")
+            ),
+            "manifest.json was altered (SHA-256 differs)",
+        ),
+    ],
+)
+def test_a_bundle_that_is_not_as_it_was_sealed_is_refused(
+    bundle: Path, change: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(bundle)
+    assert main([str(bundle)]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"error: {bundle}: {said}")
+
+
+def test_every_byte_of_the_manifest_counts(bundle: Path) -> None:
+    manifest = bundle / "manifest.json"
+    data = manifest.read_bytes()
+    for place in range(0, len(data), 7):
+        manifest.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        with pytest.raises(Refused) as caught:
+            open_bundle(bundle)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_policy_that_acts_otherwise_than_it_was_trained_is_refused(tmp_path: Path) -> None:
+    path = write_bundle(tmp_path / "bundle", contract(SPEED), WEIGHTS, parity=np.full((2, 3, 1), 0.5, np.float32))
+    opened = open_bundle(path)
+    with pytest.raises(Refused, match=r"the self-test failed: an action differs from the trained policy's by \d"):
+        Policy(opened).self_test(opened.parity)
+    nan = write_bundle(tmp_path / "nan", contract(SPEED), np.array([[np.nan], [0.0]]), np.zeros((2, 3, 1), np.float32))
+    opened = open_bundle(nan)
+    with pytest.raises(Refused, match="differs from the trained policy's by"):
+        Policy(opened).self_test(opened.parity)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda found: found.update(format=9), "has format 9, this node reads up to 2; upgrade muster-policy"),
+        (lambda found: found.pop("actions"), "actions is missing; export the policy again"),
+        (lambda found: found.update(control_hz=0), "control_hz is 0; export the policy again"),
+        (lambda found: found.update(groups=7), "it is no policy contract"),
+        (lambda found: found["groups"][0].update(shape=[3]), "the terms of policy have 2 numbers, its shape is [3]"),
+    ],
+)
+def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, change: Callable[[dict], None], said: str) -> None:
+    def edit(path: Path) -> None:
+        document = json.loads((path / "contract.json").read_text())
+        change(document)
+        (path / "contract.json").write_text(json.dumps(document))
+
+    resealed(bundle, edit)
+    with pytest.raises(Refused, match=re.escape(said)):
+        open_bundle(bundle)
+
+
+def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, tmp_path: Path) -> None:
+    """An observation of a wrong size."""
+    other = write_bundle(
+        tmp_path / "other", contract(term("joint_velocity", 0, 2, **JOINTS, history=2)), np.ones((4, 1))
+    )
+
+    def swap(path: Path) -> None:
+        (path / "policy.onnx").write_bytes((other / "policy.onnx").read_bytes())
+
+    resealed(bundle, swap)
+    with pytest.raises(Refused, match=r"policy\.onnx takes \{'obs': \(4,\)\}, contract\.json says \{'obs': \(2,\)\}"):
+        Policy(open_bundle(bundle))
+    resealed(bundle, lambda path: (path / "policy.onnx").write_bytes(b"no model") and None)
+    with pytest.raises(Refused, match=r"policy\.onnx can't be run by onnxruntime"):
+        Policy(open_bundle(bundle))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--remap", "imu"), "--remap imu: expected TOPIC:=NAME, such as imu:=/imu/data"),
+        (("--remap", "imu:=/x"), "--remap imu: the node has no such topic; it has joint_commands, joint_states"),
+        (
+            ("--remap", "joint_states:=/a/*"),
+            "--remap /a/*: a name of ROS has letters, digits and _ between its slashes",
+        ),
+        (("--namespace", "/left arm"), "--namespace /left arm: a name of ROS has letters"),
+        (("--name", "a/b"), "--name a/b: a node's name has no slash; give --namespace besides"),
+        (("--controller", "2nd"), "--controller 2nd: a name of ROS has letters"),
+        (("--domain", "233"), "domain 233: expected 0 to 232"),
+        (("--listen", "nonsense"), "--listen nonsense: Zenoh can't open it"),
+        (("--joints", "JOINTS"), "line 2: the policy has no joint kne; did you mean knee?"),
+        (("--joints", "/no/such"), "--joints /no/such: it can't be read (No such file or directory)"),
+    ],
+)
+def test_wrong_use_is_one_line(
+    bundle: Path, tmp_path: Path, options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = tmp_path / "names.txt"
+    names.write_text("wheel = left_wheel  # of the robot\nkne = motor\n")
+    assert main([str(bundle), *(each.replace("JOINTS", str(names)) for each in options)]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert said in line
+
+
+def test_a_domain_that_is_no_number_is_one_line(
+    bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
+    assert main([str(bundle), "--check"]) == 1
+    assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected a whole number\n"

@@ -1,0 +1,313 @@
+"""``python -m worker.deploy.simulated_robot BUNDLE``: one world of a bundle's task as a robot on ROS 2's wire, in real time.
+
+It publishes what a robot's drivers would (joint states, IMU, odometry, images, the task's commands as the operator's, the clock), takes
+joint commands, resets itself where an episode ends, has the policy node begin a fresh episode then, and tells each episode's return.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from shared_store.bundles import DamagedBundle, read_contract, verify
+from shared_store.policy_contract import Contract, brief, differences
+from worker.errors import UserError
+from worker.learning.job import configure, run_command, user_errors
+
+if TYPE_CHECKING:
+    from muster_policy.messages import Messages
+    from worker.tasks.declared import DeclaredTask
+
+Message = tuple[str, str, Any]
+"""Topic, ROS type and message."""
+TWISTS = ("velocity_command", "moving_velocity_command", "heading_velocity_command")
+NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
+"""Covariance of what a sensor does not measure, as ROS has it."""
+
+
+class SimulatedRobot:
+    """One world of a declared task as the messages of a robot.
+
+    Args:
+        task: One world on the CPU.
+        contract: What its policy sees and does.
+        messages: Types of a ROS distribution.
+    """
+
+    def __init__(self, task: DeclaredTask, contract: Contract, messages: Messages) -> None:
+        self.task, self.contract, self.messages = task, contract, messages
+        self._view = task.views["robot"]
+        self._arrays = task.robots["robot"]
+        units = [term.frame for group in contract.groups for term in group.terms if term.quantity.startswith("imu_")]
+        mount = next((frame.rotation for frame in units if frame is not None and frame.root), (0.0, 0.0, 0.0, 1.0))
+        self._mount = np.array(mount)
+        self._scale = np.array([action.scale for action in contract.actions])
+        self._offset = np.array([action.offset for action in contract.actions])
+        self._columns = {action.name: index for index, action in enumerate(contract.actions)}
+
+    def measured(self, nanoseconds: int) -> list[Message]:
+        """What its sensors say now, the joint states last: who acts when they come has all the rest."""
+        found: list[Message] = []
+        if self._view.root_coordinate >= 0:
+            found += self._root(nanoseconds)
+        found += self._commands()
+        for group in self.contract.groups:
+            if group.image is not None:
+                topic = "image_raw" if group.name == "policy" else f"{group.name}/image_raw"
+                found.append((topic, "sensor_msgs/msg/Image", self._image(group.name, len(group.image.channels))))
+        header, view, arrays = self.messages.header(nanoseconds), self._view, self.task.worlds.arrays
+        positions = arrays.joint_q.numpy()[0, view.coordinates] + self._arrays.encoder_bias.numpy()[0]
+        joints = self.messages.make(
+            "sensor_msgs/msg/JointState",
+            header=header,
+            name=list(view.joint_names),
+            position=positions.astype(np.float64),
+            velocity=arrays.joint_qd.numpy()[0, view.dofs].astype(np.float64),
+            effort=np.zeros(0),
+        )
+        found.append(("joint_states", "sensor_msgs/msg/JointState", joints))
+        return found
+
+    def actions(self, names: list[str], values: np.ndarray, before: torch.Tensor) -> torch.Tensor:
+        """The task's actions that joint commands stand for, shape ``(1, actions)``.
+
+        Args:
+            names: Of the joints.
+            values: Commands [unit of each action].
+            before: Actions of the joints that are not named.
+        """
+        found = before.clone()
+        for name, value in zip(names, values, strict=True):
+            column = self._columns[name]
+            found[0, column] = float((value - self._offset[column]) / self._scale[column])
+        return found
+
+    def _root(self, nanoseconds: int) -> list[Message]:
+        """IMU and odometry from the pose and velocities of the free root."""
+        make, view, arrays = self.messages.make, self._view, self.task.worlds.arrays
+        pose = arrays.joint_q.numpy()[0, view.root_coordinate : view.root_coordinate + 7].astype(np.float64)
+        velocity = arrays.joint_qd.numpy()[0, view.root_dof : view.root_dof + 6].astype(np.float64)
+        com = self.task.worlds.model.body_com.numpy().reshape(-1, 3)[view.root_body].astype(np.float64)
+        turn = _matrix(pose[3:])
+        angular = turn.T @ velocity[3:]
+        linear = turn.T @ velocity[:3] - np.cross(angular, com)
+        mount, zeros = _matrix(self._mount), np.zeros(9)
+        header = self.messages.header(nanoseconds, "imu")
+        imu = make(
+            "sensor_msgs/msg/Imu",
+            header=header,
+            orientation=self.messages.quaternion(_times(pose[3:], self._mount)),
+            orientation_covariance=zeros,
+            angular_velocity=self.messages.vector(mount.T @ angular),
+            angular_velocity_covariance=zeros,
+            linear_acceleration=self.messages.vector(np.zeros(3)),
+            linear_acceleration_covariance=NOT_MEASURED,
+        )
+        x, y, z = pose[:3].tolist()
+        placed = make(
+            "geometry_msgs/msg/Pose",
+            position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=self.messages.quaternion(pose[3:]),
+        )
+        odometry = make(
+            "nav_msgs/msg/Odometry",
+            header=self.messages.header(nanoseconds, "odom"),
+            child_frame_id=view.body_names[0],
+            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=placed, covariance=np.zeros(36)),
+            twist=make(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self.messages.twist(linear, angular),
+                covariance=np.zeros(36),
+            ),
+        )
+        return [("imu", "sensor_msgs/msg/Imu", imu), ("odom", "nav_msgs/msg/Odometry", odometry)]
+
+    def _commands(self) -> list[Message]:
+        found: list[Message] = []
+        described = {command.name: command for command in self.contract.commands}
+        for told in self.task.plan.commands:
+            command = described[told.bound.name]
+            memory = self.task.state_tensors()["memory"][0, told.first : told.first + len(command.names)]
+            numbers = memory.double().tolist()
+            if command.library and command.quantity in TWISTS:
+                twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
+                found.append(("cmd_vel", "geometry_msgs/msg/Twist", twist))
+            else:
+                array = self.messages.array(numbers)
+                found.append((f"commands/{command.name}", "std_msgs/msg/Float64MultiArray", array))
+        return found
+
+    def _image(self, group: str, channels: int) -> Any:
+        pixels = self.task.groups[group][0, :channels].numpy().transpose(1, 2, 0)
+        height, width, _ = pixels.shape
+        return self.messages.make(
+            "sensor_msgs/msg/Image",
+            header=self.messages.header(0, "camera"),
+            height=height,
+            width=width,
+            encoding="rgb8" if channels == 3 else "mono8",
+            is_bigendian=0,
+            step=width * channels,
+            data=np.ascontiguousarray(pixels).ravel(),
+        )
+
+
+def _matrix(rotation: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a quaternion xyzw."""
+    axis, w = rotation[:3], float(rotation[3])
+    skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    found: np.ndarray = np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew
+    return found
+
+
+def _times(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Product of two quaternions xyzw."""
+    a, b = first[:3], second[:3]
+    w = first[3] * second[3] - a @ b
+    return np.append(first[3] * b + second[3] * a + np.cross(a, b), w)
+
+
+def play(
+    robot: SimulatedRobot, node: Any, episodes: int, speed: float = 1.0, told: Callable[[str], None] = print
+) -> list[float]:
+    """Be a robot on the network until so many episodes have ended.
+
+    Args:
+        robot: The robot.
+        node: A :class:`muster_policy.graph.Node`.
+        episodes: How many.
+        speed: Simulated seconds in a second.
+        told: Called with each line.
+
+    Returns:
+        Return of each episode.
+    """
+    task, messages = robot.task, node.messages
+    publishers: dict[str, Any] = {}
+    newest: list[tuple[list[str], np.ndarray]] = []
+
+    def commanded(data: bytes, kind: str, type_hash: str) -> None:
+        message = messages.decode(data, "sensor_msgs/msg/JointState")
+        values = next(each for each in (message.position, message.velocity, message.effort) if len(each))
+        newest.append((list(message.name), values))
+
+    def publish(topic: str, kind: str, message: Any) -> None:
+        if topic not in publishers:
+            publishers[topic] = node.publisher(topic, kind)
+        publishers[topic].publish(message)
+
+    node.subscribe("joint_commands", "sensor_msgs/msg/JointState", commanded)
+    empty = messages.make("std_msgs/msg/Empty", structure_needs_at_least_one_member=0)
+    reset = node.publisher("/muster_policy/reset", "std_msgs/msg/Empty")
+    period = 1.0 / task.config.control_hz
+    actions, returns, total, late, steps = torch.zeros_like(task.actions), [], 0.0, 0, 0
+    simulated = 0
+    begun = False
+    deadline = time.monotonic()
+    while len(returns) < episodes:
+        simulated += round(period * 1e9)
+        clock = messages.make("rosgraph_msgs/msg/Clock", clock=messages.stamp(simulated))
+        publish("/clock", "rosgraph_msgs/msg/Clock", clock)
+        for message in robot.measured(time.time_ns()):
+            publish(*message)
+        deadline = max(deadline + period / speed, time.monotonic())
+        time.sleep(max(0.0, deadline - time.monotonic()))
+        if not newest and not begun:
+            continue  # nobody acts yet
+        if not begun:
+            begun = True
+            told("the first command has come")
+        late += not newest
+        while newest:
+            actions = robot.actions(*newest.pop(0), actions)
+        task.step(actions)
+        steps += 1
+        total += float(task.rewards[0])
+        if bool(task.dones[0]):
+            returns.append(total)
+            told(
+                f"episode {len(returns)} of {episodes}: return {total:.2f}, {steps} steps, {late} without a new command"
+            )
+            total, late, steps = 0.0, 0, 0
+            actions = torch.zeros_like(actions)
+            newest.clear()
+            reset.publish(empty)
+    told(f"mean return {np.mean(returns):.2f} of {len(returns)} episodes")
+    return returns
+
+
+def open_robot(bundle: Path, messages: Messages, seed: int = 0) -> SimulatedRobot:
+    """The robot of a bundle's task, with the configuration of the training.
+
+    Raises:
+        UserError: The bundle is damaged, or its task is not here, means something else by now, or has no declared robot.
+    """
+    from worker.tasks import find_task
+    from worker.tasks.declared import DeclaredTask
+    from worker.tasks.policy_contract import policy_contract, same_policy
+
+    try:
+        manifest, contract = verify(bundle), read_contract(bundle)
+    except DamagedBundle as error:
+        raise UserError(str(error)) from error
+    with user_errors("task"):
+        task_type = find_task(contract.task)
+    with user_errors():
+        task = task_type(configure(task_type, manifest["train"]), 1, seed=seed, device="cpu")
+    if not isinstance(task, DeclaredTask) or "robot" not in task.views:
+        raise UserError(f"task {contract.task} declares no robot; a task of kernels by hand can't be a simulated robot")
+    if task.discrete or any(action.rule or not action.scale for action in contract.actions):
+        raise UserError(f"task {contract.task}: joint commands can't be turned back into its actions")
+    if lines := differences(contract, same_policy(policy_contract(task, contract.task), contract)):
+        raise UserError(f"bundle {bundle} does not fit task {contract.task} as it is now: {brief(lines)}")
+    return SimulatedRobot(task, contract, messages)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m worker.deploy.simulated_robot",
+        description="Be a simulated robot on ROS 2's wire, for the policy node of a bundle.",
+        epilog="example: muster-policy cart-policy --listen tcp/localhost:7447 & python -m worker.deploy.simulated_robot cart-policy",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("bundle", type=Path, help="directory of a bundle")
+    parser.add_argument("--episodes", type=int, default=10, help="end after so many (default: 10)")
+    parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds in a second (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="of the world (default: 0)")
+    parser.add_argument("--connect", default="tcp/localhost:7447", help="the router (default: tcp/localhost:7447)")
+    parser.add_argument("--listen", default=None, help="be a router on this endpoint")
+    parser.add_argument("--domain", type=int, default=0, help="ROS domain (default: 0)")
+    given = parser.parse_args()
+    if given.episodes < 1 or not 0.0 < given.speed <= 100.0:
+        raise UserError("--episodes must be 1 or more, --speed above 0 and at most 100")
+    try:
+        from muster_policy.errors import Refused
+        from muster_policy.graph import Node, open_session
+        from muster_policy.messages import Messages
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error.name} is not installed; pip install ./policy_node") from error
+    messages = Messages()
+    robot = open_robot(given.bundle, messages, given.seed)
+    try:
+        connect = None if given.listen else given.connect
+        with open_session(connect, given.listen) as session:
+            node = Node(session, messages, given.domain, "/", "simulated_robot")
+            print(f"simulated robot of {robot.contract.task}: it waits for joint_commands", flush=True)
+            try:
+                play(robot, node, given.episodes, given.speed, lambda line: print(line, flush=True))
+            finally:
+                node.close()
+    except Refused as error:
+        raise UserError(str(error)) from error
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)
