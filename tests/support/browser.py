@@ -17,6 +17,8 @@ import pytest
 from PIL import Image
 from websockets.sync.client import connect
 
+from tests.support.waiting import wait_for
+
 _OPTIONS = (
     "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist --no-first-run "
     "--remote-debugging-port=0 --disable-background-networking --window-size=640,400"
@@ -47,8 +49,16 @@ class Browser:
 
     def picture(self) -> np.ndarray:
         """What is seen, shape ``(height, width, 3)``, uint8."""
-        data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
+        answer = wait_for(self._shot, 30, "a picture of the page")
+        data = base64.b64decode(answer["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def _shot(self) -> dict[str, Any] | None:
+        """A picture; None while the browser goes to the page and has none."""
+        try:
+            return self._call("Page.captureScreenshot", format="png")
+        except RuntimeError:
+            return None
 
     def close(self) -> None:
         self._open.close()
@@ -63,5 +73,7 @@ class Browser:
             if got.get("method") == "Network.requestWillBeSent":
                 self.asked.add(got["params"]["request"]["url"])
             if got.get("id") == self._sent:
+                if "error" in got:
+                    raise RuntimeError(f"{method}: {got['error']}")
                 result: dict[str, Any] = got["result"]
                 return result

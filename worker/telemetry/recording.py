@@ -76,6 +76,7 @@ class Recording:
         self.steps = self.episodes = self.lost = 0
         self._ended = np.zeros(stage.worlds, np.int64)
         self._whole = np.zeros(stage.worlds, bool)
+        self._just_ended = np.zeros(stage.worlds, bool)
         """Whether each running episode was recorded from its first step on, without a gap."""
         try:
             self._file = self.partial.open("wb")
@@ -100,7 +101,7 @@ class Recording:
         try:
             self.lost += rows.lost
             if rows.lost:
-                self._whole[:] = False
+                self._whole[:] = self._just_ended[:] = False
             for step in range(len(rows)):
                 self._write_step(rows, step)
             for camera, seen in (images or {}).items():
@@ -211,7 +212,9 @@ class Recording:
         }
         self._add(f"/{frame}/rl/step", messages.STEP, now, messages.encoded(messages.STEP, **fields))
         if not self._sums[world, 1]:
-            self._whole[world] = done or fields["age"] == 1
+            # where the first step that is seen ends an episode, nobody knows when that began
+            self._whole[world] = self._just_ended[world] or (fields["age"] == 1 and not done)
+        self._just_ended[world] = done
         self._sums[world] += fields["reward"], 1
         if done:
             self._end_episode(world, fields)

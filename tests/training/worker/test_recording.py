@@ -149,6 +149,18 @@ def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached
     assert attached["robot.xml"] == (REPOSITORY / "worker/tasks/cartpole.xml").read_bytes()
 
 
+def test_an_episode_of_which_the_beginning_was_not_seen_is_not_complete(recorded: Recorded, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    recording = Recording(tmp_path / "late.mcap", recorded.stage, {})
+    for rows in recorded.rows[11:25]:  # the first of them ends an episode
+        recording.write(rows)
+    with recording.finish().open("rb") as file:
+        episodes = [each.metadata for each in make_reader(file).iter_metadata() if each.name == "episode"]
+    found = [(each["episode"], each["length"], each["complete"]) for each in episodes if each["world"] == "0"]
+    assert found == [("0", "1", "false"), ("1", "12", "true")]
+
+
 def test_ros_2_s_reader_in_python_opens_the_file(recorded: Recorded) -> None:
     from rosbags.highlevel import AnyReader
 
