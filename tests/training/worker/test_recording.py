@@ -152,7 +152,7 @@ def test_each_episode_has_a_record_and_the_robot_s_file_and_the_job_are_attached
 def test_an_episode_of_which_the_beginning_was_not_seen_is_not_complete(recorded: Recorded, tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
-    recording = Recording(tmp_path / "late.mcap", recorded.stage, {})
+    recording = Recording(tmp_path / "late.mcap", recorded.stage, {}, {})
     for rows in recorded.rows[11:25]:  # the first of them ends an episode
         recording.write(rows)
     with recording.finish().open("rb") as file:
