@@ -2,8 +2,9 @@
 
     python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
 
-Each training goes through three stretches of as many iterations: nobody has asked for its worlds, ``muster record`` writes four of
-them, and that has ended. Its checkpoint is then recorded, evaluated and exported. Writes ``seeing.md``.
+Each training goes through two stretches of as many iterations: ``muster record`` writes four of its worlds, and that has ended. A twin
+with the same seed, which nobody looks at, makes the same iterations for comparison: they get longer and shorter as robots learn. The
+checkpoint is then recorded, evaluated and exported. Writes ``seeing.md``.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import signal
 import statistics
 import subprocess
 import sys
@@ -25,7 +27,6 @@ import torch
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, build, device_name
-from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Run
 from shared_store.metrics import read_metrics
 from worker.distributed import Placement, connect
@@ -40,46 +41,38 @@ from worker.telemetry.rollout import Rollout
 
 WORLDS = {"Cartpole": 4096, "Ant": 4096, "Humanoid": 4096, "Quadruped": 4096}
 WORLDS_CPU = {"Cartpole": 1024, "Ant": 64}
-WARM, STRETCH, ROUNDS = 8, 40, 3
+WARM, STRETCH, ROUNDS = 8, 40 if CUDA else 20, 3
 TAPPED, EPISODES = 4, 2
 """Worlds that are recorded, and episodes of each of a checkpoint's recording."""
 
 
-def stretches(loop: Loop) -> list[float]:
-    """Milliseconds of an iteration: before anybody asks, while worlds are recorded, and after that; medians."""
+def watched(loop: Loop) -> list[int]:
+    """Train while somebody looks on, and then nobody; the iterations at which both stretches begin and end."""
     run, marks = loop.job.run, list[int]()
 
-    def done() -> int:
-        return len(read_metrics(run))
-
     def wait(iterations: int) -> None:
-        goal = done() + iterations
-        while done() < goal:
+        goal = len(read_metrics(run)) + iterations
+        while len(read_metrics(run)) < goal:
             time.sleep(0.05)
+
+    def mark(iterations: int) -> None:
+        marks.append(len(read_metrics(run)))
+        wait(iterations)
+        marks.append(len(read_metrics(run)))
 
     def look_on(folder: Path) -> None:
         wait(WARM)
-        marks.append(done())
-        wait(STRETCH)
-        marks.append(done())
         command = [sys.executable, "-m", "worker.telemetry.live", str(run.path), "--worlds", str(TAPPED)]
         output = ["--episodes", "1000000", "--output", str(folder / "live.mcap")]
         reader = subprocess.Popen([*command, *output], stdout=subprocess.DEVNULL)
-        while not answer_of(run).exists():
-            if reader.poll() is not None:
-                loop.stop.requested = True
-                return
+        while not answer_of(run).exists() and reader.poll() is None:
             time.sleep(0.05)
-        wait(WARM)  # the rollout is captured anew, the reader has built what it shows
-        marks.append(done())
-        wait(STRETCH)
-        marks.append(done())
-        reader.send_signal(2)
+        wait(WARM)  # the rollout is captured anew, the reader builds what it shows
+        mark(STRETCH)
+        reader.send_signal(signal.SIGINT)
         reader.wait()
         wait(WARM)
-        marks.append(done())
-        wait(STRETCH)
-        marks.append(done())
+        mark(STRETCH)
         loop.stop.requested = True
 
     with tempfile.TemporaryDirectory() as folder:
@@ -88,9 +81,14 @@ def stretches(loop: Loop) -> list[float]:
         with contextlib.redirect_stdout(io.StringIO()):
             loop.train()
         watcher.join()
+    return marks
+
+
+def took(run: Run, marks: list[int]) -> list[float]:
+    """Milliseconds of an iteration between each two marks, medians."""
     ends = [record["total_seconds"] for record in read_metrics(run)]
-    took = [1000 * (after - before) for before, after in pairwise(ends)]
-    return [statistics.median(took[first:last]) for first, last in zip(marks[::2], marks[1::2], strict=True)]
+    each = [1000 * (after - before) for before, after in pairwise(ends)]
+    return [statistics.median(each[first:last]) for first, last in zip(marks[::2], marks[1::2], strict=True)]
 
 
 def recorded(run: Run, folder: Path) -> dict[str, float]:
@@ -140,19 +138,22 @@ def exported(run: Run) -> dict[str, float]:
 
 def measure(task: str, worlds: int) -> dict[str, Any]:
     """All of one task."""
-    rounds, row = [], dict[str, Any]()
+    rounds, row = list[tuple[list[float], list[float]]](), dict[str, Any]()
     for number in range(ROUNDS):
-        with tempfile.TemporaryDirectory() as store:
+        with tempfile.TemporaryDirectory() as store, tempfile.TemporaryDirectory() as other:
             loop = build(task, worlds, Path(store), every=1000)
-            rounds.append(stretches(loop))
-            run = loop.job.run
+            marks, run = watched(loop), loop.job.run
             steps = worlds * loop.algorithm.steps
             loop.close()
+            twin = build(task, worlds, Path(other), every=1000, iterations=marks[-1] + 1)
+            with contextlib.redirect_stdout(io.StringIO()):
+                twin.train()
+            rounds.append((took(run, marks), took(twin.job.run, marks)))
+            twin.close()
             if number == ROUNDS - 1:
-                assert list_checkpoints(run)
                 row = {**recorded(run, Path(store)), **judged(run, worlds), **exported(run)}
-    alone = statistics.median(each[0] for each in rounds)
-    ratios = [statistics.median(each[stretch] / each[0] for each in rounds) - 1.0 for stretch in (1, 2)]
+    alone = statistics.median(unseen[0] for _, unseen in rounds)
+    ratios = [statistics.median(seen[part] / unseen[part] for seen, unseen in rounds) - 1.0 for part in (0, 1)]
     shown = {"task": task, "worlds": worlds, "iteration": alone, "tapped": ratios[0], "left": ratios[1]}
     return {**shown, "training_rate": 1000 * steps / alone, **row}
 
@@ -162,10 +163,10 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# What looking at a policy costs, on {device_name()}",
         "",
-        f"`python -m benchmarks.seeing`; medians of {ROUNDS} trainings, each of {STRETCH} iterations without anybody who looks on, with "
-        f"`muster record` of {TAPPED} worlds, and after that. {told(rows)}",
+        f"`python -m benchmarks.seeing`; medians of {ROUNDS} pairs of trainings with the same seed; of one, `muster record` writes {TAPPED} "
+        f"worlds for {STRETCH} iterations, and then nobody reads for as many. {told(rows)}",
         "",
-        "| task | worlds | an iteration [ms] | while worlds are recorded | after that |",
+        "| task | worlds | an iteration that nobody sees [ms] | while worlds are recorded | after that |",
         "|---|--:|--:|--:|--:|",
     ]
     for row in rows:

@@ -125,7 +125,7 @@ def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
         known: Joints of the policy.
 
     Raises:
-        Refused: A line is of another form, or names no joint of the policy.
+        Refused: A line is of another form or names no joint of the policy, or two joints are one of the robot.
     """
     try:
         lines = path.read_text().splitlines()
@@ -143,6 +143,12 @@ def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
         if ours not in known:
             raise Refused(f"--joints {path}, line {number}: the policy has no joint {ours}; {nearest(ours, known)}")
         found[ours] = theirs
+    robot: dict[str, str] = {}
+    for joint in known:
+        if (other := robot.setdefault(found.get(joint, joint), joint)) != joint:
+            raise Refused(
+                f"--joints {path}: {other} and {joint} of the policy are both {found.get(joint, joint)} of the robot; give each its own"
+            )
     return found
 
 

@@ -93,12 +93,11 @@ class Inputs:
             elif type_hash != wanted:
                 what = f"{kind} of another definition ({type_hash[:20]}…, here {wanted[:20]}…)"
                 self._complain(topic, f"{what}; give --distro as the robot has it")
-            elif each is self.all[0]:
+            else:
                 with self.news:
                     each.waiting = data, time.monotonic()
-                    self.news.notify_all()
-            else:
-                each.waiting = data, time.monotonic()
+                    if each is self.all[0]:
+                        self.news.notify_all()
 
         return received
 
@@ -109,9 +108,11 @@ class Inputs:
             topics: Full names, for complaints.
         """
         for each in self.all:
-            if each.waiting is None:
+            with self.news:  # a message that comes meanwhile must not be lost: a command may come once
+                waiting, each.waiting = each.waiting, None
+            if waiting is None:
                 continue
-            (data, arrived), each.waiting = each.waiting, None
+            data, arrived = waiting
             try:
                 each.value = each.read(self._messages.decode(data, each.kind))
                 each.arrived = arrived
@@ -130,9 +131,10 @@ class Inputs:
         return [each for each in self.all if each.value is None]
 
     def stale(self, now: float, timeout: float) -> list[tuple[Input, float]]:
-        """What is measured, and too old, with its age [s]; commands do not count."""
-        ages = [(each, now - each.arrived) for each in self.all if each.command is None]
-        return [(each, age) for each, age in ages if age > timeout]
+        """What is too old, with its age [s]: of what is measured, and of commanded velocities that were never 0 in training."""
+        limits = [(each, timeout) for each in self.all if each.command is None]
+        limits += [(each, COMMAND_TIMEOUT) for each in self.all if _is_silent(each, now) and not _may_be_zero(each)]
+        return [(each, now - each.arrived) for each, limit in limits if now - each.arrived > limit]
 
     def snapshot(self, now: float) -> Snapshot:
         """What is known now; nothing may be missing. A commanded velocity that is too old is 0."""
@@ -182,6 +184,12 @@ def _is_silent(each: Input, now: float) -> bool:
     return each.command is not None and is_twist(each.command) and now - each.arrived > COMMAND_TIMEOUT
 
 
+def _may_be_zero(each: Input) -> bool:
+    """Whether the policy knows how to stand."""
+    assert each.command is not None
+    return all(pair is None or pair[0] <= 0.0 <= pair[1] for pair in each.command.ranges)
+
+
 def _limited(each: Input, now: float) -> np.ndarray:
     """A command within what was commanded in training."""
     assert each.command is not None
@@ -226,6 +234,8 @@ def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
             if message.linear_acceleration_covariance[0] == -1.0:
                 raise Refused("it has no acceleration (linear_acceleration_covariance[0] is -1)")
             force = _xyz(message.linear_acceleration, "linear acceleration")
+        if message.angular_velocity_covariance[0] == -1.0:
+            raise Refused("it has no angular velocity (angular_velocity_covariance[0] is -1)")
         return Imu(turn, _xyz(message.angular_velocity, "angular velocity"), force)
 
     return read

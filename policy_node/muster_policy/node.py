@@ -131,10 +131,14 @@ class PolicyNode:
         self._log = node.publisher("/rosout", LOG, Qos(depth=1000, transient_local=True))
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
-        node.subscribe("~/reset", EMPTY, lambda data, kind, type_hash: self._reset.set())
+        node.subscribe("~/reset", EMPTY, self._hear_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
         self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
+
+    def _hear_reset(self, data: bytes, kind: str, type_hash: str) -> None:
+        if kind == EMPTY:
+            self._reset.set()
 
     def _loop(self) -> None:
         gc.collect()

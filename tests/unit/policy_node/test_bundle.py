@@ -158,6 +158,7 @@ def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, t
         (("--domain", "233"), "domain 233: expected 0 to 232"),
         (("--listen", "nonsense"), "--listen nonsense: Zenoh can't open it"),
         (("--joints", "JOINTS"), "line 2: the policy has no joint kne; did you mean knee?"),
+        (("--joints", "TWICE"), "knee and wheel of the policy are both motor of the robot; give each its own"),
         (("--joints", "/no/such"), "--joints /no/such: it can't be read (No such file or directory)"),
     ],
 )
@@ -166,7 +167,10 @@ def test_wrong_use_is_one_line(
 ) -> None:
     names = tmp_path / "names.txt"
     names.write_text("wheel = left_wheel  # of the robot\nkne = motor\n")
-    assert main([str(bundle), *(each.replace("JOINTS", str(names)) for each in options)]) == 1
+    twice = tmp_path / "twice.txt"
+    twice.write_text("knee = motor\nwheel = motor\n")
+    files = {"JOINTS": str(names), "TWICE": str(twice)}
+    assert main([str(bundle), *(files.get(each, each) for each in options)]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert said in line
 

@@ -133,6 +133,16 @@ def test_a_commanded_velocity_that_is_too_old_is_0() -> None:
     assert heard.inputs.silent_commands(command.arrived + 0.4) == []
 
 
+def test_a_policy_that_never_stood_in_training_stops_without_a_commanded_velocity() -> None:
+    heard = Heard(contract())
+    heard.all()
+    (command,) = (each for each in heard.inputs.all if each.topic == "cmd_vel")
+    assert command.command is not None and heard.inputs.stale(command.arrived + 0.6, 9.0) == []
+    command.command = dataclasses.replace(command.command, ranges=((0.5, 1.0), *command.command.ranges[1:]))
+    assert heard.inputs.stale(command.arrived + 0.4, 9.0) == []
+    assert [each for each, _ in heard.inputs.stale(command.arrived + 0.6, 9.0)] == [command]
+
+
 def test_other_commands_are_arrays_that_do_not_grow_old() -> None:
     reach = Command("reach", ("x", "y"), ("m", "m"), ((0.0, 1.0), None), (5.0, 5.0), "pose_command", True)
     told = term("command_number", 0, 2, kind="command", command="reach", element="index", elements=("0", "1"))
@@ -235,6 +245,10 @@ def test_a_message_of_another_definition_is_ignored_with_one_line() -> None:
         ),
         (imu((0.0, 0.0, 0.0, 0.0)), "its orientation is no rotation: a quaternion of length 0"),
         (imu(angular=(0.0, np.nan, 0.0)), "not finite: its angular velocity"),
+        (
+            imu(angular_velocity_covariance=np.array([-1.0] + [0.0] * 8)),
+            "it has no angular velocity (angular_velocity_covariance[0] is -1)",
+        ),
     ],
 )
 def test_an_imu_that_can_t_be_used_is_ignored_with_one_line(message: Any, said: str) -> None:
