@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
@@ -24,10 +24,11 @@ from orchestrator.backoff import Backoff
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError
 from orchestrator.tables import Job, WebhookDelivery, now
-from orchestrator.webhooks import PAUSES, Webhook, event_of, kind_of
+from orchestrator.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
-from shared_store.evaluations import by_checkpoint
+from shared_store.evaluations import by_checkpoint, evaluation_name, list_evaluations
+from shared_store.layout import Run
 
 TIMEOUT = 10.0
 """Seconds that a receiver may take to be connected, and between two pieces of its answer."""
@@ -186,23 +187,16 @@ class Deliveries:
 
     def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
         attempts = self._attempts(job)
-        run = self._controller.store.run(job.run)
-        checkpoint: str | None = None
-        evaluation = None
-        try:
-            checkpoints = list_checkpoints(run)
-            checkpoint = checkpoints[-1].name if checkpoints else None
-            summary = by_checkpoint(run).get(checkpoint or "")
-            evaluation = {key: summary[key] for key in _SHOWN} if summary else None
-        except (OSError, ValueError):  # a volume that is away: the message does without
-            pass
+        name = run_of(job)
+        checkpoint, summary = _evaluated(self._controller.store.run(name), job)
+        evaluation = {key: summary[key] for key in _SHOWN} if summary else None
         data = {
             "job": job.id,
             "name": job.name,
             "kind": kind_of(job),
             "queue": job.queue,
             "owner": job.owner,
-            "run": job.run,
+            "run": name,
             "status": job.status,
             "statusReason": job.status_reason,
             "stopped": job.stop_reason is not None,
@@ -221,6 +215,21 @@ class Deliveries:
         """The exit code of each attempt."""
         with self._database.session() as session:
             return [attempt.exit_code for attempt in session.get_one(Job, job.id).attempts]
+
+
+def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:
+    """The checkpoint that a message names and its evaluation: of a job that evaluates its own, of others the newest one's."""
+    with suppress(OSError, ValueError):  # a volume that is away: the message does without
+        if kind_of(job) == "evaluate":
+            own = (
+                each for each in list_evaluations(run) if each["name"] == evaluation_name(each["checkpoint"], job.id)
+            )
+            summary = next(own, None)
+            return (summary["checkpoint"], summary) if summary else (None, None)
+        checkpoints = list_checkpoints(run)
+        if checkpoints:
+            return checkpoints[-1].name, by_checkpoint(run).get(checkpoints[-1].name)
+    return None, None
 
 
 def _failed(session: Session, which: ColumnElement[bool], most: int = 20) -> list[dict[str, Any]]:

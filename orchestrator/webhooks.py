@@ -106,11 +106,22 @@ class Webhook(BaseModel):
 
 def kind_of(job: Job) -> str:
     """What a job does, of :data:`orchestrator.spec.KINDS`; ``command`` where its spec does not say, or its row is damaged."""
-    try:
-        spec = gang_needs(job.node_properties).spec or {}
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return "command"
+    spec = _spec(job)
     return next((kind for kind in KINDS if spec.get(kind)), "command")
+
+
+def run_of(job: Job) -> str:
+    """The run that a job trains, or of which it evaluates, exports, records or renders a checkpoint."""
+    section = _spec(job).get(kind_of(job))
+    named = section.get("run") if isinstance(section, dict) else None
+    return named if isinstance(named, str) and NAME.fullmatch(named) else job.run
+
+
+def _spec(job: Job) -> dict[str, Any]:
+    try:
+        return gang_needs(job.node_properties).spec or {}
+    except (ValueError, KeyError, TypeError, AttributeError):  # its row is damaged
+        return {}
 
 
 def read_webhooks(source: str | None) -> Sequence[Webhook]:

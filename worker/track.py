@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import select
 import subprocess
 import sys
@@ -27,7 +26,7 @@ from shared_store.evaluations import list_evaluations
 from shared_store.files import read_json, write_json
 from shared_store.layout import Run
 from shared_store.metrics import MetricsHistory
-from worker.telemetry.services import SERVICES, Ending, Refused, Service, Tracked, one_line
+from worker.telemetry.services import SERVICES, Ending, Refused, Service, Tracked, one_line, without_key
 
 LOOK_SECONDS = 2.0
 """Between two looks at the metrics."""
@@ -77,7 +76,7 @@ class Sender:
         if is_other or note.get("id") != self._service.identity:
             write_json(self._note, {"id": self._service.identity, "settings": self._settings})
         self._sent = sent
-        self._say(_without_key(self._service.place))
+        self._say(without_key(self._service.place))
 
     def step(self, resumed_from: int | None, epoch: int, *, at_once: bool = False) -> bool:
         """Send what is new, unless a try failed a moment ago; returns whether everything is sent. Raises StaleEpoch."""
@@ -99,7 +98,7 @@ class Sender:
             self._next = time.monotonic() + min(most, first * 2**self._tries)
             self._tries = min(self._tries + 1, 10)
             if not self._trouble:
-                self._say(f"warning: nothing can be sent now ({_without_key(one_line(error))})")
+                self._say(f"warning: nothing can be sent now ({one_line(error)})")
             self._trouble = True
             return False
 
@@ -107,11 +106,6 @@ class Sender:
         """Send the end: evaluation and pictures of a training that is done. Raises whatever the service does."""
         figures, files = _results(self._run) if outcome == "finished" else ({}, [])
         self._service.finish(Ending(outcome, self._sent or 0, figures, files))
-
-
-def _without_key(text: str) -> str:
-    """A text whose URIs name no user and no password."""
-    return re.sub(r"//[^/@\s]*@", "//", text)
 
 
 def _results(run: Run) -> tuple[dict[str, float], list[Path]]:

@@ -16,6 +16,7 @@ from muster_policy.errors import Refused, nearest
 from muster_policy.messages import DISTRIBUTIONS
 from muster_policy.node import PolicyNode, Settings
 from muster_policy.policy import Policy
+from muster_policy.snapshot import IMU
 
 EXAMPLES = """\
 examples:
@@ -158,6 +159,8 @@ def _introduce(node: PolicyNode, bundle: Bundle) -> None:
         _say(f"warning: --rate {node.rate:g}: the policy was trained at {trained:g} Hz")
     if (unit := node.observations.unit) is not None:
         _say(f"imu: in the frame of {unit.name}, on {unit.body}")
+    elif IMU in node.observations.needs:
+        _say("imu: in the frame of the robot's root body")
     _say("joints, whose controllers must have these gains:")
     for line in node.commands.table():
         _say(line)

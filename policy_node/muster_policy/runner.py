@@ -13,6 +13,9 @@ from muster_policy.inputs import Inputs
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 
+SETTLED = 0.5
+"""How long all inputs must have been fresh after one was too old, before the node commands again [s]."""
+
 
 class Mode(enum.Enum):
     """What the node does."""
@@ -37,7 +40,8 @@ class Runner:
     """Decides in each control step whether to command, and what.
 
     It commands only while all that is measured is there and fresh, and the policy's actions are numbers. Where that ends it gives one
-    last command, which holds the robot where it is, and no further one.
+    last command, which holds the robot where it is, and no further one. It goes on when inputs have been fresh for :data:`SETTLED`, so
+    that an input slower than the timeout does not start and stop the robot again and again.
 
     Args:
         inputs: What is measured.
@@ -63,6 +67,8 @@ class Runner:
         self.timeout, self._give, self._say = timeout, give, say
         self.mode, self.counts = Mode.WAITING, Counts()
         self._silent: set[str] = set()
+        self._settled = -float("inf")
+        """From when on inputs have been fresh for long enough [s, monotonic]."""
         self._topics: Mapping[str, str] = {}
 
     def name_topics(self, topics: Mapping[str, str]) -> None:
@@ -88,8 +94,10 @@ class Runner:
             if self.mode is Mode.ACTING:
                 each, age = max(stale, key=lambda entry: entry[1])
                 self._stop(f"{self._topic(each.topic)} is silent for {age * 1e3:.0f} ms", Mode.WAITING)
+            if self.counts.stops:
+                self._settled = now + SETTLED
             return False
-        if not due:
+        if not due or (self.mode is Mode.WAITING and now < self._settled):
             return False
         if self.mode is Mode.WAITING:
             self._forget()
@@ -139,7 +147,8 @@ class Runner:
         self._hold()
         self.mode = then
         self.counts.stops += 1
-        goes_on = "when all inputs are fresh" if then is Mode.WAITING else "after ~/reset"
+        fresh = f"when no input has been older than {self.timeout * 1e3:.0f} ms (--timeout) for {SETTLED:g} s"
+        goes_on = fresh if then is Mode.WAITING else "after ~/reset"
         self._say(f"{why}: one last command holds the joints where they are; it goes on {goes_on}", True)
 
     def _hold(self) -> None:

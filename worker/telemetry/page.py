@@ -38,6 +38,8 @@ _ASSETS = {
     "/favicon.ico": "image/x-icon",
     "/apple-touch-icon.png": "image/png",
 }
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Asks this machine, whatever proxy the environment names."""
 _ELSEWHERE = re.compile(r"<link\b[^>]*https://[^>]*>")
 """Links of the page to other servers."""
 
@@ -191,12 +193,12 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header("Content-Length", "0")
                 self.end_headers()
             elif asked.path == "/":
-                with urllib.request.urlopen(f"{own['assets']}/") as page:
+                with _DIRECT.open(f"{own['assets']}/") as page:
                     content = _ELSEWHERE.sub("", page.read().decode()).replace("Rerun Viewer", "muster view").encode()
                 self._begin("text/html; charset=utf-8", str(len(content)))
                 self.wfile.write(content)
             elif asked.path in _ASSETS:
-                with urllib.request.urlopen(f"{own['assets']}{asked.path}") as asset:
+                with _DIRECT.open(f"{own['assets']}{asked.path}") as asset:
                     self._begin(_ASSETS[asked.path], asset.headers["rerun-final-length"])
                     shutil.copyfileobj(asset, self.wfile, 1 << 20)
             else:

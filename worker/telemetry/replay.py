@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,39 +64,41 @@ class Replay:
         shapes: dict[str, bytes] = {}
         places: list[tuple[float, float, float]] = []
         links: list[str] = []
-        for kind, topic, _, data in self._messages():
-            if topic == "/tf_static":
-                for each in _decoded(kind, data).transforms:
-                    where = each.transform.translation
-                    places.append((where.x, where.y, where.z))
-            elif topic in ("/ground", "/world_0/scene"):
-                for entity in _decoded(kind, data).entities:
-                    frame = "ground" if topic == "/ground" else entity.frame_id.removeprefix("world_0").lstrip("/")
-                    shapes[frame] = bytes(entity.models[0].data)
-            elif topic == "/tf":
-                links = [each.child_frame_id for each in _decoded(kind, data).transforms]
-            elif topic == "/world_0/rl/step" and shapes and places:
-                own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
-                self.look = Look(own, shapes, np.array(places), tuple(_decoded(kind, data).reward_names))
-                self.cut = False
-                return
+        with self._ours():
+            for kind, topic, _, data in self._messages():
+                if topic == "/tf_static":
+                    for each in _decoded(kind, data).transforms:
+                        where = each.transform.translation
+                        places.append((where.x, where.y, where.z))
+                elif topic in ("/ground", "/world_0/scene"):
+                    for entity in _decoded(kind, data).entities:
+                        frame = "ground" if topic == "/ground" else entity.frame_id.removeprefix("world_0").lstrip("/")
+                        shapes[frame] = bytes(entity.models[0].data)
+                elif topic == "/tf":
+                    links = [each.child_frame_id for each in _decoded(kind, data).transforms]
+                elif topic == "/world_0/rl/step" and shapes and places:
+                    own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
+                    self.look = Look(own, shapes, np.array(places), tuple(_decoded(kind, data).reward_names))
+                    self.cut = False
+                    return
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
     def parts(self) -> Iterator[Part]:
         """All control steps, in order."""
         found = _Gathered(self.look)
-        for kind, topic, time, data in self._messages():
-            if topic == "/tf":
-                if len(found.times) == BATCH:
-                    yield self._part(found)
-                    found = _Gathered(self.look, found.sums)
-                found.move(time, _decoded(kind, data).transforms)
-            elif topic == "/rosout":
-                line = _decoded(kind, data)
-                found.said.append((time, line.name, line.msg))
-            elif topic.endswith("/rl/step") and found.times:
-                found.step(time, _decoded(kind, data))
+        with self._ours():
+            for kind, topic, time, data in self._messages():
+                if topic == "/tf":
+                    if len(found.times) == BATCH:
+                        yield self._part(found)
+                        found = _Gathered(self.look, found.sums)
+                    found.move(time, _decoded(kind, data).transforms)
+                elif topic == "/rosout":
+                    line = _decoded(kind, data)
+                    found.said.append((time, line.name, line.msg))
+                elif topic.endswith("/rl/step") and found.times:
+                    found.step(time, _decoded(kind, data))
         if found.times:
             yield self._part(found)
 
@@ -104,6 +107,18 @@ class Replay:
         steps = np.arange(first, self.count + 1)
         rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
         return Part(np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns)
+
+    @contextmanager
+    def _ours(self) -> Iterator[None]:
+        """Refuse what is not as Muster writes it. Raises UserError."""
+        try:
+            yield
+        except UserError:
+            raise
+        except Exception as error:  # rosbags raises whatever its generated code meets in the bytes of another program
+            raise UserError(
+                f"{self.path}: it is no recording of Muster's, whose topics have other messages; `rerun {self.path.name}` may show it"
+            ) from error
 
     def _messages(self) -> Iterator[tuple[str, str, int, bytes]]:
         """Type, topic, time [ns] and content, as they were written. Sets :attr:`cut`. Raises UserError where it is no MCAP file."""

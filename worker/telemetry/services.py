@@ -6,6 +6,7 @@ A service is asked how far it has a run's history, and is given what comes after
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -236,8 +237,13 @@ SERVICES: dict[str, type[WandB] | type[MLflow]] = {"wandb": WandB, "mlflow": MLf
 
 
 def one_line(error: BaseException) -> str:
-    """An error as a line of at most 300 characters."""
-    return " ".join(str(error).split())[:300] or type(error).__name__
+    """An error as a line of at most 300 characters, without a key."""
+    return without_key(" ".join(str(error).split()))[:300] or type(error).__name__
+
+
+def without_key(text: str) -> str:
+    """A text whose URIs name no user and no password."""
+    return re.sub(r"//[^/@\s]*@", "//", text)
 
 
 def _package(name: str) -> Any:

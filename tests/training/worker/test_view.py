@@ -68,6 +68,23 @@ def test_a_recording_of_which_the_end_is_missing_is_shown_up_to_there(recorded: 
         Replay(cut)
 
 
+def test_a_recording_of_another_program_is_refused_in_one_line(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(
+            "tf2_msgs/msg/TFMessage", "ros2msg", b"geometry_msgs/TransformStamped[] transforms"
+        )
+        writer.add_message(writer.register_channel("/tf_static", "cdr", schema), 1, b"\0\1\0\0\xff\xff\0\0", 1)
+        writer.finish()
+    with pytest.raises(UserError, match="it is no recording of Muster's, whose topics have other messages") as error:
+        Replay(path)
+    assert "\n" not in str(error.value)
+
+
 def test_every_link_of_every_world_is_where_the_simulation_has_it(recorded: Recorded, shown: dict[str, Any]) -> None:
     table = shown["/tf"]
     frames = [each[0] for each in table["Transform3D:child_frame"].to_pylist()]

@@ -90,8 +90,15 @@ def test_a_silent_input_stops_the_node_with_one_last_command_that_holds_the_join
     assert rig.lines[-1].startswith(
         "joint_states is silent for 70 ms: one last command holds the joints where they are"
     )
-    assert rig.step(0.2, knee=0.2), "it goes on by itself"
+    assert "it goes on when no input has been older than 60 ms (--timeout) for 0.5 s" in rig.lines[-1]
+    assert [rig.step(0.1 + 0.05 * step, knee=0.2) for step in range(9)] == [False] * 9
+    assert rig.step(0.6, knee=0.2), "it goes on by itself"
     assert rig.given[-1] == pytest.approx(0.3 + 0.5 * 0.2), "with a fresh episode: there is no last action"
+
+
+def test_an_input_slower_than_the_timeout_does_not_start_and_stop_the_robot_again_and_again(rig: Rig) -> None:
+    acted = [rig.step(0.02 * step, knee=0.2 if step % 5 == 0 else None) for step in range(200)]
+    assert acted.count(True) == 4 and rig.runner.counts.stops == 1, "it acts until the first gap, and then no more"
 
 
 def test_messages_that_can_t_be_used_are_silence(rig: Rig) -> None:
