@@ -20,14 +20,21 @@ CREDENTIALS = (
     "DATABRICKS_TOKEN",
 )
 """Variables that hold a key: in ``environment`` they would be stored in the run."""
+_URIS = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI", "WANDB_BASE_URL")
+"""Variables that may hold one."""
 
 
 def _uri(value: str) -> str:
-    if re.match(r"[^/]*//[^/]*:[^/]*@", value):
+    if _has_credential(value):
         raise ValueError(
             "a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD as secrets"
         )
     return value
+
+
+def _has_credential(uri: str) -> bool:
+    """Whether a URI names a user, or a password among its parameters."""
+    return bool(re.match(r"[^/]*//[^/]*@", uri) or re.search(r"[?&](password|token|secret|key)=", uri, re.IGNORECASE))
 
 
 class WandB(Section):
@@ -74,7 +81,10 @@ class Track(Section):
 
 def key_in(environment: Mapping[str, str]) -> str | None:
     """The first variable of a job's ``environment`` that holds a service's key."""
-    return next((name for name in environment if name in CREDENTIALS), None)
+    held = (
+        name for name, value in environment.items() if name in CREDENTIALS or (name in _URIS and _has_credential(value))
+    )
+    return next(held, None)
 
 
 def track_schema(section: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import Counter, deque
@@ -175,8 +176,9 @@ class Inputs:
     def _complain(self, topic: str, problem: str) -> None:
         self.ignored[topic] += 1
         line = f"{topic}: message ignored: {problem}"
-        if line not in self._told and len(self._told) < _DIFFERENT:
-            self._told.add(line)
+        kind = re.sub(r"[0-9.]+", "#", line)  # the same problem with other numbers is told once
+        if kind not in self._told and len(self._told) < _DIFFERENT:
+            self._told.add(kind)
             self._complaints.append(line)
 
 
@@ -222,10 +224,11 @@ def _rotation(turn: Any) -> np.ndarray:
 def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
     """Reads what these quantities need; a field whose covariance begins with -1 is not measured, as ROS has it."""
     needs_turn = bool(quantities & {"projected_gravity", "root_uprightness", "imu_projected_gravity"})
+    needs_rate = bool(quantities & {"imu_angular_velocity", "root_angular_velocity"})
     needs_force = "imu_acceleration" in quantities
 
     def read(message: Any) -> Imu:
-        turn, force = np.eye(3), np.zeros(3)
+        turn, rate, force = np.eye(3), np.zeros(3), np.zeros(3)
         if needs_turn:
             if message.orientation_covariance[0] == -1.0:
                 raise Refused("it has no orientation (orientation_covariance[0] is -1); run a filter that estimates it")
@@ -234,9 +237,11 @@ def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
             if message.linear_acceleration_covariance[0] == -1.0:
                 raise Refused("it has no acceleration (linear_acceleration_covariance[0] is -1)")
             force = _xyz(message.linear_acceleration, "linear acceleration")
-        if message.angular_velocity_covariance[0] == -1.0:
-            raise Refused("it has no angular velocity (angular_velocity_covariance[0] is -1)")
-        return Imu(turn, _xyz(message.angular_velocity, "angular velocity"), force)
+        if needs_rate:
+            if message.angular_velocity_covariance[0] == -1.0:
+                raise Refused("it has no angular velocity (angular_velocity_covariance[0] is -1)")
+            rate = _xyz(message.angular_velocity, "angular velocity")
+        return Imu(turn, rate, force)
 
     return read
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import shutil
 import signal
 import socket
@@ -72,10 +73,12 @@ class Page:
         program = need_rerun()
         self._http = _listen(port)
         self._home = Path(tempfile.mkdtemp(prefix="muster-view-"))
-        stream, assets = _free_port(), _free_port()
-        self.server = f"rerun+http://{LOOPBACK}:{stream}/proxy"
+        # Rerun's server looks at no Host header: of an address that nobody can guess no page of another name (DNS rebinding) reads
+        own = f"127.{secrets.randbelow(255)}.{secrets.randbelow(255)}.{1 + secrets.randbelow(254)}"
+        stream, assets = _free_port(own), _free_port(own)
+        self.server = f"rerun+http://{own}:{stream}/proxy"
         self.url = f"http://{LOOPBACK}:{self._http.server_port}"
-        options = {"--bind": LOOPBACK, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
+        options = {"--bind": own, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
         command = [
             str(program),
             "--serve-web",
@@ -90,9 +93,11 @@ class Page:
             stdout=self._log,
             stderr=self._log,
         )
-        self._http.__dict__.update(assets=f"http://{LOOPBACK}:{assets}", stream=stream, query=self._query())
+        self._http.__dict__.update(
+            assets=f"http://{own}:{assets}", stream=f"http://{own}:{stream}", query=self._query()
+        )
         try:
-            self._wait(stream, assets)
+            self._wait(own, stream, assets)
         except UserError:
             self.close()
             raise
@@ -126,10 +131,10 @@ class Page:
     def _query(self) -> str:
         return urlencode({"url": self.server, "hide_welcome_screen": "1", "persist": "0", "theme": "dark"})
 
-    def _wait(self, *ports: int) -> None:
+    def _wait(self, address: str, *ports: int) -> None:
         until = time.monotonic() + _STARTED_WITHIN
         for port in ports:
-            while socket.socket().connect_ex((LOOPBACK, port)):
+            while socket.socket().connect_ex((address, port)):
                 self.check()
                 if time.monotonic() > until:
                     raise UserError(f"Rerun's server did not start within {_STARTED_WITHIN:.0f} s{self._last_words()}")
@@ -153,9 +158,9 @@ def _listen(port: int | None) -> ThreadingHTTPServer:
         ) from error
 
 
-def _free_port() -> int:
+def _free_port(address: str) -> int:
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.bind((address, 0))
         port: int = probe.getsockname()[1]
         return port
 
@@ -182,7 +187,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """One of the page's files; ``/`` leads to the page with the view in it."""
         own = self.server.__dict__
-        if self.headers.get("Host") not in (f"{name}:{self.server.server_port}" for name in (LOOPBACK, "localhost")):
+        name, _, port = (self.headers.get("Host") or "").partition(":")
+        if name not in (LOOPBACK, "localhost") or (port or "80") != str(self.server.server_port):
             self.send_error(403, "this page is served to this machine alone")
             return
         asked = urlsplit(self.path)
@@ -213,7 +219,7 @@ class _Handler(BaseHTTPRequestHandler):
         allowed = {
             "default-src": "'self' 'unsafe-inline' blob: data:",
             "script-src": "'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
-            "connect-src": f"'self' http://{LOOPBACK}:{stream} blob: data:",
+            "connect-src": f"'self' {stream} blob: data:",
             "frame-ancestors": "'self'",
         }
         self.send_response(200)

@@ -30,7 +30,7 @@ def spec(**changes: Any) -> dict[str, Any]:
             {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
             {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
         ),
-        ({"mlflow": {"uri": "http://me@host:5000/a"}}, {"mlflow": {"uri": "http://me@host:5000/a", "tags": {}}}),
+        ({"mlflow": {"uri": "http://host:5000/a"}}, {"mlflow": {"uri": "http://host:5000/a", "tags": {}}}),
     ],
 )
 def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, kept: Any) -> None:
@@ -59,6 +59,16 @@ def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, k
             {"track": {"mlflow": {"uri": "http://me:word@host"}}},
             "job.yaml: track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
             "MLFLOW_TRACKING_PASSWORD as secrets",
+        ),
+        (
+            {"track": {"mlflow": {"uri": "https://word@host/?password=word"}}},
+            "job.yaml: track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD as secrets",
+        ),
+        (
+            {"track": "mlflow", "environment": {"MLFLOW_TRACKING_URI": "postgresql://host/db?password=word"}},
+            "job.yaml: environment.MLFLOW_TRACKING_URI: the key would be stored in the run; remove it, and give it as a secret: "
+            "secrets: {MLFLOW_TRACKING_URI: NAME}",
         ),
         (
             {"track": "wandb", "environment": {"WANDB_API_KEY": "x"}},
