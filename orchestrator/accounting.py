@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.jobs import Ending, Status
 from orchestrator.scheduling import decayed
-from orchestrator.tables import Attempt, Dependency, Job, ShareUsage, WebhookDelivery
+from orchestrator.tables import Attempt, AutomaticEvaluation, Dependency, Job, ShareUsage, WebhookDelivery
 from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.layout import Run
 
@@ -100,6 +100,9 @@ def forget_before(session: Session, moment: int, most: int = 500) -> int:
     query = query.order_by(Job.stopped_at).limit(most)
     ids = list(session.scalars(query))
     session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(ids), WebhookDelivery.next_at.is_(None)))
+    session.execute(
+        delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(ids), AutomaticEvaluation.open.is_(False))
+    )
     for table, column in ((Attempt, Attempt.job_id), (Dependency, Dependency.job_id), (Job, Job.id)):
         session.execute(delete(table).where(column.in_(ids)))
     return len(ids)

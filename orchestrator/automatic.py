@@ -32,7 +32,7 @@ from orchestrator.jobs import Status
 from orchestrator.spec_sections import Evaluation
 from orchestrator.tables import AutomaticEvaluation, Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.evaluations import evaluation_is_over, keep_for_evaluation
+from shared_store.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
 from shared_store.layout import Run
 
 LOOK = 2.0
@@ -78,6 +78,7 @@ class AutomaticEvaluations:
             self._thread.join(timeout=10)
 
     def _loop(self) -> None:
+        self._isolated("checkpoints kept for nobody", self._let_go)
         while not self._ending.wait(self._interval):
             if self._controller.trouble is None:
                 self.look()
@@ -105,6 +106,16 @@ class AutomaticEvaluations:
             self._backoff.failed(subject, f"automatic evaluations, {subject}: {type(error).__name__}", error)
 
     # -- what was submitted ---------------------------------------------------------------------------------------------
+
+    def _let_go(self) -> None:
+        """Give up the claims of a controller that was killed before it submitted their evaluations."""
+        with self._controller.database.session() as session:
+            rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open.is_(False))).all()
+            names = [row.run for row in rows]
+        for name in names:
+            run = self._controller.store.run(name)
+            for checkpoint in wanted_checkpoints(run):
+                evaluation_is_over(run, checkpoint)
 
     def _close_ended(self) -> None:
         """Give up the claim on checkpoints whose evaluation has ended, well or not."""

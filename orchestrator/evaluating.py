@@ -26,7 +26,11 @@ def evaluation_document(
         section: What ``evaluate`` says beside the run.
         name: Of the job; ``evaluate-RUN`` where None.
     """
-    kept = {key: trained[key] for key in ("queue", "share", "image", "environment") if trained.get(key) is not None}
+    kept = {
+        key: trained[key]
+        for key in ("queue", "share", "image", "environment", "secrets")
+        if trained.get(key) is not None
+    }
     resources = dict(trained.get("resources") or {})
     if resources.get("gpus"):
         resources["gpus"] = 1

@@ -211,6 +211,12 @@ class Spec(Section):
         return self
 
     @model_validator(mode="after")
+    def _given_once(self) -> Spec:
+        if both := sorted(self.secrets.keys() & self.environment.keys()):
+            raise ValueError(f"secrets: {both[0]} is in environment, too; give it once")
+        return self
+
+    @model_validator(mode="after")
     def _trackable(self) -> Spec:
         if self.track is None:
             return self

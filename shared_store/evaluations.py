@@ -78,13 +78,18 @@ def evaluation_is_over(run: Run, checkpoint: str) -> None:
     (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
 
 
+def wanted_checkpoints(run: Run) -> set[str]:
+    """Names of the checkpoints that a job is going to evaluate, as :func:`keep_for_evaluation` was told."""
+    return {path.stem for path in run.evaluations.glob("*.wanted")}
+
+
 def kept_checkpoints(run: Run) -> set[str]:
     """Names of the checkpoints that retention leaves alone for their evaluations.
 
     Those that are going to be evaluated, and those that have been, unless each evaluation says that its checkpoint need not be kept;
     of these the best one.
     """
-    kept = {path.stem for path in run.evaluations.glob("*.wanted")}
+    kept = wanted_checkpoints(run)
     for path in run.evaluations.glob("*.json"):
         summary = _read(run, path.stem) if checkpoint_of(path.stem) else None
         if summary is None or summary.get("keep", True):  # also where it can't be read: nothing is lost by a guess

@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _introduce(node, bundle)
         if given.check:
             return 0
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: node.stopping.set())
         node.run()
     except Refused as error:
@@ -161,6 +161,8 @@ def _introduce(node: PolicyNode, bundle: Bundle) -> None:
         _say(f"imu: in the frame of {unit.name}, on {unit.body}")
     elif IMU in node.observations.needs:
         _say("imu: in the frame of the robot's root body")
+    if node.settings.controller:
+        _say(f"{node.settings.controller}: its parameter must be joints: [{', '.join(node.commands.joints)}]")
     _say("joints, whose controllers must have these gains:")
     for line in node.commands.table():
         _say(line)

@@ -37,6 +37,8 @@ class Input:
         command: The command that it is; None of what is measured.
         value: That of the last good message; None before the first.
         arrived: When that came [s, monotonic].
+        waiting: The newest message that is not decoded yet, and when it came.
+        count: Good messages so far.
     """
 
     topic: str
@@ -46,6 +48,7 @@ class Input:
     value: Any = None
     arrived: float = -float("inf")
     waiting: tuple[bytes, float] | None = None
+    count: int = 0
 
 
 class Inputs:
@@ -116,7 +119,7 @@ class Inputs:
             data, arrived = waiting
             try:
                 each.value = each.read(self._messages.decode(data, each.kind))
-                each.arrived = arrived
+                each.arrived, each.count = arrived, each.count + 1
             except Refused as problem:
                 self._complain((topics or {}).get(each.topic, each.topic), str(problem))
 
@@ -132,10 +135,15 @@ class Inputs:
         return [each for each in self.all if each.value is None]
 
     def stale(self, now: float, timeout: float) -> list[tuple[Input, float]]:
-        """What is too old, with its age [s]: of what is measured, and of commanded velocities that were never 0 in training."""
-        limits = [(each, timeout) for each in self.all if each.command is None]
-        limits += [(each, COMMAND_TIMEOUT) for each in self.all if _is_silent(each, now) and not _may_be_zero(each)]
-        return [(each, now - each.arrived) for each, limit in limits if now - each.arrived > limit]
+        """What is measured, and too old, with its age [s]; commands do not count."""
+        ages = [(each, now - each.arrived) for each in self.all if each.command is None]
+        return [(each, age) for each, age in ages if age > timeout]
+
+    def too_slow(self, now: float) -> list[Input]:
+        """Commanded velocities between 0 and all that was commanded in training: the policy would go faster than it is told."""
+        return [
+            each for each in self.all if each.command is not None and is_twist(each.command) and _is_too_slow(each, now)
+        ]
 
     def snapshot(self, now: float) -> Snapshot:
         """What is known now; nothing may be missing. A commanded velocity that is too old is 0."""
@@ -186,16 +194,23 @@ def _is_silent(each: Input, now: float) -> bool:
     return each.command is not None and is_twist(each.command) and now - each.arrived > COMMAND_TIMEOUT
 
 
-def _may_be_zero(each: Input) -> bool:
-    """Whether the policy knows how to stand."""
+def _asked(each: Input, now: float) -> np.ndarray:
+    """The numbers of a command; a commanded velocity that is too old is 0."""
     assert each.command is not None
-    return all(pair is None or pair[0] <= 0.0 <= pair[1] for pair in each.command.ranges)
+    value: np.ndarray = np.zeros(len(each.command.names)) if _is_silent(each, now) else each.value
+    return value
+
+
+def _is_too_slow(each: Input, now: float) -> bool:
+    assert each.command is not None
+    pairs = zip(_asked(each, now), each.command.ranges, strict=True)
+    return any(pair is not None and (0.0 < pair[0] > value or 0.0 > pair[1] < value) for value, pair in pairs)
 
 
 def _limited(each: Input, now: float) -> np.ndarray:
     """A command within what was commanded in training."""
     assert each.command is not None
-    value: np.ndarray = np.zeros(len(each.command.names)) if _is_silent(each, now) else each.value
+    value = _asked(each, now)
     ends = [(-np.inf, np.inf) if pair is None else pair for pair in each.command.ranges]
     low, high = np.array(ends).T
     within: np.ndarray = np.clip(value, low, high)

@@ -13,6 +13,7 @@ from muster_policy.bundle import Bundle
 from muster_policy.errors import Refused
 from muster_policy.graph import Node, open_session
 from muster_policy.inputs import Inputs
+from muster_policy.lines import Lines
 from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
@@ -24,6 +25,20 @@ REPORT = 10.0
 """Time between two lines about the loop [s]."""
 PATIENCE = 5.0
 """Time between two lines about inputs that are missing [s]."""
+
+
+SLOW = 0.8
+"""Share of the rate below which it is warned."""
+
+
+@dataclass(frozen=True)
+class _Report:
+    """What had happened at a moment [s, monotonic]."""
+
+    time: float
+    steps: int = 0
+    joints: int = 0
+    stops: int = 0
 
 
 @dataclass(frozen=True)
@@ -77,7 +92,7 @@ class PolicyNode:
     """
 
     def __init__(self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print) -> None:
-        self.settings, self._tell = settings, tell
+        self.settings, self._tell, self._print = settings, tell, tell
         contract = bundle.contract
         self.rate = settings.rate or contract.control_hz
         self.messages = Messages(settings.distribution)
@@ -100,10 +115,12 @@ class PolicyNode:
             self.inputs, self.observations, policy, self.commands, self.timeout, self._publish, self._say
         )
         self._lines: list[tuple[str, bool]] = []
+        self._last_report = _Report(time.monotonic())
 
     def run(self) -> None:
         """Be a node until :attr:`stopping` is set, or the duration is over. Raises Refused where Zenoh can't be opened."""
-        settings = self.settings
+        settings, lines = self.settings, Lines(self._print)
+        self._tell = lines.say
         with open_session(settings.connect, settings.listen) as session:
             self._node = node = Node(session, self.messages, settings.domain, settings.namespace, settings.name)
             try:
@@ -117,6 +134,7 @@ class PolicyNode:
                 self.runner.end("the node ends")
                 self._flush()
                 self._tell(self.summary())
+                lines.close()
                 node.close()
 
     def _connect(self, node: Node) -> None:
@@ -168,6 +186,7 @@ class PolicyNode:
             if now > report:
                 report = now + REPORT
                 self._tell(self.summary())
+                self._check_rates(now)
 
     def _wait(self, period: float) -> float | None:
         """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""
@@ -244,6 +263,19 @@ class PolicyNode:
             else:
                 how = "nobody publishes it"
             self._tell(f"waiting for {topic} ({each.kind}): {how}")
+
+    def _check_rates(self, now: float) -> None:
+        """Warn where it acts, or joint states come, more rarely than the policy was trained for."""
+        counts, before = self.runner.counts, self._last_report
+        this = self._last_report = _Report(now, counts.steps, self.inputs.all[0].count, counts.stops)
+        if self.runner.mode is not Mode.ACTING or not before.steps or this.stops != before.stops:
+            return
+        seconds = this.time - before.time
+        for what, count in (("it acts", this.steps - before.steps), ("joint states come", this.joints - before.joints)):
+            if count / seconds < SLOW * self.rate:
+                self._say(
+                    f"warning: {what} at {count / seconds:.1f} Hz, and the rate of control is {self.rate:g} Hz", True
+                )
 
     def summary(self) -> str:
         """One line about the loop so far."""

@@ -93,9 +93,15 @@ class Runner:
         if stale := self.inputs.stale(now, self.timeout):
             if self.mode is Mode.ACTING:
                 each, age = max(stale, key=lambda entry: entry[1])
-                self._stop(f"{self._topic(each.topic)} is silent for {age * 1e3:.0f} ms", Mode.WAITING)
+                fresh = f"when no input has been older than {self.timeout * 1e3:.0f} ms (--timeout) for {SETTLED:g} s"
+                self._stop(f"{self._topic(each.topic)} is silent for {age * 1e3:.0f} ms", fresh)
             if self.counts.stops:
                 self._settled = now + SETTLED
+            return False
+        if slow := self.inputs.too_slow(now):
+            if self.mode is Mode.ACTING:
+                why = f"{self._topic(slow[0].topic)} asks for less than the policy was ever told to do"
+                self._stop(why, "when that is over")
             return False
         if not due or (self.mode is Mode.WAITING and now < self._settled):
             return False
@@ -129,12 +135,12 @@ class Runner:
             seen = self.observations.build(self.inputs.snapshot(now))
         for name, numbers in seen.items():
             if not np.isfinite(numbers).all():
-                self._stop(f"the observation {name} is not finite", Mode.STOPPED)
+                self._stop(f"the observation {name} is not finite")
                 return False
         action = self.policy.act(seen)[0]
         if not np.isfinite(action).all():
             worst = self.commands.actions[int(np.flatnonzero(~np.isfinite(action))[0])].name
-            self._stop(f"the policy's action for {worst} is not finite", Mode.STOPPED)
+            self._stop(f"the policy's action for {worst} is not finite")
             return False
         self.observations.acted(action)
         command = self.commands.command(action)
@@ -143,13 +149,14 @@ class Runner:
         self.counts.limited += command.limited
         return True
 
-    def _stop(self, why: str, then: Mode) -> None:
+    def _stop(self, why: str, goes_on: str | None = None) -> None:
+        """Hold the robot, and go on where ``goes_on`` says; None: when it is reset."""
         self._hold()
-        self.mode = then
+        self.mode = Mode.STOPPED if goes_on is None else Mode.WAITING
         self.counts.stops += 1
-        fresh = f"when no input has been older than {self.timeout * 1e3:.0f} ms (--timeout) for {SETTLED:g} s"
-        goes_on = fresh if then is Mode.WAITING else "after ~/reset"
-        self._say(f"{why}: one last command holds the joints where they are; it goes on {goes_on}", True)
+        self._say(
+            f"{why}: one last command holds the joints where they are; it goes on {goes_on or 'after ~/reset'}", True
+        )
 
     def _hold(self) -> None:
         positions, _ = self.inputs.all[0].value

@@ -18,6 +18,7 @@ from orchestrator.errors import ApiError
 from orchestrator.server import Server
 from orchestrator.tables import Job
 from shared_store.checkpoints import list_checkpoints, retain
+from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster
 from tests.support.orchestrator.trained import SPEC, add_checkpoint
 from tests.support.processes import end_all
@@ -158,6 +159,20 @@ def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_eval
     controller.start()
     controller.look()
     assert controller.evaluations() == [(10, "RUNNABLE")]
+
+
+def test_a_checkpoint_that_a_killed_controller_kept_for_nobody_is_let_go(controller: Controller) -> None:
+    controller.train({"every": 1})
+    controller.save(10)
+    controller.look()
+    controller.end(controller.newest()["job"])
+    controller.look()
+    run = controller.server.store.run("taught")
+    assert wanted_checkpoints(run) == set()
+    keep_for_evaluation(run, "00000010-e1")
+    controller.stop()
+    controller.start()
+    wait_for(lambda: wanted_checkpoints(run) == set(), what="the claim is given up")
 
 
 def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_no_more(controller: Controller) -> None:

@@ -87,6 +87,10 @@ def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, k
             {"secrets": {"KEY": ""}},
             "job.yaml: secrets: 'KEY': expected the name under which the controller has the value",
         ),
+        (
+            {"secrets": {"KEY": "x"}, "environment": {"KEY": "y"}},
+            "job.yaml: secrets: KEY is in environment, too; give it once",
+        ),
         ({"secrets": {"KEY": 3}}, "job.yaml: secrets.KEY: expected a text, found a whole number (3)"),
     ],
 )

@@ -133,14 +133,26 @@ def test_a_commanded_velocity_that_is_too_old_is_0() -> None:
     assert heard.inputs.silent_commands(command.arrived + 0.4) == []
 
 
-def test_a_policy_that_never_stood_in_training_stops_without_a_commanded_velocity() -> None:
+def test_a_policy_never_goes_faster_than_it_is_told() -> None:
     heard = Heard(contract())
     heard.all()
     (command,) = (each for each in heard.inputs.all if each.topic == "cmd_vel")
-    assert command.command is not None and heard.inputs.stale(command.arrived + 0.6, 9.0) == []
-    command.command = dataclasses.replace(command.command, ranges=((0.5, 1.0), *command.command.ranges[1:]))
-    assert heard.inputs.stale(command.arrived + 0.4, 9.0) == []
-    assert [each for each, _ in heard.inputs.stale(command.arrived + 0.6, 9.0)] == [command]
+    assert command.command is not None
+    now, ranges = command.arrived, command.command.ranges[1:]
+    for ends, value, slow in (
+        ((0.5, 1.0), 0.0, True),
+        ((0.5, 1.0), -0.7, True),
+        ((0.5, 1.0), 0.6, False),
+        ((0.5, 1.0), 3.0, False),
+        ((-1.0, -0.5), -0.2, True),
+        ((-1.0, 1.0), 0.0, False),
+    ):
+        command.command = dataclasses.replace(command.command, ranges=(ends, *ranges))
+        command.value = np.array([value, 0.0, 0.0])
+        assert bool(heard.inputs.too_slow(now)) == slow, (ends, value)
+    command.command = dataclasses.replace(command.command, ranges=((0.5, 1.0), *ranges))
+    command.value = np.array([0.7, 0.0, 0.0])
+    assert heard.inputs.too_slow(now + 0.4) == [] and heard.inputs.too_slow(now + 0.6) == [command], "silence is 0"
 
 
 def test_other_commands_are_arrays_that_do_not_grow_old() -> None:

@@ -237,4 +237,6 @@ def apply_impulse(
     mjlab: apply_body_impulse (whose cooldown_s begins when an impulse is over). Isaac Lab: -.
     """
     _draw_wrenches(world, wrench, stream, force, torque)
-    wrench.left[world] = between(stream, 6 * wrench.bodies.shape[0], duration)
+    wrench.left[world] = wp.max(
+        between(stream, 6 * wrench.bodies.shape[0], duration), 1.0e-6
+    )  # one control step at least
