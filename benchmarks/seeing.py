@@ -2,8 +2,8 @@
 
     python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
 
-Each training goes through two stretches of as many iterations: ``muster record`` writes four of its worlds, and that has ended. A twin
-with the same seed, which nobody looks at, makes the same iterations for comparison: they get longer and shorter as robots learn. The
+Each training goes through three stretches of as many iterations: ``muster record`` writes four of its worlds, that has ended, and
+``muster view`` shows them (without a browser, where Rerun is installed). A twin with the same seed, which nobody looks at, makes the same iterations for comparison: they get longer and shorter as robots learn. The
 checkpoint is then recorded, evaluated and exported. Writes ``seeing.md``.
 """
 
@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -42,29 +43,30 @@ from worker.telemetry.rollout import Rollout
 WORLDS = {"Cartpole": 4096, "Ant": 4096, "Humanoid": 4096, "Quadruped": 4096}
 WORLDS_CPU = {"Cartpole": 1024, "Ant": 64}
 WARM, STRETCH, ROUNDS = 8, 40 if CUDA else 20, 3
+CHANGES = ("recorded", "left", "viewed")
 TAPPED, EPISODES = 4, 2
 """Worlds that are recorded, and episodes of each of a checkpoint's recording."""
 
 
 def watched(loop: Loop) -> list[int]:
-    """Train while somebody looks on, and then nobody; the iterations at which both stretches begin and end."""
+    """Train while worlds are recorded, then seen by nobody, then shown; the iterations at which the stretches begin and end."""
     run, marks = loop.job.run, list[int]()
 
+    def done() -> int:
+        return int(loop.state.progress.iteration)
+
     def wait(iterations: int) -> None:
-        goal = len(read_metrics(run)) + iterations
-        while len(read_metrics(run)) < goal:
+        goal = done() + iterations
+        while done() < goal:
             time.sleep(0.05)
 
     def mark(iterations: int) -> None:
-        marks.append(len(read_metrics(run)))
+        marks.append(done())
         wait(iterations)
-        marks.append(len(read_metrics(run)))
+        marks.append(done())
 
-    def look_on(folder: Path) -> None:
-        wait(WARM)
-        command = [sys.executable, "-m", "worker.telemetry.live", str(run.path), "--worlds", str(TAPPED)]
-        output = ["--episodes", "1000000", "--output", str(folder / "live.mcap")]
-        reader = subprocess.Popen([*command, *output], stdout=subprocess.DEVNULL)
+    def attended(*command: str) -> None:
+        reader = subprocess.Popen([sys.executable, "-m", *command], stdout=subprocess.DEVNULL)
         while not answer_of(run).exists() and reader.poll() is None:
             time.sleep(0.05)
         wait(WARM)  # the rollout is captured anew, the reader builds what it shows
@@ -72,7 +74,15 @@ def watched(loop: Loop) -> list[int]:
         reader.send_signal(signal.SIGINT)
         reader.wait()
         wait(WARM)
+
+    def look_on(folder: Path) -> None:
+        wait(WARM)
+        worlds = ("--worlds", str(TAPPED))
+        output = ("--episodes", "1000000", "--output", str(folder / "live.mcap"))
+        attended("worker.telemetry.live", str(run.path), *worlds, *output)
         mark(STRETCH)
+        if find_spec("rerun"):
+            attended("worker.telemetry.view", "--training", str(run.path), "--job", "bench", *worlds)
         loop.stop.requested = True
 
     with tempfile.TemporaryDirectory() as folder:
@@ -153,8 +163,9 @@ def measure(task: str, worlds: int) -> dict[str, Any]:
             if number == ROUNDS - 1:
                 row = {**recorded(run, Path(store)), **judged(run, worlds), **exported(run)}
     alone = statistics.median(unseen[0] for _, unseen in rounds)
-    ratios = [statistics.median(seen[part] / unseen[part] for seen, unseen in rounds) - 1.0 for part in (0, 1)]
-    shown = {"task": task, "worlds": worlds, "iteration": alone, "tapped": ratios[0], "left": ratios[1]}
+    parts = range(len(rounds[0][0]))
+    ratios = [statistics.median(seen[part] / unseen[part] for seen, unseen in rounds) - 1.0 for part in parts]
+    shown = {"task": task, "worlds": worlds, "iteration": alone, **dict(zip(CHANGES, ratios, strict=False))}
     return {**shown, "training_rate": 1000 * steps / alone, **row}
 
 
@@ -164,13 +175,13 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# What looking at a policy costs, on {device_name()}",
         "",
         f"`python -m benchmarks.seeing`; medians of {ROUNDS} pairs of trainings with the same seed; of one, `muster record` writes {TAPPED} "
-        f"worlds for {STRETCH} iterations, and then nobody reads for as many. {told(rows)}",
+        f"worlds for {STRETCH} iterations, then nobody reads for as many, then `muster view` shows them. {told(rows)}",
         "",
-        "| task | worlds | an iteration that nobody sees [ms] | while worlds are recorded | after that |",
-        "|---|--:|--:|--:|--:|",
+        "| task | worlds | an iteration that nobody sees [ms] | while worlds are recorded | after that | in the live view |",
+        "|---|--:|--:|--:|--:|--:|",
     ]
     for row in rows:
-        changes = f"{row['tapped']:+.1%} | {row['left']:+.1%}"
+        changes = " | ".join(f"{row[name]:+.1%}" if name in row else "-" for name in CHANGES)
         lines.append(f"| {row['task']} | {row['worlds']:,} | {row['iteration']:.1f} | {changes} |")
     lines += [
         "",
