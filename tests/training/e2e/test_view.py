@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from shared_store.files import read_json
 from shared_store.layout import Run, Store
 from tests.conftest import MUSTER, Serving, wait_for
 from tests.support.browser import Browser
+from worker.telemetry.page import need_rerun
 
 SMALL = {
     "nodes": 1,
@@ -35,7 +35,6 @@ SMALL = {
     "train.ppo.hidden_sizes": [8],
     "train.ppo.steps": 8,
 }
-RERUN = Path(sys.executable).parent / "rerun"
 
 
 class View:
@@ -91,11 +90,12 @@ def saved(url: str, file: Path) -> dict[str, Any]:
     from rerun.chunk import RrdReader
 
     client = subprocess.Popen(
-        [RERUN, stream_of(url), "--save", file, "--bind", "127.0.0.1", "--port", "auto"], stderr=subprocess.DEVNULL
+        [need_rerun(), stream_of(url), "--save", file, "--bind", "127.0.0.1", "--port", "auto"],
+        stderr=subprocess.DEVNULL,
     )
     size = wait_for(lambda: file.exists() and file.stat().st_size, 60, "the stream")
     wait_for(lambda: file.stat().st_size > size + 200_000, 60, "some frames of the stream")
-    client.send_signal(signal.SIGINT)
+    client.kill()  # what it has written can be read
     client.wait()
     found: dict[str, list[Any]] = {}
     for chunk in RrdReader(file).stream().to_chunks():
