@@ -337,9 +337,9 @@ class IkSolver:
 
     def _read_ranges(self, view: RobotView, joints: list[int], share: float) -> None:
         ranges = np.array([view.ranges[joint] for joint in joints])
-        margins = 0.5 * (1.0 - share) * (ranges[:, 1] - ranges[:, 0])
-        margins = np.where(np.isfinite(margins), margins, 0.0)
-        ranges += np.stack((margins, -margins), axis=1)
+        limited = np.isfinite(ranges).all(axis=1)
+        margins = 0.5 * (1.0 - share) * (ranges[limited, 1] - ranges[limited, 0])
+        ranges[limited] += np.stack((margins, -margins), axis=1)
         self._chain.ranges = self._array(ranges.astype(np.float32), wp.vec2)
 
     def act(self) -> None:
