@@ -25,7 +25,7 @@ def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
 
 
 def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
-    """Refuse a term that drives neither joints nor a frame, or joints without an actuator.
+    """Refuse a term that drives neither joints nor a frame, or joints without an actuator; name the columns of a frame.
 
     Raises:
         ValueError: In one line with its place.
@@ -38,8 +38,7 @@ def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[
             "or index: int, value: float and one of the type IkArrays"
         )
     if frame:
-        if term.size is not None:
-            raise ValueError(f"{place}: leave size= out; the axes of the DifferentialIK say which columns there are")
+        bound.element_names = frame.rows(views)[: len(bound.elements or [])]  # by number where size= says how many
         return
     view = views[term.robot]
     lacking = [joint for joint in bound.elements or [] if view.actuators[joint] < 0]

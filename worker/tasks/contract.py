@@ -158,7 +158,7 @@ def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[fl
             clip=clip,
             rule=f"{_rule(term)} Then {frame.said(plan.views)}",
         )
-        for index, (name, axis) in enumerate(zip(driven.bound.element_names, frame.axes, strict=True))
+        for index, (name, axis) in enumerate(zip(driven.bound.element_names, frame.axes, strict=False))
     ]
 
 

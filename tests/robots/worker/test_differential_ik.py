@@ -160,7 +160,8 @@ def test_the_axes_are_those_of_a_root_that_is_free_and_turned() -> None:
     found = asked(task, positions, np.tile([0.5, 1.0, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
     shoulder, elbow = 0.4, 0.4 + 0.9
     second = np.array([-0.4 * math.sin(elbow), 0.4 * math.cos(elbow)])
-    moves = np.stack((second + [-0.5 * math.sin(shoulder), 0.5 * math.cos(shoulder)], second), axis=1)
+    first = second + np.array([-0.5 * math.sin(shoulder), 0.5 * math.cos(shoulder)])
+    moves = np.stack((first, second), axis=1)
     expected = np.linalg.solve(moves.T @ moves + 0.0025 * np.eye(2), moves.T @ [0.01, 0.01])
     np.testing.assert_allclose(found, np.tile(expected, (2, 1)), atol=1e-4)
 
@@ -269,6 +270,8 @@ def test_actions_and_tables_and_the_contract_name_the_columns() -> None:
     assert first.rule.startswith("A movement of a body or site") and "position targets of shoulder, elbow" in first.rule
     assert "the site tip in the root's frame by x, y" in first.rule and "damping = 0.05" in first.rule
     assert grip.rule == ""
+    fewer = type("Fewer", (Planar,), {"actions": {"tip": Action(terms.move_frame, size=1)}}).sketch(ArmConfig())  # type: ignore[attr-defined]
+    assert fewer.action_names == ("tip_x",)
 
 
 WRONG: Mapping[str, tuple[dict[str, Any], str]] = {
@@ -309,7 +312,9 @@ def test_actions_that_do_not_fit_are_refused_in_one_line() -> None:
     both = replace(Planar.ik, site=None, body="finger", joints="*")
     driven = {"tip": Action(terms.move_frame, kind="position"), "grip": grip}
     assert "sensors.tip: joint grip is driven by two terms; each joint has one" in refusal(ik=both, actions=driven)
-    assert "actions.tip: leave size= out" in refusal(actions={"tip": Action(terms.move_frame, size=1), "grip": grip})
+    assert "actions.tip: size is 3, more than the 2 columns of tip" in refusal(
+        actions={"tip": Action(terms.move_frame, size=3)}
+    )
     assert 'offset="default" is for terms of joints' in refusal(
         actions={"tip": Action(terms.move_frame, offset="default")}
     )

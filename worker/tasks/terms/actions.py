@@ -157,8 +157,8 @@ def move_frame(world: int, ik: IkArrays, index: int, value: float):
 
     The axes are those of the robot's root that the ``DifferentialIK`` names; it makes position targets of them, once a control step.
 
-    mjlab: DifferentialIKAction (relative alone, along the world's axes; solved anew in every physics step). Isaac Lab:
-    DifferentialInverseKinematicsAction (relative alone; solved anew in every physics step).
+    mjlab: DifferentialIKAction (which also takes absolute poses, has the world's axes, and solves in every physics
+    step). Isaac Lab: DifferentialInverseKinematicsAction (which also takes absolute poses, and solves in every physics step).
     """
     ik.wanted[world, index] = value
 
