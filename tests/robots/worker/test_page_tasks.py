@@ -124,7 +124,7 @@ def test_the_hand_of_the_page_on_sensors_goes_up(tmp_path: Path) -> None:
     task = page.LiftCubeByHand(page.LiftCubeByHand.config_type(), 2, seed=1)
     assert task.action_names[:3] == ("grasp_site_x", "grasp_site_y", "grasp_site_z") and task.action_size == 7
     task.reset()
-    places = wp.to_torch(task.sensors["hand"].arrays.positions)
+    places = wp.to_torch(task.sensors["hand"].arrays.positions)[:, 0]
     begin = places.clone()
     for _ in range(30):
         task.step(torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]] * 2))
