@@ -186,7 +186,7 @@ def test_targets_keep_to_the_greatest_step_and_within_the_limits() -> None:
     for world in range(2):
         moves = jacobian(ARM, positions[world], site="palm")
         steps = np.linalg.solve(moves.T @ moves + 0.0025 * np.eye(7), moves.T @ np.full(6, 5.0))
-        assert np.abs(steps).max() > 0.07
+        assert np.abs(steps).max() > 0.07  # so that the greatest step counts
         expected = within(positions[world], np.clip(steps, -0.07, 0.07), half)
         np.testing.assert_allclose(found[world], expected, atol=1e-4)
     assert found[1, 4] == pytest.approx(0.05 - 0.3, abs=1e-5)  # beyond the soft limit: back at once
@@ -246,8 +246,40 @@ def test_a_constant_action_moves_the_tip_in_its_direction_alone() -> None:
     assert -0.105 < moved[0] < -0.06 and abs(moved[1]) < 0.01
 
 
-def test_a_state_goes_on_bit_for_bit() -> None:
-    one, other = made(Skew), made(Skew)
+class Heavy(Planar):
+    """The planar arm on its side: the joints' axes are level, and its weight pulls it down."""
+
+    text = PLANAR.replace('gravity="0 0 0"', 'gravity="0 -9.81 0"')
+
+
+def test_an_arm_that_goes_on_from_its_targets_holds_its_weight() -> None:
+    sunk = {}
+    for goes_on in (False, True):
+        task = made(Heavy, worlds=1, from_targets=goes_on)
+        begin = tip(task.observations[0].tolist())
+        for _ in range(40):
+            task.step(torch.zeros(1, 3))
+        sunk[goes_on] = begin[1] - tip(task.observations[0].tolist())[1]
+    assert sunk[False] > 0.05 and 0.0 < sunk[True] < 0.02
+
+
+def test_targets_that_go_on_stay_near_the_joints_and_begin_anew_with_an_episode() -> None:
+    task = made(Planar, worlds=1, from_targets=True, max_step=0.04, damping=0.01)
+    begin = task.observations.clone()
+    for _ in range(5):
+        places = task.observations.numpy().copy()
+        task.step(torch.tensor([[-1.0, 0.0, 0.0]]))
+        far = np.abs(task.worlds.arrays.controls.numpy() - places)[:, :2]
+        assert far.max() < 0.04 + 1e-5
+    assert far.max() == pytest.approx(0.04, abs=1e-5)
+    task.reset()
+    task.step(torch.zeros(1, 3))
+    np.testing.assert_allclose(task.worlds.arrays.controls.numpy()[:, :2], begin[:, :2], atol=1e-5)
+
+
+@pytest.mark.parametrize("goes_on", [False, True], ids=["from the joints", "from the targets"])
+def test_a_state_goes_on_bit_for_bit(goes_on: bool) -> None:
+    one, other = made(Skew, from_targets=goes_on), made(Skew, from_targets=goes_on)
     action = torch.full((2, 6), 0.03)
     for _ in range(3):
         one.step(action)

@@ -13,11 +13,12 @@ import torch
 import warp as wp
 
 from shared_store.wording import nearest
+from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.kinematics import root_rotation_of
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext
+from worker.simulation.sensors.sensor import SensorContext, views_of
 from worker.simulation.worlds import WorldArrays
 
 wp.set_module_options({"enable_backward": False})
@@ -52,10 +53,12 @@ class _Chain:
         joints: Indices of the joints in ``RobotArrays``, shape ``(joints,)``.
         ranges: Least and greatest target of each joint [m, rad], shape ``(joints,)``.
         damping, posture, limits: Squares of these weights.
-        max_step: Of a joint in a control step [m, rad].
+        max_step: How far a joint's target is from the joint, at most [m, rad].
         jacobian: Movement of the columns for one unit of each joint, in the root's frame, shape ``(columns, joints, worlds)``.
         matrix: Of the normal equations, then its Cholesky factor, shape ``(joints, joints, worlds)``; only the lower triangle is used.
         steps: Their right side, then the joints' displacements [m, rad], shape ``(joints, worlds)``.
+        goes_on: Whether a step goes on from the last targets.
+        targets: Those [m, rad], shape ``(worlds, joints)``.
     """
 
     body: int
@@ -75,6 +78,8 @@ class _Chain:
     jacobian: wp.array3d(dtype=wp.float32)
     matrix: wp.array3d(dtype=wp.float32)
     steps: wp.array2d(dtype=wp.float32)
+    goes_on: bool
+    targets: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
@@ -165,19 +170,32 @@ def _move_frame(worlds: WorldArrays, bodies: BodyArrays, robot: RobotArrays, cha
     _solve_equations(chain, world)
     for index in range(chain.joints.shape[0]):
         joint = chain.joints[index]
-        step = wp.clamp(chain.steps[index, world], -chain.max_step, chain.max_step)
+        place = worlds.joint_q[world, robot.coordinates[joint]]
+        target = place + chain.steps[index, world]
+        if chain.goes_on:
+            target = chain.targets[world, index] + chain.steps[index, world]
         ends = chain.ranges[index]
-        target = wp.clamp(worlds.joint_q[world, robot.coordinates[joint]] + step, ends[0], ends[1])
+        target = wp.clamp(wp.clamp(target, place - chain.max_step, place + chain.max_step), ends[0], ends[1])
+        chain.targets[world, index] = target
         worlds.controls[world, robot.actuators[joint]] = target
     for column in range(chain.rows.shape[0]):
         ik.wanted[world, column] = 0.0
+
+
+@wp.kernel
+def _begin(worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, chain: _Chain):
+    """In a world that was placed afresh the last targets are where the joints are."""
+    world = wp.tid()
+    if episodes.ages[world] == 0:
+        for index in range(chain.joints.shape[0]):
+            chain.targets[world, index] = worlds.joint_q[world, robot.coordinates[chain.joints[index]]]
 
 
 @dataclass(frozen=True)
 class DifferentialIK:
     """Joints that move a frame of a robot: ``terms.move_frame`` says how far, damped least squares make position targets of it.
 
-    The targets are q + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx, and hold for a control step; their actuators must be
+    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx, and hold for a control step; their actuators must be
     position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint whose encoder
     has a bias is moved from where it is, not from where the encoder shows it.
 
@@ -192,10 +210,12 @@ class DifferentialIK:
         position_weight: Of errors along x, y and z [1/m].
         orientation_weight: Of errors about them [1/rad].
         damping: Weight of the joints' displacements [1/rad, 1/m]: small steps where the arm is stretched, and less than is wanted.
-        max_step: Greatest displacement of a joint in a control step [rad, m].
+        max_step: How far a joint's target is from where the joint is, at most [rad, m].
         posture_weight: Draws joints to their default positions [1/rad, 1/m]; 0: not at all.
         limit_weight: Draws joints that are beyond their limits back [1/rad, 1/m], so that the others do their part; 0: not at all.
         soft_factor: Targets, and what ``limit_weight`` minds, are within so much of each joint's range about its middle.
+        from_targets: Whether dq is added to the last targets, not to where the joints are: an arm then holds against its weight, and
+            servos catch up with small steps. An episode begins with targets where the joints are.
     """
 
     body: str | None = None
@@ -210,6 +230,7 @@ class DifferentialIK:
     posture_weight: float = 0.0
     limit_weight: float = 0.0
     soft_factor: float = 1.0
+    from_targets: bool = False
     arrays_type: ClassVar[Any] = IkArrays
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
@@ -274,6 +295,7 @@ class DifferentialIK:
         return (
             f"damped least squares make position targets of {joints} that move {moved} in the root's frame by "
             f"{', '.join(self.axes)} ({numbers})"
+            f"{', each from the last targets' if self.from_targets else ''}"
         )
 
     def build(self, context: SensorContext) -> IkSolver:
@@ -301,7 +323,7 @@ class IkSolver:
     def __init__(self, declared: DifferentialIK, place: Place, context: SensorContext) -> None:
         self.names = tuple(declared.rows(context.views))
         self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
-        self._robot = context.robots[declared.robot]
+        self._robot, self._episodes = context.robots[declared.robot], context.episodes
         joints, count = declared.driven(context.views), context.worlds.world_count
         self.arrays = IkArrays()
         self.arrays.wanted = context.array((count, len(self.names)), wp.float32)
@@ -317,6 +339,8 @@ class IkSolver:
         chain.jacobian = context.array((len(rows), len(joints), count), wp.float32)
         chain.matrix = context.array((len(joints), len(joints), count), wp.float32)
         chain.steps = context.array((len(joints), count), wp.float32)
+        chain.goes_on = declared.from_targets
+        chain.targets = context.array((count, len(joints)), wp.float32)
 
     def _array(self, values: Any, dtype: Any) -> wp.array:
         return wp.array(values, dtype=dtype, device=self._device)
@@ -351,8 +375,11 @@ class IkSolver:
         """Nothing: it acts before the physics."""
 
     def settle(self) -> None:
-        """Nothing: it keeps nothing from step to step."""
+        """Forget the last targets where an episode begins."""
+        if self._chain.goes_on:
+            inputs = [self._worlds.arrays, self._episodes, self._robot, self._chain]
+            wp.launch(_begin, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
+        """The last targets, where the next ones are counted from them."""
+        return views_of(self._chain, "targets") if self._chain.goes_on else {}
