@@ -247,9 +247,10 @@ def test_a_constant_action_moves_the_tip_in_its_direction_alone() -> None:
 
 
 class Heavy(Planar):
-    """The planar arm on its side: the joints' axes are level, and its weight pulls it down."""
+    """The planar arm upright: its joints turn about -y, from x to z, and its weight pulls it down."""
 
-    text = PLANAR.replace('gravity="0 0 0"', 'gravity="0 -9.81 0"')
+    text = PLANAR.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('axis="0 0 1"', 'axis="0 -1 0"')
+    ik = replace(Planar.ik, axes=("x", "z"))
 
 
 def test_an_arm_that_goes_on_from_its_targets_holds_its_weight() -> None:
