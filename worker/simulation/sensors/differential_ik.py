@@ -195,9 +195,9 @@ def _begin(worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, cha
 class DifferentialIK:
     """Joints that move a frame of a robot: ``terms.move_frame`` says how far, damped least squares make position targets of it.
 
-    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx, and hold for a control step; their actuators must be
-    position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint whose encoder
-    has a bias is moved from where it is, not from where the encoder shows it.
+    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx. They hold for a control step; their
+    actuators must be position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint
+    whose encoder has a bias is moved from where it is, not from where the encoder shows it.
 
     Attributes:
         body: The body that is moved, by its frame's origin. Give this or ``site``.
