@@ -135,10 +135,10 @@ class Action(_Part):
     """One number that a policy asks for: the actuator's input is ``offset + scale * action``, the action clipped to ``clip`` before."""
 
     name: str
-    """Name of the joint; of a choice, its own."""
+    """Name of the joint; of a choice, its own; of a frame that inverse kinematics move, its name and the axis."""
     kind: Literal["effort", "position", "velocity", "choice"]
     """Whether the input is a force or torque, or the target of a position or velocity controller in the actuator; a choice is one of
-    several actions, of which the policy names one."""
+    several actions, of which the policy names one. Of a frame that is moved, the inputs are position targets."""
     unit: str
     """Unit of the input: N, N m, m, rad, m/s or rad/s."""
     scale: float

@@ -42,6 +42,9 @@ class RobotView:
         coordinates: Column of each joint in ``WorldArrays.joint_q``.
         dofs: Column of each joint in ``WorldArrays.joint_qd`` and ``drives``.
         actuators: Column of each joint's actuator in ``WorldArrays.controls``, -1 where it has none.
+        joint_types: What each joint is a degree of freedom of, one of ``newton.JointType``.
+        joint_bodies: Column of the body that each joint moves.
+        parents: Column of the body on which each body hangs, by its own column; -1: the world.
         defaults: Default position of each joint [m, rad].
         ranges: Lower and upper limit of each joint [m, rad], infinite where there is none.
         efforts: Greatest force of each joint's actuator [N, N m], infinite where it is not limited.
@@ -77,6 +80,9 @@ class RobotView:
         self.joint_names: list[str] = []
         self.coordinates: list[int] = []
         self.dofs: list[int] = []
+        self.joint_types: list[newton.JointType] = []
+        self.joint_bodies: list[int] = []
+        self.parents: dict[int, int] = {}
         self.root_coordinate = self.root_dof = -1
         self.root_body = self.bodies[0]
         x, y, z = (float(each) for each in template.body_com[self.root_body])
@@ -84,6 +90,7 @@ class RobotView:
         self.start = wp.transform(*template.body_q[self.root_body])
         for joint in self._mine(template.joint_label):
             first, dof = template.joint_q_start[joint], template.joint_qd_start[joint]
+            self.parents[template.joint_child[joint]] = template.joint_parent[joint]
             if template.joint_type[joint] == newton.JointType.FREE:
                 if template.joint_child[joint] == self.root_body:
                     self.root_coordinate, self.root_dof = first, dof
@@ -95,6 +102,8 @@ class RobotView:
                 self.joint_names.append(joint_name)
                 self.coordinates.append(first + axis)
                 self.dofs.append(dof + axis)
+                self.joint_types.append(newton.JointType(template.joint_type[joint]))
+                self.joint_bodies.append(template.joint_child[joint])
         self.defaults = [float(template.joint_q[column]) for column in self.coordinates]
         self.ranges = [
             (_limit(template.joint_limit_lower[dof], -1), _limit(template.joint_limit_upper[dof], 1))
@@ -133,6 +142,14 @@ class RobotView:
     def find_geoms(self, patterns: Patterns) -> list[int]:
         """Indices into :attr:`geom_names`, in the model's order. Raises ValueError where a pattern matches nothing."""
         return find(self.geom_names, patterns, f"geom of {self.name}")
+
+    def joints_moving(self, body: int) -> list[int]:
+        """Indices into :attr:`joint_names` of the joints between the root and a body, given by its column; none of the world's, -1."""
+        above: set[int] = set()
+        while body >= 0 and body not in above:
+            above.add(body)
+            body = self.parents.get(body, -1)
+        return [joint for joint, moved in enumerate(self.joint_bodies) if moved in above]
 
     def need_ranges(self, joints: Iterable[int], purpose: str) -> None:
         """Refuse joints without limits.

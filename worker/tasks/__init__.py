@@ -51,6 +51,7 @@ _PUBLIC = {
     "worker.simulation.robot_arrays": ("BodyArrays", "RobotArrays"),
     "worker.simulation.sensors.camera": ("CameraArrays", "CameraSensor"),
     "worker.simulation.sensors.contact": ("ContactArrays", "ContactSensor"),
+    "worker.simulation.sensors.differential_ik": ("DifferentialIK", "IkArrays"),
     "worker.simulation.sensors.frames": ("FrameArrays", "Frames"),
     "worker.simulation.sensors.height_scan": ("GridPattern", "HeightScan", "HeightScanArrays", "RingPattern"),
     "worker.simulation.sensors.imu": ("Imu", "ImuArrays"),

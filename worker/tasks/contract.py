@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
+from worker.simulation.sensors.differential_ik import AXES, DifferentialIK
+from worker.tasks.acting import frame_of
 from worker.tasks.declaration import Action as DeclaredAction
 from worker.tasks.declaration import Choice, Command
 from worker.tasks.interface import Action, Interface, Observation
@@ -103,10 +105,12 @@ def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[floa
 def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) -> list[Action]:
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)
-    view = plan.views[term.robot]
     clip = None
     if driven.clip is not None:
         clip = (plan.numbers.values[driven.clip], plan.numbers.values[driven.clip + 1])
+    if frame := frame_of(driven.bound, plan.declaration.sensors):
+        return _movements(plan, driven, frame, clip)
+    view = plan.views[term.robot]
     found = []
     slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
     for index, joint in enumerate(driven.bound.elements or ()):
@@ -137,6 +141,25 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
             )
         )
     return found
+
+
+def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[float, float] | None) -> list[Action]:
+    """One action for each column of a frame that inverse kinematics move."""
+    term = driven.bound.term
+    assert isinstance(term, DeclaredAction)
+    return [
+        Action(
+            name,
+            "position",
+            term.unit or ("m" if axis in AXES[:3] else "rad"),
+            scale=value_of(plan, driven.scale, index, 1.0),
+            default_position=0.0,
+            offset=value_of(plan, driven.offset, index, 0.0),
+            clip=clip,
+            rule=f"{_rule(term)} Then {frame.said(plan.views)}",
+        )
+        for index, (name, axis) in enumerate(zip(driven.bound.element_names, frame.axes, strict=False))
+    ]
 
 
 def _range(view: RobotView, joint: int) -> tuple[float, float] | None:

@@ -270,8 +270,9 @@ class Action(Term):
     """What a part of the policy's output does: ``offset + scale * action``, of the clipped action, is the function's ``value``.
 
     Args:
-        function: Has the parameters ``joint`` and ``value``, and writes ``worlds.controls``.
-        scale: Factor; one number, or a mapping from patterns of joints.
+        function: Has the parameters ``joint`` and ``value``, and writes ``worlds.controls``; or, of a frame that a ``DifferentialIK``
+            moves, ``index``, ``value`` and one of the type ``IkArrays``.
+        scale: Factor; one number, or a mapping from patterns of joints or columns.
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
         clip: Least and greatest action; None: the policy's output as it is.
         kind: What the actuator's input is: an ``"effort"``, a ``"position"`` or a ``"velocity"``.

@@ -18,6 +18,7 @@ from worker.simulation.episodes import STEP, check_group, check_observations
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.camera import Camera
+from worker.simulation.sensors.differential_ik import IkSolver
 from worker.simulation.sensors.rays import RayCasting
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.terrain import Terrain
@@ -166,6 +167,7 @@ class DeclaredTask(Task):
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
         }
         self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        self._movers = [sensor for sensor in self.sensors.values() if isinstance(sensor, IkSolver)]
         self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
         structs: dict[str, Any] = {"bodies": bodies, "terrain": terrain}
         structs |= {f"robot_{name}": arrays for name, arrays in robots.items()}
@@ -306,6 +308,8 @@ class DeclaredTask(Task):
         """Actions, physics, sensors."""
         self.randomizer.push()
         wp.launch(self._kernels.act, dim=self.world_count, inputs=self._common, device=self.device)
+        for mover in self._movers:
+            mover.act()
         self.randomizer.delay()
         self.worlds.simulate()
         self._measure()
@@ -386,7 +390,8 @@ class _Needs:
         measured = any(sensor.needs_bodies for sensor in sensors.values())
         self.bodies = measured or torch_terms.any or any(map(_reads_bodies, plan.terms))
         self.apart = torch_terms.observe_any or any(_reads_bodies(bound) or _reads_sensors(bound) for bound in observed)
-        self.placed = self.bodies and (self.apart or any(map(_reads_bodies, acting)))
+        moved = any(isinstance(sensor, IkSolver) for sensor in sensors.values())
+        self.placed = self.bodies and (self.apart or moved or any(map(_reads_bodies, acting)))
 
 
 def _reads_bodies(bound: Bound) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 from shared_store.wording import nearest
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView
+from worker.tasks.acting import check_action, check_driven
 from worker.tasks.binding import Binder, Bound
 from worker.tasks.checks import check_command, check_observation, check_randomized
 from worker.tasks.config import TaskConfig
@@ -223,20 +224,14 @@ class Plan:
         if isinstance(declared, Choice):
             own = {"choice": "int(episodes.actions[world, 0])"}
             self.choice = self._bind("actions", "choice", declared, element=False, own=own)
+            check_driven([self.choice], self.views, self.binder.sensors)
             return
         if not declared:
             raise ValueError("actions: there is none; a policy needs at least one")
         for name, term in declared.items():
             place, first = f"actions.{name}", len(self.binder.actions)
             bound = self._bind("actions", name, term, own={"value": "value"})
-            if bound.signature is None or not bound.takes("joint") or not bound.takes("value"):
-                raise ValueError(f"{place}: {term.function_name} needs the parameters joint: int and value: float")
-            view = self.views[term.robot]
-            lacking = [joint for joint in bound.elements or [] if view.actuators[joint] < 0]
-            if lacking:
-                raise ValueError(
-                    f"{place}: joint {view.joint_names[lacking[0]]} has no actuator; give the robot one, or leave the joint out of joints="
-                )
+            check_action(bound, self.views, self.binder.sensors)
             self.binder.actions += bound.element_names
             offset = self._default(place, bound) if term.offset == "default" else term.offset
             clip = self.numbers.add(f"{place}.clip", term.clip, 2, in_order) if term.clip is not None else None
@@ -244,9 +239,7 @@ class Plan:
             self.driven.append(
                 Driven(bound, first, scale, self._columns(f"{place}.offset", offset, bound.element_names), clip)
             )
-        doubled = [name for name in self.binder.actions if self.binder.actions.count(name) > 1]
-        if doubled:
-            raise ValueError(f"actions: joint {doubled[0]} is driven by two terms; each joint has one action")
+        check_driven([driven.bound for driven in self.driven], self.views, self.binder.sensors)
 
     def _default(self, place: str, bound: Bound) -> list[float]:
         """The default positions of the joints for which a term is called."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from worker.tasks.acting import frame_of
 from worker.tasks.binding import Bound
 from worker.tasks.contract import value_of
 from worker.tasks.declaration import Adaptive, Choice, Event, Reward, Termination
@@ -97,12 +98,20 @@ def _actions(plan: Plan) -> list[Row]:
         rows.append(
             _term(plan, driven.bound)
             | {
-                "joints": ", ".join(driven.bound.element_names),
+                "joints": ", ".join(_joints(plan, driven.bound)),
                 "scale": _spread(value_of(plan, driven.scale, index, 1.0) for index in range(count)),
                 "offset": _spread(value_of(plan, driven.offset, index, 0.0) for index in range(count)),
             }
         )
     return rows
+
+
+def _joints(plan: Plan, bound: Bound) -> list[str]:
+    """Names of the joints that an action term drives."""
+    frame = frame_of(bound, plan.declaration.sensors)
+    if frame is None:
+        return bound.element_names
+    return [plan.views[frame.robot].joint_names[joint] for joint in frame.driven(plan.views)]
 
 
 def _observation(plan: Plan, seen: Seen) -> Row:

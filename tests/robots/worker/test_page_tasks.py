@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import warp as wp
 import yaml
 
 from tests.conftest import REPOSITORY
@@ -116,6 +117,19 @@ def test_the_ant_of_the_page_on_sensors_feels(tmp_path: Path) -> None:
     task = played(page.FeelingAnt(page.FeelingAntConfig(), 2, seed=1), 60)
     touches = [task.observation_names.index(name) for name in task.observation_names if name.endswith("_touches")]
     assert len(touches) == 4 and task.observations[:, touches].sum() > 0
+
+
+def test_the_hand_of_the_page_on_sensors_goes_up(tmp_path: Path) -> None:
+    page = module("tasks/sensors.md", tmp_path)
+    task = page.LiftCubeByHand(page.LiftCubeByHand.config_type(), 2, seed=1)
+    assert task.action_names[:3] == ("grasp_site_x", "grasp_site_y", "grasp_site_z") and task.action_size == 7
+    task.reset()
+    places = wp.to_torch(task.sensors["hand"].arrays.positions)[:, 0]
+    begin = places.clone()
+    for _ in range(30):
+        task.step(torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]] * 2))
+    moved = places - begin
+    assert (moved[:, 2] > 0.03).all() and (moved[:, 1].abs() < 0.005).all()
 
 
 def test_the_climber_and_the_ridges_of_the_page_on_terrain(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from worker.tasks.terms.actions import (
     limited_effort,
     limited_position_target,
     mean_action_acceleration,
+    move_frame,
     position_target,
     relative_position_target,
     share_of_range_target,

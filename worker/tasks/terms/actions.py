@@ -1,7 +1,7 @@
 """Actions: what they do to the actuators, what a policy sees of them, what their changes cost.
 
-A function that acts is called for one joint with ``value``, offset + scale * action, and writes the input of that joint's actuator.
-It acts once a control step: the input holds for all its physics steps.
+A function that acts is called for one joint with ``value``, offset + scale * action, and writes the input of that joint's actuator;
+or for one column of a ``DifferentialIK``, which moves a frame of the robot and writes the inputs of all its joints. It acts once a control step: the input holds for all its physics steps.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.sensors.differential_ik import IkArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.term_needs import needs
 
@@ -148,6 +149,18 @@ def two_velocities_target(
     mjlab: -. Isaac Lab: BinaryJointVelocityAction.
     """
     worlds.controls[world, robot.actuators[joint]] = wp.where(value < 0.0, closing, opening)
+
+
+@wp.func
+def move_frame(world: int, ik: IkArrays, index: int, value: float):
+    """A movement of a body or site: from where it is at the control step's start, by ``value`` along or about one axis [m, rad].
+
+    The axes are those of the robot's root that the ``DifferentialIK`` names; it makes position targets of them, once a control step.
+
+    mjlab: DifferentialIKAction (which also takes absolute poses, has the world's axes, and solves in every physics
+    step). Isaac Lab: DifferentialInverseKinematicsAction (which also takes absolute poses, and solves in every physics step).
+    """
+    ik.wanted[world, index] = value
 
 
 @wp.func

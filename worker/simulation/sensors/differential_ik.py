@@ -1,0 +1,385 @@
+"""Differential inverse kinematics: position targets of joints that move a frame of a robot as actions ask. It measures nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import newton
+import numpy as np
+import torch
+import warp as wp
+
+from shared_store.wording import nearest
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.kinematics import root_rotation_of
+from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.worlds import WorldArrays
+
+wp.set_module_options({"enable_backward": False})
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""What of a frame may be moved: along the root's axes [m], and about them [rad]."""
+
+
+@wp.struct
+class IkArrays:
+    """How a frame shall move in the coming control step, one row a world.
+
+    Attributes:
+        wanted: Displacement along and turn about the axes of the robot's root [m, rad], shape ``(worlds, columns)``; a column for each of
+            the declared ``axes``. The joints' targets are computed from it when all actions are written; then it is 0 again.
+    """
+
+    wanted: wp.array2d(dtype=wp.float32)
+
+
+@wp.struct
+class _Chain:
+    """The joints and the frame that they move, and room for the equations; a world comes last, so that threads read side by side.
+
+    Attributes:
+        body, pose: Column of the frame's body, and the frame in it [m, quaternion xyzw].
+        rows: Of each column, its index in ``AXES``, shape ``(columns,)``.
+        weights: Of each column, squared, shape ``(columns,)``.
+        children: Columns of the bodies that the joints move, shape ``(joints,)``.
+        slides: 1 of a joint that slides, 0 of one that turns, shape ``(joints,)``.
+        anchors, axes: Of the joints, in the frames of these bodies [m], shape ``(joints,)``.
+        joints: Indices of the joints in ``RobotArrays``, shape ``(joints,)``.
+        ranges: Least and greatest target of each joint [m, rad], shape ``(joints,)``.
+        damping, posture, limits: Squares of these weights.
+        max_step: How far a joint's target is from the joint, at most [m, rad].
+        jacobian: Movement of the columns for one unit of each joint, in the root's frame, shape ``(columns, joints, worlds)``.
+        matrix: Of the normal equations, then its Cholesky factor, shape ``(joints, joints, worlds)``; only the lower triangle is used.
+        steps: Their right side, then the joints' displacements [m, rad], shape ``(joints, worlds)``.
+        goes_on: Whether a step goes on from the last targets.
+        targets: Those [m, rad], shape ``(worlds, joints)``.
+    """
+
+    body: int
+    pose: wp.transform
+    rows: wp.array(dtype=wp.int32)
+    weights: wp.array(dtype=wp.float32)
+    children: wp.array(dtype=wp.int32)
+    slides: wp.array(dtype=wp.int32)
+    anchors: wp.array(dtype=wp.vec3)
+    axes: wp.array(dtype=wp.vec3)
+    joints: wp.array(dtype=wp.int32)
+    ranges: wp.array(dtype=wp.vec2)
+    damping: float
+    posture: float
+    limits: float
+    max_step: float
+    jacobian: wp.array3d(dtype=wp.float32)
+    matrix: wp.array3d(dtype=wp.float32)
+    steps: wp.array2d(dtype=wp.float32)
+    goes_on: bool
+    targets: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def _movement(chain: _Chain, bodies: BodyArrays, world: int, joint: int, position: wp.vec3):
+    """Linear and angular movement of what is at ``position``, in the world frame, for one unit of a joint."""
+    pose = bodies.poses[world, chain.children[joint]]
+    axis = wp.transform_vector(pose, chain.axes[joint])
+    linear = axis
+    angular = wp.vec3(0.0, 0.0, 0.0)
+    if chain.slides[joint] == 0:
+        linear = wp.cross(axis, position - wp.transform_point(pose, chain.anchors[joint]))
+        angular = axis
+    return linear, angular
+
+
+@wp.func
+def _fill_jacobian(chain: _Chain, bodies: BodyArrays, world: int, root: wp.quat):
+    position = wp.transform_get_translation(place_pose(bodies, world, chain.body, chain.pose))
+    for joint in range(chain.joints.shape[0]):
+        linear, angular = _movement(chain, bodies, world, joint, position)
+        linear = wp.quat_rotate_inv(root, linear)
+        angular = wp.quat_rotate_inv(root, angular)
+        for column in range(chain.rows.shape[0]):
+            row = chain.rows[column]
+            if row < 3:
+                chain.jacobian[column, joint, world] = linear[row]
+            else:
+                chain.jacobian[column, joint, world] = angular[row - 3]
+
+
+@wp.func
+def _fill_equations(chain: _Chain, worlds: WorldArrays, robot: RobotArrays, ik: IkArrays, world: int):
+    """(J^T W J + D) dq = J^T W dx + r: D and r are of damping, posture and exceeded limits."""
+    for first in range(chain.joints.shape[0]):
+        joint = chain.joints[first]
+        place = worlds.joint_q[world, robot.coordinates[joint]]
+        ends = chain.ranges[first]
+        excess = wp.clamp(place, ends[0], ends[1]) - place
+        right = chain.posture * (robot.defaults[joint] - place) + chain.limits * excess
+        for column in range(chain.rows.shape[0]):
+            right += chain.weights[column] * chain.jacobian[column, first, world] * ik.wanted[world, column]
+        chain.steps[first, world] = right
+        for second in range(first + 1):
+            total = float(0.0)
+            for column in range(chain.rows.shape[0]):
+                moves = chain.jacobian[column, first, world] * chain.jacobian[column, second, world]
+                total += chain.weights[column] * moves
+            if first == second:
+                total += chain.damping + chain.posture
+                if excess != 0.0:
+                    total += chain.limits
+            chain.matrix[first, second, world] = total
+
+
+@wp.func
+def _solve_equations(chain: _Chain, world: int):
+    """Cholesky's factor in place of the matrix, then the solution in place of the right side."""
+    count = chain.joints.shape[0]
+    for row in range(count):
+        for column in range(row + 1):
+            total = chain.matrix[row, column, world]
+            for each in range(column):
+                total -= chain.matrix[row, each, world] * chain.matrix[column, each, world]
+            if row == column:
+                # without rounding it is never less than the damping
+                chain.matrix[row, row, world] = wp.sqrt(wp.max(total, chain.damping))
+            else:
+                chain.matrix[row, column, world] = total / chain.matrix[column, column, world]
+    for row in range(count):
+        total = chain.steps[row, world]
+        for each in range(row):
+            total -= chain.matrix[row, each, world] * chain.steps[each, world]
+        chain.steps[row, world] = total / chain.matrix[row, row, world]
+    for back in range(count):
+        row = count - 1 - back
+        total = chain.steps[row, world]
+        for each in range(row + 1, count):
+            total -= chain.matrix[each, row, world] * chain.steps[each, world]
+        chain.steps[row, world] = total / chain.matrix[row, row, world]
+
+
+@wp.kernel
+def _move_frame(worlds: WorldArrays, bodies: BodyArrays, robot: RobotArrays, chain: _Chain, ik: IkArrays):
+    """Position targets of the joints of one world."""
+    world = wp.tid()
+    _fill_jacobian(chain, bodies, world, root_rotation_of(worlds, robot, world))
+    _fill_equations(chain, worlds, robot, ik, world)
+    _solve_equations(chain, world)
+    for index in range(chain.joints.shape[0]):
+        joint = chain.joints[index]
+        place = worlds.joint_q[world, robot.coordinates[joint]]
+        target = place + chain.steps[index, world]
+        if chain.goes_on:
+            target = chain.targets[world, index] + chain.steps[index, world]
+        ends = chain.ranges[index]
+        target = wp.clamp(wp.clamp(target, place - chain.max_step, place + chain.max_step), ends[0], ends[1])
+        chain.targets[world, index] = target
+        worlds.controls[world, robot.actuators[joint]] = target
+    for column in range(chain.rows.shape[0]):
+        ik.wanted[world, column] = 0.0
+
+
+@wp.kernel
+def _begin(worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, chain: _Chain):
+    """In a world that was placed afresh the last targets are where the joints are."""
+    world = wp.tid()
+    if episodes.ages[world] == 0:
+        for index in range(chain.joints.shape[0]):
+            chain.targets[world, index] = worlds.joint_q[world, robot.coordinates[chain.joints[index]]]
+
+
+@dataclass(frozen=True)
+class DifferentialIK:
+    """Joints that move a frame of a robot: ``terms.move_frame`` says how far, damped least squares make position targets of it.
+
+    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx. They hold for a control step; their
+    actuators must be position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint
+    whose encoder has a bias is moved from where it is, not from where the encoder shows it.
+
+    Attributes:
+        body: The body that is moved, by its frame's origin. Give this or ``site``.
+        site: The site that is moved.
+        joints: Pattern or patterns of the joints that move it. Each turns or slides about one axis, lies between root and frame and has
+            an actuator; it belongs to one declaration.
+        robot: Whose they are.
+        axes: The columns, of :data:`AXES`: along and about the axes of the robot's root. What is not named here is left free. Turns
+            about several axes are one rotation vector.
+        position_weight: Of errors along x, y and z [1/m].
+        orientation_weight: Of errors about them [1/rad].
+        damping: Weight of the joints' displacements [1/rad, 1/m]: small steps where the arm is stretched, and less than is wanted.
+        max_step: How far a joint's target is from where the joint is, at most [rad, m].
+        posture_weight: Draws joints to their default positions [1/rad, 1/m]; 0: not at all.
+        limit_weight: Draws joints that are beyond their limits back [1/rad, 1/m], so that the others do their part; 0: not at all.
+        soft_factor: Targets, and what ``limit_weight`` minds, are within so much of each joint's range about its middle.
+        from_targets: Whether dq is added to the last targets, not to where the joints are: an arm then holds against its weight, and
+            servos catch up with small steps. An episode begins with targets where the joints are.
+    """
+
+    body: str | None = None
+    site: str | None = None
+    joints: str | Sequence[str] = "*"
+    robot: str = "robot"
+    axes: Sequence[str] = ("x", "y", "z")
+    position_weight: float = 1.0
+    orientation_weight: float = 1.0
+    damping: float = 0.05
+    max_step: float = 0.5
+    posture_weight: float = 0.0
+    limit_weight: float = 0.0
+    soft_factor: float = 1.0
+    from_targets: bool = False
+    arrays_type: ClassVar[Any] = IkArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each column, such as ``hand_x``.
+
+        Raises:
+            ValueError: A name matches nothing, a number is out of range, or a joint can't move the frame about or along one axis.
+        """
+        if (self.body is None) == (self.site is None):
+            raise ValueError("DifferentialIK: give either body or site, and not both")
+        names = place_names(views, "DifferentialIK", self.robot, bodies=self.body, sites=self.site)
+        if len(names) != 1:
+            raise ValueError(f"DifferentialIK: name one body or site; the pattern matches {', '.join(names)}")
+        if isinstance(self.axes, str) or not self.axes or len({*self.axes}) != len(self.axes):
+            raise ValueError(f"DifferentialIK.axes is {self.axes!r}; give some of {', '.join(AXES)}, each once")
+        for axis in self.axes:
+            if axis not in AXES:
+                raise ValueError(f"DifferentialIK.axes: there is no axis {axis!r}; {nearest(str(axis), AXES)}")
+        self._check_numbers()
+        self._check_joints(views[self.robot], names[0])
+        return [f"{names[0]}_{axis}" for axis in self.axes]
+
+    def _check_numbers(self) -> None:
+        for name in ("position_weight", "orientation_weight", "damping", "max_step", "soft_factor"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"DifferentialIK.{name} is {value}; use a finite number > 0")
+        for name in ("posture_weight", "limit_weight"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"DifferentialIK.{name} is {value}; use a finite number >= 0")
+        if self.soft_factor > 1.0:
+            raise ValueError(f"DifferentialIK.soft_factor is {self.soft_factor}; use a number > 0, at most 1")
+
+    def _check_joints(self, view: RobotView, name: str) -> None:
+        bodies = dict(zip(view.body_names, view.bodies, strict=True))
+        body = bodies[name] if self.site is None else view.site_bodies[view.site_names.index(name)]
+        between = view.joints_moving(body)
+        for joint in view.find_joints(self.joints):
+            if joint not in between:
+                those = ", ".join(view.joint_names[each] for each in between) or "none"
+                raise ValueError(
+                    f"DifferentialIK.joints: {view.joint_names[joint]} does not move {name}; those that do: {those}"
+                )
+            if view.joint_types[joint] not in (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC):
+                raise ValueError(
+                    f"DifferentialIK.joints: {view.joint_names[joint]} is one of several joints between the same two bodies; "
+                    "put a body between them in the robot's file, or leave it out"
+                )
+
+    def driven(self, views: Mapping[str, RobotView]) -> list[int]:
+        """Indices of the joints in ``RobotView.joint_names``. Raises ValueError where a pattern matches nothing."""
+        return views[self.robot].find_joints(self.joints)
+
+    def said(self, views: Mapping[str, RobotView]) -> str:
+        """What becomes of the columns, in words, with every number."""
+        view = views[self.robot]
+        joints = ", ".join(view.joint_names[joint] for joint in self.driven(views))
+        names = ("position_weight", "orientation_weight", "damping", "max_step", "posture_weight", "limit_weight")
+        numbers = ", ".join(f"{name} = {getattr(self, name):g}" for name in (*names, "soft_factor"))
+        moved = f"the body {self.body}" if self.site is None else f"the site {self.site}"
+        return (
+            f"damped least squares make position targets of {joints} that move {moved} in the root's frame by "
+            f"{', '.join(self.axes)} ({numbers})"
+            f"{', each from the last targets' if self.from_targets else ''}"
+        )
+
+    def build(self, context: SensorContext) -> IkSolver:
+        """What moves the frame in these worlds.
+
+        Raises:
+            ValueError: As :meth:`rows`.
+        """
+        self.rows(context.views)
+        found = find_places(context, "DifferentialIK", self.robot, self.body, self.site)
+        return IkSolver(self, only_one(found, "DifferentialIK"), context)
+
+
+class IkSolver:
+    """:class:`DifferentialIK` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        declared: As a task declares it.
+        place: The frame.
+        context: The worlds.
+    """
+
+    needs_bodies = True
+
+    def __init__(self, declared: DifferentialIK, place: Place, context: SensorContext) -> None:
+        self.names = tuple(declared.rows(context.views))
+        self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
+        self._robot, self._episodes = context.robots[declared.robot], context.episodes
+        joints, count = declared.driven(context.views), context.worlds.world_count
+        self.arrays = IkArrays()
+        self.arrays.wanted = context.array((count, len(self.names)), wp.float32)
+        self._chain = chain = _Chain()
+        chain.body, chain.pose = place.body, place.pose
+        self._read_joints(context.views[declared.robot], joints)
+        self._read_ranges(context.views[declared.robot], joints, declared.soft_factor)
+        rows = [AXES.index(axis) for axis in declared.axes]
+        weights = [(declared.position_weight if row < 3 else declared.orientation_weight) ** 2 for row in rows]
+        chain.rows, chain.weights = self._array(rows, wp.int32), self._array(weights, wp.float32)
+        chain.damping, chain.max_step = declared.damping**2, declared.max_step
+        chain.posture, chain.limits = declared.posture_weight**2, declared.limit_weight**2
+        chain.jacobian = context.array((len(rows), len(joints), count), wp.float32)
+        chain.matrix = context.array((len(joints), len(joints), count), wp.float32)
+        chain.steps = context.array((len(joints), count), wp.float32)
+        chain.goes_on = declared.from_targets
+        chain.targets = context.array((count, len(joints)), wp.float32)
+
+    def _array(self, values: Any, dtype: Any) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self._device)
+
+    def _read_joints(self, view: RobotView, joints: list[int]) -> None:
+        """Bodies, anchors and axes of the joints, which are the same in every world."""
+        model, dofs = self._worlds.model, [view.dofs[joint] for joint in joints]
+        owners = np.searchsorted(model.joint_qd_start.numpy(), dofs, side="right") - 1
+        mounts = model.joint_X_c.numpy()[owners]
+        axes = model.joint_axis.numpy()[dofs]
+        turned = [wp.quat_rotate(wp.quat(*mount[3:]), wp.vec3(*axis)) for mount, axis in zip(mounts, axes, strict=True)]
+        self._chain.children = self._array([view.joint_bodies[joint] for joint in joints], wp.int32)
+        slides = [view.joint_types[joint] == newton.JointType.PRISMATIC for joint in joints]
+        self._chain.slides = self._array(slides, wp.int32)
+        self._chain.anchors = self._array(mounts[:, :3], wp.vec3)
+        self._chain.axes = self._array(turned, wp.vec3)
+        self._chain.joints = self._array(joints, wp.int32)
+
+    def _read_ranges(self, view: RobotView, joints: list[int], share: float) -> None:
+        ranges = np.array([view.ranges[joint] for joint in joints])
+        limited = np.isfinite(ranges).all(axis=1)
+        margins = 0.5 * (1.0 - share) * (ranges[limited, 1] - ranges[limited, 0])
+        ranges[limited] += np.stack((margins, -margins), axis=1)
+        self._chain.ranges = self._array(ranges.astype(np.float32), wp.vec2)
+
+    def act(self) -> None:
+        """Write the joints' targets, when all actions are written. ``Worlds.update_bodies`` must have been called."""
+        inputs = [self._worlds.arrays, self._bodies, self._robot, self._chain, self.arrays]
+        wp.launch(_move_frame, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+
+    def advance(self) -> None:
+        """Nothing: it acts before the physics."""
+
+    def settle(self) -> None:
+        """Forget the last targets where an episode begins."""
+        if self._chain.goes_on:
+            inputs = [self._worlds.arrays, self._episodes, self._robot, self._chain]
+            wp.launch(_begin, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """The last targets, where the next ones are counted from them."""
+        return views_of(self._chain, "targets") if self._chain.goes_on else {}

@@ -1,0 +1,84 @@
+"""What the terms of actions drive: joints, one action each, or a frame of a robot whose inverse kinematics drive joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.differential_ik import DifferentialIK
+from worker.tasks.binding import Bound
+
+
+def frame_of(bound: Bound, sensors: Mapping[str, Any]) -> DifferentialIK | None:
+    """What an action term moves, where it is called for the columns of a frame; None where it is called for joints."""
+    found = next(_frames(bound, sensors), None)
+    return sensors[found] if found and bound.takes("index") else None
+
+
+def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
+    """Names of the inverse kinematics that a term is given."""
+    given = {
+        variable.removeprefix("sensor_") for variable in bound.arguments.values() if variable.startswith("sensor_")
+    }
+    yield from (name for name, sensor in sensors.items() if name in given and isinstance(sensor, DifferentialIK))
+
+
+def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
+    """Refuse a term that drives neither joints nor a frame, or joints without an actuator; name the columns of a frame.
+
+    Raises:
+        ValueError: In one line with its place.
+    """
+    place, term = bound.place, bound.term
+    frame = frame_of(bound, sensors)
+    if bound.signature is None or not bound.takes("value") or not (bound.takes("joint") or frame):
+        raise ValueError(
+            f"{place}: {term.function_name} needs the parameters joint: int and value: float; "
+            "or index: int, value: float and one of the type IkArrays"
+        )
+    if frame:
+        bound.element_names = frame.rows(views)[: len(bound.elements or [])]  # by number where size= says how many
+        return
+    view = views[term.robot]
+    lacking = [joint for joint in bound.elements or [] if view.actuators[joint] < 0]
+    if lacking:
+        raise ValueError(
+            f"{place}: joint {view.joint_names[lacking[0]]} has no actuator; give the robot one, or leave the joint out of joints="
+        )
+
+
+def check_driven(acting: Sequence[Bound], views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
+    """Refuse two actions for one thing, and inverse kinematics that no action asks.
+
+    Args:
+        acting: The terms of the actions.
+        views: The robots and objects by name.
+        sensors: The sensors as declared, by name.
+
+    Raises:
+        ValueError: In one line.
+    """
+    names = [name for bound in acting for name in bound.element_names]
+    if doubled := next((name for name in names if names.count(name) > 1), None):
+        what = "joint" if any(bound.takes("joint") and doubled in bound.element_names for bound in acting) else "column"
+        raise ValueError(f"actions: {what} {doubled} is driven by two terms; each {what} has one action")
+    driven = {(bound.term.robot, joint) for bound in acting if bound.takes("joint") for joint in bound.elements or ()}
+    asked = {name for bound in acting for name in _frames(bound, sensors)}
+    for name, sensor in sensors.items():
+        if not isinstance(sensor, DifferentialIK):
+            continue
+        if name not in asked:
+            raise ValueError(f"sensors.{name}: no action asks for it; declare one, such as Action(terms.move_frame)")
+        view = views[sensor.robot]
+        for joint in sensor.driven(views):
+            joint_name = view.joint_names[joint]
+            if view.actuators[joint] < 0:
+                raise ValueError(
+                    f"sensors.{name}: joint {joint_name} has no actuator; give the robot one, or leave the joint out of joints="
+                )
+            if (sensor.robot, joint) in driven:
+                raise ValueError(
+                    f"sensors.{name}: joint {joint_name} is driven by two terms; each joint has one action"
+                )
+            driven.add((sensor.robot, joint))
