@@ -262,7 +262,12 @@ class Plain(SeeingConfig):
             {},
             "there is no camera 'front'; the task declares none; give it a CameraSensor",
         ),
-        (SeeingConfig(), Image("imu"), {"imu": Imu(), "front": CameraSensor()}, "the sensor imu is no camera; "),
+        (
+            SeeingConfig(),
+            Image("imu"),
+            {"imu": Imu(body="cart"), "front": CameraSensor()},
+            "the sensor imu is no camera; ",
+        ),
         (
             SeeingConfig(),
             Image("front"),

@@ -10,6 +10,7 @@ import warp as wp
 
 from tests.support.worker.terms_rig import (
     ACTIONS,
+    BODIES,
     JOINTS,
     OBJECT,
     OBJECT_DOF,
@@ -18,7 +19,10 @@ from tests.support.worker.terms_rig import (
     SECONDS,
     WORLDS,
     Rig,
+    array,
 )
+from worker.simulation.sensors.differential_ik import IkArrays
+from worker.simulation.sensors.wrench import WrenchArrays
 from worker.tasks.terms import actions, commands, episode, events, root
 
 MODULES = (actions, commands, episode, events)
@@ -26,14 +30,21 @@ ALL = [
     each
     for module in MODULES
     for each in vars(module).values()
-    if isinstance(each, wp.Function) and each.func.__module__ == module.__name__ and each.key != "aim"
+    if isinstance(each, wp.Function)
+    and each.func.__module__ == module.__name__
+    and each.key not in ("aim", "_draw_wrenches")
 ]
 DRAWS = 120
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    return Rig([*ALL, root.root_linear_velocity], tmp_path_factory.mktemp("commands"))
+    wrench, frame = WrenchArrays(), IkArrays()
+    wrench.wrenches = array(np.zeros((WORLDS, BODIES, 6)), wp.spatial_vector)
+    wrench.bodies, wrench.left = array([1, 4], wp.int32), array(np.zeros(WORLDS))
+    frame.wanted = array(np.zeros((WORLDS, 3)))
+    structs = {WrenchArrays: wrench, IkArrays: frame}
+    return Rig([*ALL, root.root_linear_velocity], tmp_path_factory.mktemp("commands"), structs)
 
 
 @pytest.fixture
@@ -362,3 +373,17 @@ def test_terms_of_the_episode(rig: Rig) -> None:
     broken[1, 3] = np.nan
     rig.worlds.joint_qd.assign(broken)
     assert rig.call(episode.not_finite).tolist() == [0, 1, 0]
+
+
+def test_wrenches_are_drawn_from_their_ranges_and_a_frame_is_told_where_to_go(rig: Rig) -> None:
+    wrench, frame = rig.structs[WrenchArrays], rig.structs[IkArrays]
+    rig.call(events.apply_wrench, stream=3, force=(1.0, 2.0), torque=(-2.0, -1.0))
+    drawn = wrench.wrenches.numpy()
+    assert (wrench.left.numpy() == -2.0).all() and not drawn[:, [0, 2, 3, 5, 6]].any()
+    assert (drawn[:, [1, 4], :3] >= 1.0).all() and (drawn[:, [1, 4], :3] <= 2.0).all()
+    assert (drawn[:, [1, 4], 3:] <= -1.0).all() and len(np.unique(drawn[:, [1, 4]])) == 12 * WORLDS
+    rig.call(events.apply_impulse, stream=4, duration=(0.2, 0.4), force=(3.0, 3.0))
+    left = wrench.left.numpy()
+    assert (left >= 0.2).all() and (left <= 0.4).all() and (wrench.wrenches.numpy()[:, 1, :3] == 3.0).all()
+    rig.call(actions.move_frame, 1, value=0.5)
+    assert frame.wanted.numpy().tolist() == [[0.0, 0.5, 0.0]] * WORLDS
