@@ -18,6 +18,7 @@ from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.errors import UsageError
 from shared_store.documents import DocumentError
+from shared_store.evaluations import flattened
 from shared_store.policy_contract import differences, read
 
 ModelArgument = Annotated[
@@ -71,14 +72,21 @@ def list_models(store: StoreOption = None, as_json: JsonOption = False) -> None:
         echo("no model is registered yet; muster models register RUN --name NAME")
         return
     table = Table(box=None, pad_edge=False)
-    for column in ("MODEL", "VERSION", "TASK", "RUN", "ITERATION", "SCORE", "REGISTERED"):
+    for column in ("MODEL", "VERSION", "TASK", "RUN", "ITERATION", "RETURN", "REGISTERED"):
         table.add_column(column, no_wrap=True)
     for each in found:
         table.add_row(
             *(each["name"], str(each["version"]), str(each.get("task", "-")), str(each.get("run", "-"))),
-            *(str(each.get("iteration", "-")), scored(each.get("score"), None), _when(each.get("registered"))),
+            *(str(each.get("iteration", "-")), _return(each), _when(each.get("registered"))),
         )
     print_cut(table)
+
+
+def _return(model: dict[str, Any]) -> str:
+    """The mean return of its evaluation of most episodes in the worlds of the training; else the training's score."""
+    own = [each for each in model.get("evaluations") or [] if not each.get("config")]
+    best = max(own, key=lambda each: each["episodes"], default=None)
+    return f"{best['mean_return']:.2f}" if best else scored(model.get("score"), None)
 
 
 def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
@@ -94,7 +102,10 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
     if parent:
         echo(f"  parent:      run {parent.get('run')}, checkpoint {parent.get('checkpoint')}")
     for evaluation in found.get("evaluations") or []:
-        echo(f"  evaluation:  {evaluated(evaluation)}")
+        changed = ", ".join(f"{place} {value}" for place, value in flattened(evaluation.get("config") or {}))
+        echo(
+            f"  evaluation:  {evaluated(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
+        )
     if judged := found.get("judged"):
         echo(
             f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {judged['episodes']} episodes"

@@ -27,7 +27,7 @@ from orchestrator.spec_sections import Resources, Retry
 SourceArgument = Annotated[
     str | None,
     typer.Argument(
-        metavar="RUN[@ITERATION|@best] | JOB",
+        metavar="RUN[@ITERATION|@best|@latest] | JOB",
         help="Of a run: its newest checkpoint, that of an iteration, or the one with the best score.",
     ),
 ]
@@ -63,8 +63,10 @@ def record(
         if source is not None or output is not None:
             raise UsageError("--recover: give the cut file alone; the recovered one lies beside it")
         raise typer.Exit(run_worker("worker.telemetry.live", "--recover", str(recover)))
-    if source is None or output is None:
+    if source is None:
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
+    if output is None:
+        raise UsageError(f"-o is missing: muster record {source} -o FILE.mcap")
     _check_output(output, ".mcap")
     with controller(store, cpus) as connect:
         client = connect()

@@ -27,7 +27,7 @@ def view(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="JOB | RUN[@ITERATION|@best] | FILE",
+            metavar="JOB | RUN[@ITERATION|@best|@latest] | FILE",
             help="A training that runs on this machine; a checkpoint's policy; a recording (.mcap, .mcap.partial, .rrd).",
         ),
     ],

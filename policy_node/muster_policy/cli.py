@@ -142,10 +142,12 @@ def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
         if not (ours and equals and theirs):
             raise Refused(f"--joints {path}, line {number}: expected policy_joint = robot_joint, found {text[:60]!r}")
         if ours not in known:
-            raise Refused(f"--joints {path}, line {number}: the policy has no joint {ours}; {nearest(ours, known)}")
+            raise Refused(
+                f"--joints {path}, line {number}: the policy has no joint {ours}; {nearest(ours, sorted(set(known)))}"
+            )
         found[ours] = theirs
     robot: dict[str, str] = {}
-    for joint in known:
+    for joint in dict.fromkeys(known):
         if (other := robot.setdefault(found.get(joint, joint), joint)) != joint:
             raise Refused(
                 f"--joints {path}: {other} and {joint} of the policy are both {found.get(joint, joint)} of the robot; give each its own"

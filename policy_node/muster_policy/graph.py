@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -50,7 +51,9 @@ def open_session(connect: str | None, listen: str | None) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = f"--listen {listen}" if listen else f"--connect {connect}"
-        reason = " ".join(str(error).split())[:160]
+        reason = re.sub(r" at /\S*", "", " ".join(str(error).split()))[:160]  # places in Zenoh's own source
+        if "Address already in use" in reason:
+            raise Refused(f"{where}: the port is taken; is a router or another node there? give another one") from None
         raise Refused(f"{where}: Zenoh can't open it ({reason}); give an endpoint such as tcp/localhost:7447") from None
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import warp
 
 from shared_store.bundles import DamagedBundle, read_contract, verify
 from shared_store.policy_contract import Contract, brief, differences
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
 TWISTS = ("velocity_command", "moving_velocity_command", "heading_velocity_command")
+PATIENCE = 5.0
+"""Seconds between two lines while nobody commands it."""
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
 """Covariance of what a sensor does not measure, as ROS has it."""
 
@@ -210,6 +213,7 @@ def play(
     simulated = 0
     begun = False
     deadline = time.monotonic()
+    patience = deadline + PATIENCE
     while len(returns) < episodes:
         simulated += round(period * 1e9)
         clock = messages.make("rosgraph_msgs/msg/Clock", clock=messages.stamp(simulated))
@@ -218,8 +222,11 @@ def play(
             publish(*message)
         deadline = max(deadline + period / speed, time.monotonic())
         time.sleep(max(0.0, deadline - time.monotonic()))
-        if not newest and not begun:
-            continue  # nobody acts yet
+        if not newest and not begun:  # nobody acts yet
+            if time.monotonic() > patience:
+                patience = time.monotonic() + PATIENCE
+                told("no joint_commands yet; is a policy node there, and on the same router? muster-policy BUNDLE")
+            continue
         if not begun:
             begun = True
             told("the first command has come")
@@ -293,6 +300,7 @@ def main() -> int:
         from muster_policy.messages import Messages
     except ModuleNotFoundError as error:
         raise UserError(f"{error.name} is not installed; pip install ./policy_node") from error
+    warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
     messages = Messages()
     robot = open_robot(given.bundle, messages, given.seed)
     try:
