@@ -253,7 +253,9 @@ def test_a_port_that_is_taken_and_a_router_that_is_not_there_are_one_line(tmp_pa
         options = ["--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]
         done = subprocess.run([*command, *options], env=env, capture_output=True, text=True, timeout=60)
     (line,) = done.stderr.strip().splitlines()
-    assert done.returncode == 1 and line.startswith(f"error: --listen {options[1]}: the port is taken; is a router or another node there?"), done.stderr
+    assert done.returncode == 1 and line.startswith(
+        f"error: --listen {options[1]}: the port is taken; is a router or another node there?"
+    ), done.stderr
     nobody = ["--connect", f"tcp/127.0.0.1:{free_port()}", "--duration", "0.5"]
     done = subprocess.run([*command, *nobody], env=env, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and f"no router answers at {nobody[1]}; it is tried again" in done.stdout, done.stderr
