@@ -195,7 +195,7 @@ class AutomaticEvaluations:
         controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
         token = permissions.current_identity.set(permissions.Identity(training.owner))
         try:
-            spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen)
+            spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
             with controller.writing, controller.database.session() as session:
                 context = Context(session, controller)
                 answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {})

@@ -64,13 +64,13 @@ def place_of(queue: str, share: str | None, wanted: Evaluation) -> dict[str, str
 
 
 def automatic_evaluation(
-    run: str, trained: Mapping[str, Any], place: Mapping[str, str], wanted: Evaluation, checkpoint: Checkpoint
+    run: str, trained: Mapping[str, Any], place: Mapping[str, str], wanted: Evaluation, iteration: int
 ) -> Spec:
     """The job that evaluates a checkpoint beside its training. Trainings may take its place, and it keeps no checkpoint. Raises SpecError.
 
-    ``place``: as :func:`place_of` says.
+    ``place``: as :func:`place_of` says; ``iteration``: the checkpoint's.
     """
-    section = {"checkpoint": checkpoint.iteration, "episodes": wanted.episodes, "worlds": wanted.worlds, "keep": False}
+    section = {"checkpoint": iteration, "episodes": wanted.episodes, "worlds": wanted.worlds, "keep": False}
     document = evaluation_document(run, {**trained, "queue": None, "share": None}, section)
     if wanted.resources is not None:
         document["resources"] = wanted.resources.model_dump()

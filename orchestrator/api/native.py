@@ -29,9 +29,11 @@ from orchestrator.api.sources import sources_of
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError, find_job
-from orchestrator.definition import GangNeeds, gang_needs
+from orchestrator.definition import GangNeeds, compile_definition, gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.engines.several import FRESH
+from orchestrator.errors import SpecError
+from orchestrator.evaluating import automatic_evaluation, place_of, wanted_of
 from orchestrator.excerpts import LONGEST_REASON, excerpt
 from orchestrator.jobs import Status
 from orchestrator.ownership import owner_of
@@ -108,6 +110,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             raise ClientError(
                 found.problem or f"{needed(needs.shape)}; no host that it could have is known now; more may come"
             )
+        if problem := _problem_of_evaluations(session, controller, queue, needs):
+            raise ClientError(problem)
         pool, placements = found.seat
         job = Job(
             id="job",
@@ -152,7 +156,24 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_in_queue(session, controller.engine, queue, needs.shape, FRESH).problem}
+        problem = fit_in_queue(session, controller.engine, queue, needs.shape, FRESH).problem
+        return {"problem": problem or _problem_of_evaluations(session, controller, queue, needs)}
+
+
+def _problem_of_evaluations(session: Session, controller: Controller, queue: JobQueue, needs: GangNeeds) -> str | None:
+    """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
+    try:
+        wanted = wanted_of(needs.spec)
+        if wanted is None:
+            return None
+        place = place_of(queue.name, None, wanted)
+        spec = automatic_evaluation("run", needs.spec or {}, place, wanted, 1)
+        definition = compile_definition(spec, needs.setting("MUSTER_DIRECTORY"))
+        shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
+        problem = fit_in_queue(session, controller.engine, _queue(session, place["queue"]), shape, FRESH).problem
+    except (ClientError, SpecError) as error:
+        problem = str(error)
+    return problem and f"evaluation: {problem}"
 
 
 def _gang_of(body: PlanRequest) -> GangNeeds:

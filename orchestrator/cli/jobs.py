@@ -62,6 +62,8 @@ def submit_spec(
     """
     definition = compile_definition(spec, os.getcwd())
     if problem := client.post("/api/fit", {"definition": definition, "queue": spec.queue})["problem"]:
+        if problem.startswith("evaluation: "):
+            raise SpecError(f"{source}: {problem}; change evaluation.resources or evaluation.queue")
         raise SpecError(f"{source}: resources: {problem}; lower nodes or resources (cpus may be a fraction)")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))

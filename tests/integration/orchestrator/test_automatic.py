@@ -214,3 +214,24 @@ def test_a_queue_that_does_not_take_the_evaluations_is_refused_with_the_training
         controller.train({"every": 1, "queue": "nowhere"})
     with pytest.raises(ApiError, match=r"^evaluation\.every: is required$"):
         controller.train({})
+
+
+@pytest.mark.parametrize("options", [(), ("--dry-run",)])
+@pytest.mark.parametrize(
+    ("section", "said"),
+    [
+        ("{every: 2, resources: {gpus: 1}}", "evaluation: each node needs 1 CPU, 1 GPU"),
+        ("{every: 2, queue: nowhere}", "evaluation: there is no queue 'nowhere'; there is default"),
+    ],
+)
+def test_evaluations_that_could_never_start_are_refused_with_the_training(
+    controller: Controller, section: str, said: str, options: tuple[str, ...]
+) -> None:
+    done = call_muster(
+        *("submit", "job_specs/cartpole.yaml", "--set", "nodes=1", "--set", f"evaluation={section}"),
+        *options,
+        home=controller.home,
+    )
+    assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    with controller.server.controller.database.session() as session:
+        assert not session.scalars(select(Job)).all()

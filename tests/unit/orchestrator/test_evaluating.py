@@ -72,7 +72,7 @@ def test_what_earlier_jobs_of_the_run_have_saved_does_not_count() -> None:
 
 def test_the_job_has_one_node_like_those_of_the_training_and_keeps_no_checkpoint() -> None:
     wanted = Evaluation(every=2, episodes=32, worlds=16)
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, saved(40)[0])
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
     assert spec.evaluate is not None and spec.evaluate.model_dump(exclude_none=True) == {
         **{"run": "ant-1", "checkpoint": 40, "episodes": 32, "worlds": 16, "config": {}, "keep": False}
     }
@@ -85,7 +85,7 @@ def test_the_section_says_where_else_and_with_what() -> None:
     section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
     wanted = wanted_of({**TRAINED, "evaluation": section})
     assert wanted is not None
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, saved(40)[0])
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
     assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
     assert (spec.resources.gpus, spec.retry.attempts) == (0, 1)
 
