@@ -137,7 +137,9 @@ class Training:
         known = [each for each in records if each.get("reward") is not None and each.get("time") is not None]
         times = np.array([1e9 * each["time"] for each in known]).astype(np.int64)
         screen.curve("mean", [each["reward"] for each in known], times, [each["iteration"] for each in known])
-        self._iteration = newest
+        self._iteration = (
+            records[-1]["iteration"] if records else newest
+        )  # one may have come since the look at the newest
 
     def _say(self, screen: Screen | None, text: str) -> None:
         print(text, flush=True)

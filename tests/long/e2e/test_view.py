@@ -94,7 +94,10 @@ def saved(url: str, file: Path) -> dict[str, Any]:
         stderr=subprocess.DEVNULL,
     )
     size = wait_for(lambda: file.exists() and file.stat().st_size, 60, "the stream")
-    wait_for(lambda: file.stat().st_size > size + 200_000, 60, "some frames of the stream")
+    for more in (200_000, 150_000):  # what was there already, then some frames of 3 kB
+        size += more
+        wait_for(lambda size=size: file.stat().st_size > size, 60, "some frames of the stream")
+        size = file.stat().st_size
     client.kill()  # what it has written can be read
     client.wait()
     found: dict[str, list[Any]] = {}
@@ -184,7 +187,7 @@ def test_a_browser_shows_the_training_moving_and_asks_no_other_machine(view: Vie
         first = worlds()
         wait_for(lambda: (np.abs(worlds() - first).max(-1) > 40).sum() > 20, 120, "another frame")
         hosts = {urllib.parse.urlsplit(url).hostname or "" for url in browser.asked}
-        assert len(hosts) == 2 and all(ipaddress.ip_address(host).is_loopback for host in hosts), hosts
+        assert hosts and all(ipaddress.ip_address(host).is_loopback for host in hosts), hosts
     finally:
         browser.close()
 
