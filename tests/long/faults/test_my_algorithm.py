@@ -90,7 +90,7 @@ def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_pat
 
 def test_two_ranks_of_it_hold_the_same_weights(tmp_path: Path) -> None:
     """Checkpoints hold the main rank's alone; metrics are those of both."""
-    ranks = run_ranks("test_my_algorithm:one_of_two", 2, training(tmp_path), timeout=300)
+    ranks = run_ranks("long.faults.test_my_algorithm:one_of_two", 2, training(tmp_path), timeout=300)
     assert [code for code, _, _ in ranks] == [0, 0], ranks[0][2] + ranks[1][2]
     one, other = (json.loads(output.splitlines()[-1]) for _, output, _ in ranks)
     assert one == other

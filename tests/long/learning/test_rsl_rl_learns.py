@@ -192,7 +192,7 @@ CURIOUS = {"num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims":
 SECTIONS: dict[str, dict[str, Any]] = {
     "PPO with RND": {
         "algorithm": {"rnd_cfg": {**CURIOUS, "state_normalization": True, "reward_normalization": True}},
-        "actor": {"class_name": "tests.training.worker.test_rsl_rl_learns:Batched", "distribution_cfg": GAUSSIAN},
+        "actor": {"class_name": "tests.long.learning.test_rsl_rl_learns:Batched", "distribution_cfg": GAUSSIAN},
     },
     "GRU": {"actor": {**GRU, "distribution_cfg": GAUSSIAN}, "algorithm": {"num_mini_batches": 2}},
     "distillation": {
@@ -243,7 +243,7 @@ def one_of_two() -> int:
 
 
 def test_two_ranks_have_the_same_weights_normalizers_and_metrics() -> None:
-    ranks = run_ranks("test_rsl_rl_learns:one_of_two", 2, timeout=300)
+    ranks = run_ranks("long.learning.test_rsl_rl_learns:one_of_two", 2, timeout=300)
     assert [code for code, _, _ in ranks] == [0, 0], ranks[0][2] + ranks[1][2]
     one, other = (json.loads(output.splitlines()[-1]) for _, output, _ in ranks)
     for name in SECTIONS:

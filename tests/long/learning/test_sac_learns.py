@@ -62,7 +62,7 @@ def test_it_learns_cartpole() -> None:
 
 
 def test_two_ranks_learn_the_same_weights() -> None:
-    first, second = run_ranks("test_sac_learns:a_rank", 2, timeout=300.0)
+    first, second = run_ranks("long.learning.test_sac_learns:a_rank", 2, timeout=300.0)
     assert first[0] == second[0] == 0, first[2] + second[2]
     told = [json.loads(output.strip().splitlines()[-1]) for _, output, _ in (first, second)]
     assert told[0]["weights"] == told[1]["weights"], "the ranks' learners hold the same bits"

@@ -22,7 +22,7 @@ def free_port() -> int:
 
 
 def start_rank(body: str, rank: int, ranks: int, port: int, env: dict[str, str]) -> subprocess.Popen[str]:
-    """One process with the environment that the supervisor gives a rank; ``module:function`` in ``tests.training.worker`` is its body."""
+    """One process with the environment that the supervisor gives a rank; ``module:function`` in ``tests`` is its body."""
     given = {
         "RANK": str(rank),
         "WORLD_SIZE": str(ranks),
@@ -99,8 +99,4 @@ if __name__ == "__main__":
     from worker.learning.job import run_command
 
     module, _, function = sys.argv[1].rpartition(":")
-    run_command(
-        getattr(
-            importlib.import_module(f"tests.training.worker.{module}") if module else sys.modules["__main__"], function
-        )
-    )
+    run_command(getattr(importlib.import_module(f"tests.{module}") if module else sys.modules["__main__"], function))

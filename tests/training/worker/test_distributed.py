@@ -72,7 +72,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], li
     """What each rank of a gang of one and of a gang of two computed, by (ranks, rank)."""
     folder = tmp_path_factory.mktemp("learnt")
     found = {(1, 0): compute(connect(Placement(), device="cpu"))}
-    for code, _, errors in run_ranks("test_distributed:learn", 2, {"MUSTER_OUT": str(folder / "two")}):
+    for code, _, errors in run_ranks("training.worker.test_distributed:learn", 2, {"MUSTER_OUT": str(folder / "two")}):
         assert code == 0, errors
     return found | {(2, rank): torch.load(folder / f"two.{rank}", weights_only=True) for rank in (0, 1)}
 

@@ -65,7 +65,7 @@ def resume_in_a_gang() -> int:
 def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with runs of two ranks of 8 worlds."""
     store = tmp_path_factory.mktemp("two-ranks")
-    for code, output, errors in run_ranks("test_runner:resume_in_a_gang", 2, training(store)):
+    for code, output, errors in run_ranks("training.worker.test_runner:resume_in_a_gang", 2, training(store)):
         assert code == 0, output + errors
     return store
 
@@ -329,7 +329,9 @@ def test_user_errors_are_one_line_and_reach_the_supervisor(
 
 def test_an_unexpected_error_shows_its_traceback(tmp_path: Path) -> None:
     errors = tmp_path / "error.json"
-    ((code, _, shown),) = run_ranks("test_runner:break_down", 1, {"TORCHELASTIC_ERROR_FILE": str(errors)})
+    ((code, _, shown),) = run_ranks(
+        "training.worker.test_runner:break_down", 1, {"TORCHELASTIC_ERROR_FILE": str(errors)}
+    )
     message = json.loads(errors.read_text())["message"]
     assert code == 1 and "Traceback" in shown
     assert message["message"] == "ValueError: a defect" and "break_down" in message["extraInfo"]["py_callstack"]
