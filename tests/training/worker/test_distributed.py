@@ -97,7 +97,7 @@ def test_all_ranks_hold_the_same_bits(learnt: dict) -> None:
 def test_a_missing_rank_is_named_by_all() -> None:
     env = {"MUSTER_REPORT_SECONDS": "2"}
     port = free_port()
-    processes = [start_rank("test_distributed:report", rank, 3, port, env) for rank in (0, 1)]
+    processes = [start_rank("training.worker.test_distributed:report", rank, 3, port, env) for rank in (0, 1)]
     for process in processes:
         _, errors = process.communicate(timeout=60 * PATIENCE)
         assert process.returncode == 1
