@@ -2,9 +2,10 @@
 
     python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
 
-Each training goes through three stretches of as many iterations: ``muster record`` writes four of its worlds, that has ended, and
-``muster view`` shows them (without a browser, where Rerun is installed). A twin with the same seed, which nobody looks at, makes the same iterations for comparison: they get longer and shorter as robots learn. The
-checkpoint is then recorded, evaluated and exported. Writes ``seeing.md``.
+Each training has three stretches of equal length: ``muster record`` writes four of its worlds; no reader is attached; ``muster view``
+shows the worlds (without a browser, and only where Rerun is installed). A second training with the same seed and no reader makes the
+same iterations for comparison, since the length of an iteration changes as robots learn. The checkpoint is then recorded, evaluated
+and exported. Writes ``seeing.md``.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ TAPPED, EPISODES = 4, 2
 
 
 def watched(loop: Loop) -> list[int]:
-    """Train while worlds are recorded, then seen by nobody, then shown; the iterations at which the stretches begin and end."""
+    """Train with a recording, then without a reader, then with a live view; returns the iterations at which each stretch begins and ends."""
     run, marks = loop.job.run, list[int]()
 
     def done() -> int:
@@ -175,9 +176,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# What looking at a policy costs, on {device_name()}",
         "",
         f"`python -m benchmarks.seeing`; medians of {ROUNDS} pairs of trainings with the same seed; of one, `muster record` writes {TAPPED} "
-        f"worlds for {STRETCH} iterations, then nobody reads for as many, then `muster view` shows them. {told(rows)}",
+        f"worlds for {STRETCH} iterations, no reader follows for as many, then `muster view` shows them. {told(rows)}",
         "",
-        "| task | worlds | an iteration that nobody sees [ms] | while worlds are recorded | after that | in the live view |",
+        "| task | worlds | an iteration without a reader [ms] | while worlds are recorded | after that | in the live view |",
         "|---|--:|--:|--:|--:|--:|",
     ]
     for row in rows:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
-TWISTS = ("velocity_command", "moving_velocity_command", "heading_velocity_command")
 PATIENCE = 5.0
 """Seconds between two lines while nobody commands it."""
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
@@ -132,13 +131,15 @@ class SimulatedRobot:
         return [("imu", "sensor_msgs/msg/Imu", imu), ("odom", "nav_msgs/msg/Odometry", odometry)]
 
     def _commands(self) -> list[Message]:
+        from muster_policy.observations import is_twist
+
         found: list[Message] = []
         described = {command.name: command for command in self.contract.commands}
         for told in self.task.plan.commands:
             command = described[told.bound.name]
             memory = self.task.state_tensors()["memory"][0, told.first : told.first + len(command.names)]
             numbers = memory.double().tolist()
-            if command.library and command.quantity in TWISTS:
+            if is_twist(command):
                 twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
                 found.append(("cmd_vel", "geometry_msgs/msg/Twist", twist))
             else:

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from worker.simulation.camera import renderer
+from worker.simulation.kinematics import yaw_quaternion
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.frames import only_one
@@ -47,8 +48,7 @@ def _follow(bodies: BodyArrays, body: int, mount: wp.transform, alignment: int, 
     if alignment == _WORLD:
         rotation = wp.quat_identity()
     if alignment == _YAW:
-        forward = wp.quat_rotate(rotation, wp.vec3(1.0, 0.0, 0.0))
-        rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.atan2(forward[1], forward[0]))
+        rotation = yaw_quaternion(rotation)
     poses[world] = wp.transform(wp.transform_get_translation(pose), rotation)
 
 
