@@ -4,7 +4,8 @@
 
 A policy walks when, in a whole episode of each of ``--judged`` other worlds (drawn from another seed, with the task's own noise,
 pushes and randomisation), the mean length of the episodes is at least ``--length`` of the longest and the mean tracking errors of its
-mean actions are at most ``--linear`` and ``--angular``. It is judged every ``--every`` seconds of training, and the clock of training stands
+mean actions are at most ``--linear`` and ``--angular``. Those worlds have the task's own physics steps and mjlab's limits of the solver,
+whatever the training has (``--limits ours``, ``--train '{"config": {"substeps": 2}}'``). It is judged every ``--every`` seconds of training, and the clock of training stands
 still meanwhile: how long that took stands apart. The clock starts with the first iteration, before any graph is recorded; what
 comes before (imports, worlds, kernels) stands apart, too. Training is as ``muster run`` does it, with metrics and checkpoints.
 
@@ -14,6 +15,7 @@ Writes ``walking-<task>-<algorithm>-<seed>.json`` and the curve as ``.png`` wher
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import tempfile
 import time
@@ -42,6 +44,9 @@ LENGTH = 0.987
 LINEAR, ANGULAR = 0.3, 0.4
 """Tracking errors of a robot that follows its commands [m/s, rad/s]: commands reach 1 m/s and 0.5 rad/s, and pushes of up to 0.5 m/s
 come every 1 to 3 s."""
+
+PHYSICS = ("substeps", "solver_iterations", "solver_line_search")
+"""Settings by which a training may have rougher physics than its judgement."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,12 @@ class WalkingLoop(Loop):
         )
 
 
+def judged_with(config: Any) -> Any:
+    """The training's configuration with the physics that the task has by default: its steps, and its limits of the solver."""
+    usual = type(config)()
+    return dataclasses.replace(config, **{name: getattr(usual, name) for name in PHYSICS})
+
+
 def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
     """Train once, and say when the policy walked. Raises ValueError where the task can't be judged."""
     built = time.perf_counter()
@@ -144,7 +155,7 @@ def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
     loop = build_loop(asked, store, WalkingLoop, algorithm=options.algorithm, **options.train)
     assert isinstance(loop, WalkingLoop)
     own = type(loop.task)
-    worlds = own(loop.config, options.judged, seed=held_out_seed(seed), device=loop.gang.device)
+    worlds = own(judged_with(loop.config), options.judged, seed=held_out_seed(seed), device=loop.gang.device)
     VelocityErrors(worlds)
     bounds = Bounds(options.length, options.linear, options.angular)
     loop.judged_by(worlds, bounds, options.every, options.seconds)
