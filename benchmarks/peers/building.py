@@ -19,7 +19,7 @@ from worker.tasks.task import Task
 
 
 def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[str, Any]]:
-    """A task whose solver has these limits, and what a job's ``train`` section has to say for them.
+    """A task whose solver has these limits, and what its configuration (``train.config`` of a job) has to say for them.
 
     Args:
         task: Name of a task.
@@ -67,7 +67,7 @@ def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Lo
     if train.get("algorithm", "ppo") != "ppo":  # another algorithm has networks and steps of its own
         network = {}
     section = {name: asked[name] for name in ("task", "worlds", "iterations", "seed")}
-    section |= settings | ({"ppo": network} if network else {}) | train
+    section |= ({"ppo": network} if network else {}) | train | {"config": settings | train.get("config", {})}
     # every checkpoint stays: they are judged afterwards
     spec = {"train": section, "checkpoint": {"every": asked["save_every"], "keep": 10**6}}
     job = Job(spec, Store(store), run, 1, 1, "peers", section=section)

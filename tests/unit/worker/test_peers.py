@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from benchmarks import walking
 from benchmarks.peers import cases, conversion, environment, judging, run, table
-from benchmarks.peers.building import limited
+from benchmarks.peers.building import build_loop, limited
 from benchmarks.peers.inside.clock import Clock
 from benchmarks.stock import stock_runner
 from worker.learning.ppo.settings import PPOConfig
@@ -219,6 +219,16 @@ def test_a_task_has_the_limits_of_its_case() -> None:
     assert exact.solver_options["njmax"] == loose.solver_options["njmax"] and exact.__name__ == "Ant"
     _, settings = limited("Go1Flat", vars(cases.find_case("go1").ours))
     assert settings == {"solver_iterations": 4, "solver_line_search": 8}
+
+
+def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
+    shared = cases.find_case("go1").shared("muster", "ours")
+    asked = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
+    loop = build_loop(asked, tmp_path, config={"substeps": 2})
+    found = loop.task.solver_options
+    loop.close()
+    assert (found["iterations"], found["ls_iterations"]) == (4, 8)
+    assert loop.config.substeps == 2 and loop.config.ppo.hidden_sizes == (8,)
 
 
 @pytest.mark.parametrize(
