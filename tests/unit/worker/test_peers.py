@@ -228,7 +228,7 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
     found = loop.task.solver_options
     loop.close()
     assert (found["iterations"], found["ls_iterations"]) == (4, 8)
-    assert loop.config.substeps == 2 and loop.config.ppo.hidden_sizes == (8,)
+    assert loop.config.substeps == 2 and list(loop.training.settings.hidden_sizes) == [8]
 
 
 @pytest.mark.parametrize(
