@@ -37,7 +37,7 @@ def main() -> int:
         f"checkpoint {rollout.checkpoint.name} of run {run.name}: {worlds} worlds, {episodes} episodes of each"
     )
     for rows in rollout.steps(episodes * rollout.task.max_episode_length):
-        recording.write(rows, rollout.images())
+        recording.write(rows)
         if recording.complete(episodes):
             break
     path = recording.finish()

@@ -13,8 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from shared_store.files import read_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
@@ -22,7 +20,7 @@ from shared_store.metrics import history_of
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.recording import Recording, recover
-from worker.telemetry.rows import Layout, Rows
+from worker.telemetry.rows import Rows
 from worker.telemetry.segment import Segment
 
 if TYPE_CHECKING:
@@ -56,6 +54,8 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         recording = _open(run, there, output, {"job": job})
         if there < worlds:
             print(f"note: the training has {there} worlds on its main rank", flush=True)
+        if asking.note:
+            print(f"note: {asking.note}", flush=True)
         log = LogFollower(run, job)
         for _ in log.drain():
             pass  # what was said before the recording began
@@ -81,9 +81,7 @@ def _rows(segment: Segment, asking: Asking, stop: list[int]) -> Iterator[Rows]:
         over = segment.closed or asking.is_answered_by_nobody
         for rows in segment.take():
             first = rows.first if first is None else first
-            layout = Layout(**{**vars(segment.layout), "worlds": worlds})
-            values, marks = rows.values[:, :worlds], rows.marks[:, :worlds]
-            yield Rows(layout, rows.first - first, values, np.ascontiguousarray(marks), rows.lost)
+            yield rows.of_worlds(worlds, since=first)
         if over:
             return
         time.sleep(0.02)

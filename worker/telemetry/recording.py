@@ -88,28 +88,14 @@ class Recording:
         except OSError as error:
             raise self._full(error) from error
 
-    def write(self, rows: Rows, images: Mapping[str, np.ndarray] | None = None) -> None:
-        """Add control steps.
-
-        Args:
-            rows: The next ones.
-            images: Of the last of them, by camera: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
-
-        Raises:
-            UserError: There is no space left, or the volume is gone.
-        """
+    def write(self, rows: Rows) -> None:
+        """Add the next control steps. Raises UserError where there is no space left, or the volume is gone."""
         try:
             self.lost += rows.lost
             if rows.lost:
                 self._whole[:] = self._just_ended[:] = False
             for step in range(len(rows)):
                 self._write_step(rows, step)
-            for camera, seen in (images or {}).items():
-                now = self._time(rows.first + len(rows), rows.layout.control_hz)
-                for world, image in enumerate(seen):
-                    topic = f"/world_{world}/{camera}/image/compressed"
-                    data = messages.picture(now, f"world_{world}", image)
-                    self._add(topic, "sensor_msgs/msg/CompressedImage", now, data)
             if time.monotonic() - self._flushed > _FLUSH_SECONDS:
                 self._flush()
         except OSError as error:
@@ -190,6 +176,10 @@ class Recording:
                 data = messages.joint_states(now, frame, stage.joints, positions, velocities)
                 self._add(f"/{frame}/joint_states", "sensor_msgs/msg/JointState", now, data)
             self._write_world(rows, step, world, now)
+        for camera, seen in rows.pictures(step).items():
+            for world, image in enumerate(seen):
+                data = messages.picture(now, f"world_{world}", image)
+                self._add(f"/world_{world}/{camera}/image/compressed", "sensor_msgs/msg/CompressedImage", now, data)
         self.steps = number
 
     def _write_world(self, rows: Rows, step: int, world: int, now: int) -> None:

@@ -62,6 +62,8 @@ class Training:
         try:
             if self._asking.worlds < worlds:
                 print(f"note: the training has {self._asking.worlds} worlds on its main rank", flush=True)
+            if self._asking.note:
+                print(f"note: {self._asking.note}", flush=True)
             self._stage, _ = stage_of(run, self._asking.worlds)
         except BaseException:
             self._asking.withdraw()
@@ -87,6 +89,8 @@ class Training:
                             closing.callback(screen.close)
                         now, steps = np.array([time.time_ns()]), np.array([rows.first + len(rows)])
                         screen.frames(now, steps, poses, rows.terms[-1:].mean(1), self._iteration)
+                        for camera, seen in rows.pictures(-1).items():
+                            screen.pictures(camera, now, steps, [seen], self._iteration)
                         self.frames += 1
                     if screen is not None and began - looked > _LOOK_SECONDS:
                         looked = began
@@ -115,7 +119,7 @@ class Training:
         worlds = self._stage.worlds
         if rows.layout.worlds < worlds or rows.layout.coordinates != self._stage.model.joint_coord_count // worlds:
             raise UserError("the training went on with other worlds; start the view again")
-        return Rows(rows.layout, rows.first, rows.values[:, :worlds], rows.marks[:, :worlds], rows.lost)
+        return rows.of_worlds(worlds)
 
     def _open(self, page: Page, rows: Rows, poses: np.ndarray) -> Screen:
         from worker.telemetry.screen import Screen
@@ -187,7 +191,10 @@ class Policy:
                 if number % every == 0:
                     page.check()
                     poses = self._stage.pose(rows.coordinates[-1])[None]
-                    screen.frames(np.array([time.time_ns()]), np.array([number]), poses, rows.terms[-1:].mean(1))
+                    now, steps = np.array([time.time_ns()]), np.array([number])
+                    screen.frames(now, steps, poses, rows.terms[-1:].mean(1))
+                    for camera, seen in rows.pictures(-1).items():
+                        screen.pictures(camera, now, steps, [seen])
                     self.frames += 1
                 self._count(screen, rows)
                 if self._stop or (self._episodes is not None and (self._ended >= self._episodes).all()):
@@ -244,6 +251,8 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int])
                 screen = Screen(page.server, path.name, replay.look, part.poses[0], live=False)
                 closing.callback(screen.close)
             screen.frames(part.times, part.steps, part.poses, part.rewards)
+            for camera in replay.look.cameras:
+                screen.pictures(camera, *part.pictures(camera))
             screen.say(part.said)
             screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
             if stop:
@@ -260,7 +269,8 @@ def look_of(stage: Stage, rows: Rows) -> Look:
     """What is seen of a stage's worlds, beside each other."""
     from worker.telemetry.screen import Look
 
-    return Look(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms)
+    cameras = tuple(name for name, *_ in rows.layout.images)
+    return Look(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms, cameras)
 
 
 def _checked(path: Path) -> Path:

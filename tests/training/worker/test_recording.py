@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +41,16 @@ class Recorded:
         tap = Tap(task, 2, rows=64)
         tap.open()
         reading = Reading(tap)
-        image = np.zeros((2, 8, 16, 3), np.uint8)
-        image[1, 2, 5] = (255, 128, 0)
+        image = np.zeros((1, 2, 3, 8, 16), np.uint8)
+        image[0, 1, :, 2, 5] = (255, 128, 0)
         recording = Recording(path, self.stage, {"run": "taught", "seed": "3"}, {"job.json": b"{}"})
         self.rows: list[Rows] = []
-        for number in range(STEPS):
+        for _ in range(STEPS):
             task.step(torch.full((2, 1), 0.1))
-            self.rows.append(reading.take())
-            recording.write(self.rows[-1], {"eye": image} if number == 0 else None)
+            rows = reading.take()
+            eye = replace(rows.layout, images=(("eye", 3, 8, 16),))
+            self.rows.append(replace(rows, layout=eye, images=image.reshape(1, 2, -1)))
+            recording.write(self.rows[-1])
         self.path = recording.finish()
 
 
@@ -125,7 +128,8 @@ def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]
 def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]]) -> None:
     from PIL import Image
 
-    (message,) = messages["/world_1/eye/image/compressed"]
+    message, *others = messages["/world_1/eye/image/compressed"]
+    assert len(others) == STEPS - 1 and len(messages["/world_0/eye/image/compressed"]) == STEPS
     pixels = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
     assert message.format == "png" and pixels.shape == (8, 16, 3)
     assert pixels[2, 5].tolist() == [255, 128, 0] and pixels.sum() == 383
