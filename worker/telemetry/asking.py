@@ -13,6 +13,7 @@ from pathlib import Path
 from shared_store.files import DamagedFile, read_json, write_json
 from shared_store.layout import Run
 from worker.errors import UserError
+from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.segment import Segment
 
@@ -94,9 +95,10 @@ class Asking:
         except (OSError, DamagedFile, ValueError, KeyError, TypeError) as error:
             raise self._unreadable(error) from error
 
-    def attach(self, patience: float, stop: list[int]) -> Segment:
+    def attach(self, patience: float, stop: list[int], activity: Activity) -> Segment:
         """Ask, and wait for the answer; ``stop`` is filled where the user does not want to wait any more. Raises UserError."""
         self.ask()
+        activity.say(f"waiting for the training of run {self._run.name} to answer …")
         try:
             until = time.monotonic() + patience
             while (segment := self.answer()) is None:

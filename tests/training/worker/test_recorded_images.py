@@ -20,6 +20,7 @@ from worker.tasks.cartpole_pixels import CartpolePixels
 from worker.tasks.overrides import configured
 from worker.telemetry.attending import Attending
 from worker.telemetry.live import record
+from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.tap import Reading, Tap
 from worker.telemetry.view import Training
@@ -119,7 +120,7 @@ def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Runni
     from rerun.chunk import RrdReader
 
     stop: list[int] = []
-    view = Training(running.run, "job", 2, stop)
+    view = Training(running.run, "job", 2, stop, Activity())
     view.show(lambda: File(tmp_path / "view.rrd", stop))  # type: ignore[arg-type,return-value]
     assert view.frames > 3
     shown: list[np.ndarray] = []
