@@ -37,11 +37,13 @@ from worker.telemetry.view import Training
 
 WARM = 20.0
 """Seconds in which the page starts and draws its first frames."""
+LATE = 8.0
+"""Seconds in which the last frames may still arrive."""
 SHOWN = 4
 """Worlds in the view."""
 PARTS = (
     ("the step's end → its row read by `muster view`", 0, 1),
-    ("→ all of the frame taken by Rerun's server", 1, 2),
+    ("→ the frame logged: handed to Rerun, which sends it to its server", 1, 2),
     ("→ the frame's bytes in the page", 2, 3),
     ("→ the end of the browser's next frame", 3, 4),
     ("**from the step to the page**", 0, 3),
@@ -109,7 +111,7 @@ class Marked(screen.Screen):
     """Its stream has a word behind each frame."""
 
     frames_sent: dict[str, tuple[int, int, int]] = {}
-    """By word: number of the step, when its row was read, when Rerun's server had taken the frame [ns]."""
+    """By word: number of the step, when its row was read, when the frame was handed to Rerun [ns]."""
 
     def frames(self, times: np.ndarray, steps: np.ndarray, *rest: Any) -> None:
         read = Timed.read
@@ -117,7 +119,6 @@ class Marked(screen.Screen):
         word = "".join(random.choices(string.ascii_letters, k=12))
         index = [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]"))]
         self._rr.send_columns("mark", index, rr.TextLog.columns(text=[f"MARK{word}"]))
-        self._rr.flush(timeout_sec=10.0)
         self.frames_sent[word] = int(steps[-1]), read, time.time_ns()
 
 
@@ -134,7 +135,8 @@ def look_on(url: str, seconds: float, home: Path, stop: list[int], found: dict[s
         time.sleep(WARM)
         found["from"], before = time.time_ns(), asked("window.frames")
         time.sleep(seconds)
-        found["rate"] = (asked("window.frames") - before) / seconds
+        found["rate"], found["to"] = (asked("window.frames") - before) / seconds, time.time_ns()
+        time.sleep(LATE)
         found["arrived"] = asked("window.arrived")
         browser.close()
     finally:
@@ -142,7 +144,7 @@ def look_on(url: str, seconds: float, home: Path, stop: list[int], found: dict[s
 
 
 def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, Any]:
-    """All times of each frame [ms], shape ``(frames, 5)``: step, read, taken, arrived, next frame."""
+    """Times of each frame that arrived [ms], shape ``(frames, 5)``: step, read, logged, arrived, next frame; and what else is told."""
     command = [
         sys.executable,
         "-m",
@@ -176,14 +178,21 @@ def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, A
         trained.wait()
     ends = np.memmap(folder / "ends", np.int64, "r")
     rows = [
-        (ends[step] / 1e6, read / 1e6, taken / 1e6, *found["arrived"].get(word, (None, None)))
-        for word, (step, read, taken) in Marked.frames_sent.items()
-        if read >= found["from"]
+        (ends[step] / 1e6, read / 1e6, logged / 1e6, *found["arrived"].get(word, (None, None)))
+        for word, (step, read, logged) in Marked.frames_sent.items()
+        if found["from"] <= read < found["to"]
     ]
     whole = np.array([row for row in rows if None not in row], float)
     if len(whole) < 10:
         raise SystemExit(f"only {len(whole)} of {len(rows)} frames were seen in the page; is Chromium's page open?")
-    return {"task": task, "worlds": worlds, "times": whole, "sent": len(rows), "rate": found["rate"]}
+    return {
+        "task": task,
+        "worlds": worlds,
+        "seconds": seconds,
+        "times": whole,
+        "sent": len(rows),
+        "rate": found["rate"],
+    }
 
 
 def table(row: dict[str, Any]) -> str:
@@ -194,7 +203,7 @@ def table(row: dict[str, Any]) -> str:
         "",
         f"`python -m benchmarks.view_latency` on {machine()}: {row['task']} trains with {row['worlds']} worlds, `muster view` shows {SHOWN} of "
         f"them, Chromium without a display has its page open and draws with a software rasteriser on the same cores, {row['rate']:.1f} frames "
-        f"a second. {len(times)} of {row['sent']} frames that were sent arrived, with their browser frame, while it was measured. {told([row])}",
+        f"a second. In {row['seconds']:.0f} s {row['sent']} frames were sent, of which {len(times)} arrived. {told([row])}",
         "",
         "| what [ms] | p50 | p99 | max |",
         "|---|--:|--:|--:|",
