@@ -142,9 +142,16 @@ class Activity:
             self._task = self._bar.add_task("", total=None)
 
     def wait(self, client: Client, job_id: str) -> None:
-        """Until the job has started, show its state and why it waits. Raises ApiError, Unreachable."""
+        """Until the job has started, show its state and why it waits; a controller that goes away is waited for. Raises Unreachable."""
         shown = ""
-        while (job := client.batch("DescribeJobs", jobs=[job_id])["jobs"][0])["status"] not in ("RUNNING", *_TERMINAL):
+        while True:
+            try:
+                job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
+            except Unreachable:
+                client.await_return()
+                continue
+            if job["status"] in ("RUNNING", *_TERMINAL):
+                return
             text = f"{job['jobName']} ({job_id[:8]}) {job['status']}: {one_line(job.get('statusReason', ''))}"
             if text != shown:
                 self.show(text)
