@@ -203,7 +203,7 @@ def table(row: dict[str, Any]) -> str:
         "",
         f"`python -m benchmarks.view_latency` on {machine()}: {row['task']} trains with {row['worlds']} worlds, `muster view` shows {SHOWN} of "
         f"them, Chromium without a display has its page open and draws with a software rasteriser on the same cores, {row['rate']:.1f} frames "
-        f"a second. In {row['seconds']:.0f} s {row['sent']} frames were sent, of which {len(times)} arrived. {told([row])}",
+        f"a second. In {row['seconds']:.0f} s {row['sent']} frames were sent, and of {len(times)} all times were seen. {told([row])}",
         "",
         "| what [ms] | p50 | p99 | max |",
         "|---|--:|--:|--:|",
