@@ -37,7 +37,7 @@ from worker.evaluation.episodes import play
 from worker.export import export
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policy
-from worker.telemetry.attending import answer_of
+from worker.telemetry.asking import answer_of
 from worker.telemetry.recording import Recording
 from worker.telemetry.rollout import Rollout
 

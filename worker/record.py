@@ -17,6 +17,10 @@ def main() -> int:
     if int(os.environ.get("RANK") or 0):
         return 0
     run, worlds, episodes = job.named_run(), job.setting("worlds", 4), job.setting("episodes", 2)
+    from worker.telemetry.progress import Activity, loading
+
+    activity = Activity()
+    activity.say(loading(run, worlds))
     from worker.distributed import use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -36,8 +40,10 @@ def main() -> int:
     recording.say(
         f"checkpoint {rollout.checkpoint.name} of run {run.name}: {worlds} worlds, {episodes} episodes of each"
     )
-    for rows in rollout.steps(episodes * rollout.task.max_episode_length):
-        recording.write(rows, rollout.images())
+    most = episodes * rollout.task.max_episode_length
+    for rows in rollout.steps(most):
+        recording.write(rows)
+        activity.count("recording: step", recording.steps, most)
         if recording.complete(episodes):
             break
     path = recording.finish()

@@ -23,6 +23,10 @@ def main() -> int:
     if not isinstance(seconds, int | float) or not 0 < seconds <= 600:
         raise UserError(f"seconds: expected a number above 0, at most 600, found {seconds!r}")
     ending = f".{job.section.get('format', 'gif')}"
+    from worker.telemetry.progress import Activity, loading
+
+    activity = Activity()
+    activity.say(loading(run, worlds))
     from worker.distributed import use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -41,6 +45,7 @@ def main() -> int:
     camera = picture.Camera(stage, width, height)
     taken, spent = [], 0.0
     for number, rows in enumerate(rollout.steps(steps)):
+        activity.count("rendering: step", number + 1, steps)
         if number % stride == 0 and not (ending == ".png" and len(taken) == picture.MOMENTS):
             started = time.perf_counter()
             taken.append(camera.take(rows.coordinates[-1]))

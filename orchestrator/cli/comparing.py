@@ -11,6 +11,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.compared import Group, RunFacts, grouped
@@ -31,6 +32,7 @@ def compare(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Draw the return against the steps into this PNG file.")
     ] = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare runs, or groups of runs that differ in their seed alone; draw their curves.
@@ -38,6 +40,8 @@ def compare(
     A group has the mean over its runs ± their standard deviation. EVALUATED is the return of each run's best checkpoint in its
     evaluations (its last checkpoint has one); an interval of 95 % where the group is a single run.
     """
+    if output is not None:
+        refuse_existing(output, overwrite)
     with Client.connect() as client:
         names = _chosen(client, runs)
         groups = grouped([_facts(client, name) for name in names])

@@ -131,6 +131,55 @@ def _describe(record: dict[str, Any]) -> dict[str, str]:
     }
 
 
+class Activity:
+    """What a job is busy with: on a terminal one line that is written over, else lines on standard error."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            text = TextColumn("{task.description}", markup=False)
+            self._bar = Progress(text, BarColumn(bar_width=24), console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("", total=None)
+
+    def wait(self, client: Client, job_id: str) -> None:
+        """Until the job has started, show its state and why it waits; a controller that goes away is waited for. Raises Unreachable."""
+        shown = ""
+        while True:
+            try:
+                job = client.batch("DescribeJobs", jobs=[job_id])["jobs"][0]
+            except Unreachable:
+                client.await_return()
+                continue
+            if job["status"] in ("RUNNING", *_TERMINAL):
+                return
+            text = f"{job['jobName']} ({job_id[:8]}) {job['status']}: {one_line(job.get('statusReason', ''))}"
+            if text != shown:
+                self.show(text)
+            shown = text
+            time.sleep(_POLL)
+
+    def show(self, text: str) -> None:
+        """What it does now; ``3 of 8`` at the end moves a bar."""
+        if self._bar is None:
+            echo(text, err=True)
+            return
+        self._bar.start()
+        found = re.search(r"(\d+) of (\d+)$", text)
+        done, total = (int(found[1]), int(found[2])) if found else (0, None)
+        self._bar.update(self._task, description=one_line(text), completed=done, total=total)
+
+    def end(self) -> None:
+        """Take the line away: what follows is printed as usual."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __enter__(self) -> Activity:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+
 class _Display:
     """What both displays know: how far the job is, and how long it will still take."""
 

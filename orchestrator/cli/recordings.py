@@ -17,6 +17,7 @@ import typer
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import chosen
 from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.progress import Activity
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, named
@@ -32,6 +33,7 @@ SourceArgument = Annotated[
     ),
 ]
 OutOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file that is made.", show_default=False)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the file where it exists.")]
 _RUNNING = ("STARTING", "RUNNING")
 
 
@@ -45,6 +47,7 @@ def record(
     output: OutOption = None,
     worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds.")] = 4,
     episodes: Annotated[int, typer.Option(min=1, help="Of each world.")] = 2,
+    overwrite: OverwriteOption = False,
     recover: Annotated[
         Path | None,
         typer.Option(
@@ -67,7 +70,7 @@ def record(
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
     if output is None:
         raise UsageError(f"-o is missing: muster record {source} -o FILE.mcap")
-    _check_output(output, ".mcap")
+    _check_output(output, overwrite, ".mcap")
     with controller(store, cpus) as connect:
         client = connect()
         run, live = source_of(client, source)
@@ -87,6 +90,7 @@ def render(
     worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds, side by side.")] = 4,
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
     size: Annotated[str, typer.Option(help="Width and height of a frame [px].")] = "640x360",
+    overwrite: OverwriteOption = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
@@ -96,7 +100,7 @@ def render(
     """
     if source is None or output is None:
         raise UsageError("give a run, and -o FILE.gif (or .mp4, .png)")
-    _check_output(output, ".gif", ".mp4", ".png")
+    _check_output(output, overwrite, ".gif", ".mp4", ".png")
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     if not found:
         raise UsageError(f"--size {size}: expected WIDTHxHEIGHT, such as 640x360")
@@ -112,7 +116,13 @@ def render(
         _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
 
 
-def _check_output(path: Path, *endings: str) -> None:
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raises UsageError where a file would be replaced that nobody said may be."""
+    if path.exists() and not overwrite:
+        raise UsageError(f"-o {path}: it exists; --overwrite replaces it")
+
+
+def _check_output(path: Path, overwrite: bool, *endings: str) -> None:
     """Refuse what can't be written before anything runs. Raises UsageError."""
     if path.is_dir():
         raise UsageError(f"-o {path}: it is a directory; name a file in it, such as {path / ('policy' + endings[0])}")
@@ -123,6 +133,13 @@ def _check_output(path: Path, *endings: str) -> None:
         raise UsageError(f"-o {path}: there is no directory {above}; create it first")
     if not os.access(above, os.W_OK):
         raise UsageError(f"-o {path}: {above} can't be written to; choose another directory")
+    refuse_existing(path, overwrite)
+    cut = path.with_name(f"{path.name}.partial")
+    if path.suffix == ".mcap" and cut.exists() and not overwrite:
+        raise UsageError(
+            f"-o {path}: {cut.name} exists, a recording that was cut short, or one that is being made; muster record --recover {cut} "
+            "saves it, --overwrite replaces it"
+        )
 
 
 def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
@@ -164,9 +181,16 @@ def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
 def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> None:
     """Run the job and bring what it made to ``output``. Raises typer.Exit, ServerError."""
     job = submit_spec(client, spec, spec.name)["jobId"]
-    for line in client.logs(job, follow=True):
-        if line["rank"] is not None and line["text"].startswith(("recorded: ", "rendered: ", "compiling ")):
-            echo(line["text"])
+    with Activity() as told:
+        told.wait(client, job)
+        for line in client.logs(job, follow=True):
+            if line["rank"] is None:
+                continue
+            if line["text"].startswith(("recorded: ", "rendered: ")):
+                told.end()
+                echo(line["text"])
+            elif line["text"].startswith(("loading ", "recording: ", "rendering: ", "compiling ")):
+                told.show(line["text"])
     detail = client.get(f"/api/jobs/{job}")
     if detail["status"] != "SUCCEEDED":
         raise ServerError(f"{spec.name} failed: {detail['statusReason']}")

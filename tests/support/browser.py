@@ -44,8 +44,8 @@ class Browser:
         self.asked: set[str] = set()
         """All that the page asked for."""
         for domain in ("Network", "Page"):
-            self._call(f"{domain}.enable")
-        self._call("Page.navigate", url=url)
+            self.call(f"{domain}.enable")
+        self.call("Page.navigate", url=url)
 
     def picture(self) -> np.ndarray:
         """What is seen, shape ``(height, width, 3)``, uint8."""
@@ -56,7 +56,7 @@ class Browser:
     def _shot(self) -> dict[str, Any] | None:
         """A picture; None while the browser goes to the page and has none."""
         try:
-            return self._call("Page.captureScreenshot", format="png")
+            return self.call("Page.captureScreenshot", format="png")
         except RuntimeError:
             return None
 
@@ -65,7 +65,8 @@ class Browser:
         self._process.terminate()
         self._process.wait()
 
-    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """A command of the DevTools protocol. Raises RuntimeError where the browser refuses it."""
         self._sent += 1
         self._socket.send(json.dumps({"id": self._sent, "method": method, "params": parameters}))
         while True:

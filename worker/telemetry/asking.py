@@ -13,12 +13,35 @@ from pathlib import Path
 from shared_store.files import DamagedFile, read_json, write_json
 from shared_store.layout import Run
 from worker.errors import UserError
-from worker.telemetry.attending import answer_of, is_alive, request_of
+from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.segment import Segment
 
 PATIENCE = 180.0
 """Seconds in which a training answers: it does between two iterations."""
+
+
+def request_of(run: Run) -> Path:
+    """Where a reader asks."""
+    return run.telemetry / "request.json"
+
+
+def answer_of(run: Run) -> Path:
+    """Where the training answers."""
+    return run.telemetry / "tap.json"
+
+
+def is_alive(host: object, process: object) -> bool:
+    """Whether a process of this machine runs; of another machine nobody here knows, which counts as no."""
+    if host != socket.gethostname() or not isinstance(process, int) or process <= 0:
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass  # another user's
+    return True
 
 
 class Asking:
@@ -35,6 +58,8 @@ class Asking:
         self.worlds, self._run, self._instead, self._newest = worlds, run, instead, newest
         self._writer = 0
         """The process that answered."""
+        self.note = ""
+        """What the training says of what it leaves out."""
 
     def ask(self) -> None:
         """Put the request; an answer of an earlier one is forgotten. Raises UserError where another process reads."""
@@ -64,14 +89,16 @@ class Asking:
             segment = Segment.open(Path(told["path"]), layout)
             segment.path.unlink(missing_ok=True)  # it lives as long as both map it, and no crash leaves it behind
             self._writer = int(told.get("process", 0))
+            self.note = str(told.get("note") or "")
             self.worlds = min(self.worlds, layout.worlds)
             return segment
         except (OSError, DamagedFile, ValueError, KeyError, TypeError) as error:
             raise self._unreadable(error) from error
 
-    def attach(self, patience: float, stop: list[int]) -> Segment:
+    def attach(self, patience: float, stop: list[int], activity: Activity) -> Segment:
         """Ask, and wait for the answer; ``stop`` is filled where the user does not want to wait any more. Raises UserError."""
         self.ask()
+        activity.say(f"waiting for the training of run {self._run.name} to answer …")
         try:
             until = time.monotonic() + patience
             while (segment := self.answer()) is None:

@@ -11,13 +11,13 @@ import contextlib
 import os
 import socket
 import threading
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shared_store.files import read_json, write_json
 from shared_store.layout import Run
 from worker.learning.reporter import Gate
 from worker.simulation.episodes import WATCHED
+from worker.telemetry.asking import answer_of, is_alive, request_of
 from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap
 
@@ -30,29 +30,6 @@ DRAIN_SECONDS = 0.02
 """Between two looks at the tap, while somebody reads."""
 NEWEST_SECONDS = 0.05
 """The same, for a reader to whom the newest control step is enough: a screen."""
-
-
-def request_of(run: Run) -> Path:
-    """Where a reader asks."""
-    return run.telemetry / "request.json"
-
-
-def answer_of(run: Run) -> Path:
-    """Where the training answers."""
-    return run.telemetry / "tap.json"
-
-
-def is_alive(host: object, process: object) -> bool:
-    """Whether a process of this machine runs; of another machine nobody here knows, which counts as no."""
-    if host != socket.gethostname() or not isinstance(process, int) or process <= 0:
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        pass  # another user's
-    return True
 
 
 class Attending:
@@ -81,7 +58,7 @@ class Attending:
         """Between two iterations: open the tap where somebody has asked for it; returns whether graphs have to be recorded anew."""
         if not self._wanted:
             return False
-        tap = Tap(self._task, self._wanted)
+        tap = Tap.within(self._task, self._wanted)
         tap.open()
         self._tap, self._wanted = tap, 0
         return True
@@ -142,7 +119,7 @@ class Attending:
         segment = Segment.create(self._tap.layout)
         self._segment, self._reader = segment, (request["host"], request["process"])
         self._newest = request.get("newest") is True
-        self._say(path=str(segment.path), layout=self._tap.layout.to_json())
+        self._say(path=str(segment.path), layout=self._tap.layout.to_json(), note=self._tap.left_out)
         return reading
 
     def _say(self, **answer: Any) -> None:

@@ -13,16 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from shared_store.files import read_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
 from shared_store.metrics import history_of
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
+from worker.telemetry.progress import Activity, loading
 from worker.telemetry.recording import Recording, recover
-from worker.telemetry.rows import Layout, Rows
+from worker.telemetry.rows import Rows
 from worker.telemetry.segment import Segment
 
 if TYPE_CHECKING:
@@ -44,24 +43,30 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         UserError: It can't be recorded; one line says why.
     """
     stop: list[int] = []
+    activity = Activity()
     before = signal.signal(signal.SIGINT, lambda number, _: stop.append(number))
     asking = Asking(run, worlds, f"record its newest checkpoint: muster record {run.name} -o FILE.mcap")
     try:
-        segment = asking.attach(patience, stop)
+        segment = asking.attach(patience, stop, activity)
     except UserError:
         signal.signal(signal.SIGINT, before)
+        activity.end()
         raise
     there = asking.worlds
     try:
+        activity.say(loading(run, there))
         recording = _open(run, there, output, {"job": job})
         if there < worlds:
             print(f"note: the training has {there} worlds on its main rank", flush=True)
+        if asking.note:
+            print(f"note: {asking.note}", flush=True)
         log = LogFollower(run, job)
         for _ in log.drain():
             pass  # what was said before the recording began
         segment.skip()
         for rows in _rows(segment, asking, stop):
             recording.write(rows)
+            activity.count("recording: episode", recording.ended(episodes), episodes * there)
             for line in log.poll():
                 recording.say(line.text, name=f"rank {line.rank}" if line.rank is not None else f"node {line.node}")
             if recording.complete(episodes):
@@ -69,6 +74,7 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         recording.finish()
         return recording
     finally:
+        activity.end()
         signal.signal(signal.SIGINT, before)
         asking.withdraw()
 
@@ -81,9 +87,7 @@ def _rows(segment: Segment, asking: Asking, stop: list[int]) -> Iterator[Rows]:
         over = segment.closed or asking.is_answered_by_nobody
         for rows in segment.take():
             first = rows.first if first is None else first
-            layout = Layout(**{**vars(segment.layout), "worlds": worlds})
-            values, marks = rows.values[:, :worlds], rows.marks[:, :worlds]
-            yield Rows(layout, rows.first - first, values, np.ascontiguousarray(marks), rows.lost)
+            yield rows.of_worlds(worlds, since=first)
         if over:
             return
         time.sleep(0.02)
@@ -132,12 +136,16 @@ def main() -> int:
     given = parser.parse_args()
     try:
         if given.recover:
-            path, count = recover(given.recover)
+            made = recover(given.recover)
+            if made is None:
+                print(f"{given.recover}: it is whole already; nothing had to be recovered", flush=True)
+                return 0
+            path, count = made
             print(f"recovered: {count} messages; written: {path}", flush=True)
             return 0
-        made = record(Run(given.run), given.job, given.worlds, given.episodes, given.output)
-        lost = f", {made.lost} steps were lost" if made.lost else ""
-        print(f"recorded: {made.steps} steps, {made.episodes} episodes{lost}\nwritten: {made.path}", flush=True)
+        done = record(Run(given.run), given.job, given.worlds, given.episodes, given.output)
+        lost = f", {done.lost} steps were lost" if done.lost else ""
+        print(f"recorded: {done.steps} steps, {done.episodes} episodes{lost}\nwritten: {done.path}", flush=True)
         return 0
     except UserError as error:
         print(f"muster: {error}", file=sys.stderr, flush=True)

@@ -88,28 +88,14 @@ class Recording:
         except OSError as error:
             raise self._full(error) from error
 
-    def write(self, rows: Rows, images: Mapping[str, np.ndarray] | None = None) -> None:
-        """Add control steps.
-
-        Args:
-            rows: The next ones.
-            images: Of the last of them, by camera: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
-
-        Raises:
-            UserError: There is no space left, or the volume is gone.
-        """
+    def write(self, rows: Rows) -> None:
+        """Add the next control steps. Raises UserError where there is no space left, or the volume is gone."""
         try:
             self.lost += rows.lost
             if rows.lost:
                 self._whole[:] = self._just_ended[:] = False
             for step in range(len(rows)):
                 self._write_step(rows, step)
-            for camera, seen in (images or {}).items():
-                now = self._time(rows.first + len(rows), rows.layout.control_hz)
-                for world, image in enumerate(seen):
-                    topic = f"/world_{world}/{camera}/image/compressed"
-                    data = messages.picture(now, f"world_{world}", image)
-                    self._add(topic, "sensor_msgs/msg/CompressedImage", now, data)
             if time.monotonic() - self._flushed > _FLUSH_SECONDS:
                 self._flush()
         except OSError as error:
@@ -117,7 +103,11 @@ class Recording:
 
     def complete(self, episodes: int) -> bool:
         """Whether each world has ended so many episodes."""
-        return bool((self._ended >= episodes).all())
+        return self.ended(episodes) == episodes * self._stage.worlds
+
+    def ended(self, episodes: int) -> int:
+        """How many episodes have ended, of each world at most ``episodes``."""
+        return int(np.minimum(self._ended, episodes).sum())
 
     def say(self, text: str, level: int = 20, name: str = "muster") -> None:
         """Add a line of the job's log, at the time of the last step."""
@@ -190,6 +180,10 @@ class Recording:
                 data = messages.joint_states(now, frame, stage.joints, positions, velocities)
                 self._add(f"/{frame}/joint_states", "sensor_msgs/msg/JointState", now, data)
             self._write_world(rows, step, world, now)
+        for camera, seen in rows.pictures(step).items():
+            for world, image in enumerate(seen):
+                data = messages.picture(now, f"world_{world}", image)
+                self._add(f"/world_{world}/{camera}/image/compressed", "sensor_msgs/msg/CompressedImage", now, data)
         self.steps = number
 
     def _write_world(self, rows: Rows, step: int, world: int, now: int) -> None:
@@ -273,16 +267,16 @@ def _qos(topic: str) -> dict[str, str]:
     return {"offered_qos_profiles": json.dumps([_LATCHED])} if latched else {}
 
 
-def recover(partial: Path) -> tuple[Path, int]:
+def recover(partial: Path) -> tuple[Path, int] | None:
     """Make a readable file of one that was cut short, beside it; returns its path and how many messages it has.
 
-    All chunks that were written whole are kept. The cut file stays as it is.
+    All chunks that were written whole are kept. The cut file stays as it is. Of a file that is whole nothing is made: None.
 
     Raises:
-        UserError: There is no such file, or nothing in it can be read.
+        UserError: There is no such file, or no control step in it can be read.
     """
     from mcap.exceptions import McapError
-    from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+    from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata, Schema
     from mcap.stream_reader import StreamReader
     from mcap.writer import CompressionType, Writer
 
@@ -290,12 +284,12 @@ def recover(partial: Path) -> tuple[Path, int]:
         raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
     name = partial.name.removesuffix(PARTIAL)
     target = partial.with_name(name if name != partial.name else f"{partial.stem}-recovered{partial.suffix}")
-    if target.exists():
-        raise UserError(f"{target}: it exists already; move it away first")
     hidden = target.with_name(f".{target.name}.tmp")
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
-    count = 0
+    stepping: set[int] = set()
+    count = steps = 0
+    whole = False
     try:
         with partial.open("rb") as source, hidden.open("wb") as made:
             writer = Writer(made, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
@@ -310,20 +304,29 @@ def recover(partial: Path) -> tuple[Path, int]:
                     elif isinstance(record, Channel) and record.id not in channels:
                         own = record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
                         channels[record.id] = writer.register_channel(*own)
+                        stepping |= {record.id} if record.topic.endswith("/rl/step") else set()
                     elif isinstance(record, Message):
                         where = channels[record.channel_id], record.log_time, record.data, record.publish_time
                         writer.add_message(*where, record.sequence)
-                        count += 1
+                        count, steps = count + 1, steps + (record.channel_id in stepping)
                     elif isinstance(record, Attachment):
                         told = record.create_time, record.log_time, record.name, record.media_type, record.data
                         writer.add_attachment(*told)
                     elif isinstance(record, Metadata):
                         writer.add_metadata(record.name, record.metadata)
+                    elif isinstance(record, Footer):
+                        whole = True
             except (McapError, EOFError, ValueError, KeyError, struct.error):
                 pass  # here it was cut
             if not started:
                 raise UserError(f"{partial}: it does not begin as an MCAP file does; nothing can be recovered")
+            if whole:
+                return None
+            if not steps:
+                raise UserError(f"{partial}: it ends before the first control step; there is nothing to recover")
             writer.finish()
+        if target.exists():
+            raise UserError(f"{target}: it exists already; move it away first")
         os.replace(hidden, target)
     except OSError as error:
         raise UserError(f"{target}: it can't be written ({error.strerror or error})") from error

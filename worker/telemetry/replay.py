@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 import struct
 from collections import defaultdict
 from collections.abc import Iterator
@@ -19,6 +21,8 @@ from worker.telemetry.screen import Look
 
 BATCH = 256
 """Control steps that are handed out together."""
+_IMAGES = re.compile(r"/world_(\d+)/(.+)/image/compressed")
+"""World and camera."""
 
 
 @dataclass
@@ -32,6 +36,7 @@ class Part:
         rewards: Weighted terms, mean of the worlds; shape ``(steps, terms)``.
         said: Lines of the log: time [ns], who, text.
         returns: Of episodes that ended: time [ns], return.
+        images: By camera and step, PNG of each world; steps of which none is there, or not of every world, have none.
     """
 
     times: np.ndarray
@@ -40,6 +45,16 @@ class Part:
     rewards: np.ndarray
     said: list[tuple[int, str, str]]
     returns: list[tuple[int, float]]
+    images: dict[str, dict[int, list[bytes]]] = field(default_factory=dict)
+
+    def pictures(self, camera: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Times, numbers and images of the steps of which a camera has images, as :meth:`worker.telemetry.screen.Screen.pictures` takes them."""
+        from PIL import Image
+
+        found = self.images.get(camera, {})
+        seen = [np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in worlds]) for worlds in found.values()]
+        places = list(found)
+        return self.times[places], self.steps[places], seen
 
 
 class Replay:
@@ -64,8 +79,12 @@ class Replay:
         shapes: dict[str, bytes] = {}
         places: list[tuple[float, float, float]] = []
         links: list[str] = []
+        cameras: list[str] = []
+        terms: tuple[str, ...] | None = None
         with self._ours():
             for kind, topic, _, data in self._messages():
+                if topic == "/tf" and terms is not None:
+                    break  # the first step is over
                 if topic == "/tf_static":
                     for each in _decoded(kind, data).transforms:
                         where = each.transform.translation
@@ -77,10 +96,14 @@ class Replay:
                 elif topic == "/tf":
                     links = [each.child_frame_id for each in _decoded(kind, data).transforms]
                 elif topic == "/world_0/rl/step" and shapes and places:
-                    own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
-                    self.look = Look(own, shapes, np.array(places), tuple(_decoded(kind, data).reward_names))
-                    self.cut = False
-                    return
+                    terms = tuple(_decoded(kind, data).reward_names)
+                elif found := _IMAGES.fullmatch(topic):
+                    cameras += [found[2]] if found[1] == "0" else []
+        if terms is not None:
+            own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
+            self.look = Look(own, shapes, np.array(places), terms, tuple(cameras))
+            self.cut = False
+            return
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
@@ -99,6 +122,8 @@ class Replay:
                     found.said.append((time, line.name, line.msg))
                 elif topic.endswith("/rl/step") and found.times:
                     found.step(time, _decoded(kind, data))
+                elif (seen := _IMAGES.fullmatch(topic)) and found.times:
+                    found.images[seen[2]][len(found.times) - 1].append(bytes(_decoded(kind, data).data))
         if found.times:
             yield self._part(found)
 
@@ -106,7 +131,12 @@ class Replay:
         first, self.count = self.count + 1, self.count + len(found.times)
         steps = np.arange(first, self.count + 1)
         rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
-        return Part(np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns)
+        worlds = len(self.look.places)
+        images = {
+            camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
+            for camera, steps in found.images.items()
+        }
+        return Part(np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns, images)
 
     @contextmanager
     def _ours(self) -> Iterator[None]:
@@ -165,6 +195,9 @@ class _Gathered:
     rewards: list[list[np.ndarray]] = field(default_factory=list)
     said: list[tuple[int, str, str]] = field(default_factory=list)
     returns: list[tuple[int, float]] = field(default_factory=list)
+    images: defaultdict[str, defaultdict[int, list[bytes]]] = field(
+        default_factory=lambda: defaultdict(lambda: defaultdict(list))
+    )
 
     def move(self, time: int, transforms: list[Any]) -> None:
         parts = [(each.transform.translation, each.transform.rotation) for each in transforms]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 import warp
 
@@ -88,7 +87,7 @@ class Rollout:
 
     def steps(self, most: int) -> Iterator[Rows]:
         """Act for at most ``most`` control steps from a fresh reset; after each of them its row."""
-        tap = Tap(self.task, self.task.world_count, rows=16)
+        tap = Tap(self.task, self.task.world_count, rows=2)  # one is read while the next is written
         tap.open()
         reading = Reading(tap)
         self.task.reset()
@@ -101,15 +100,6 @@ class Rollout:
                 yield reading.take()
         finally:
             tap.close()
-
-    def images(self) -> dict[str, np.ndarray]:
-        """The newest frame of each camera that the policy sees through: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
-        found = {}
-        for name, tensor in self.task.groups.items():
-            if tensor.ndim == 4:
-                frame = tensor.permute(0, 2, 3, 1).cpu().numpy()
-                found[name] = frame[..., :3] if frame.shape[-1] % 3 == 0 else frame[..., 0]
-        return {name: np.ascontiguousarray(frame) for name, frame in found.items()}
 
     def facts(self) -> dict[str, str]:
         """For the metadata of a recording."""

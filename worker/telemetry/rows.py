@@ -1,9 +1,9 @@
-"""What the tap keeps of a world in one control step: one row of numbers, and what each of them is."""
+"""What the tap keeps of a world in one control step: one row of numbers, what each of them is, and the images that the policy sees."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,7 @@ class Layout:
         actions: Names.
         terms: Names of the reward terms.
         control_hz: Control steps of a simulated second.
+        images: The observation groups of images that are kept: name, channels (3: red, green and blue; 1), height and width [px].
     """
 
     worlds: int
@@ -42,20 +43,27 @@ class Layout:
     actions: tuple[str, ...]
     terms: tuple[str, ...]
     control_hz: float
+    images: tuple[tuple[str, int, int, int], ...] = ()
 
     @classmethod
-    def of(cls, task: Task, worlds: int, rows: int) -> Layout:
-        """That of a task's first ``worlds`` worlds."""
+    def of(cls, task: Task, worlds: int, rows: int, images: bool = True) -> Layout:
+        """That of a task's first ``worlds`` worlds, with the images of its cameras or without."""
         arrays = task.worlds.arrays
         actions = tuple(task.action_names) if not task.discrete else ("choice",)
         names = tuple(task.observation_names), actions, tuple(task.reward_terms)
-        return cls(worlds, rows, arrays.joint_q.shape[1], arrays.joint_qd.shape[1], *names, task.config.control_hz)
+        numbers = worlds, rows, arrays.joint_q.shape[1], arrays.joint_qd.shape[1]
+        shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items() if tensor.ndim == 4}
+        # the present frame comes first; of masks and the like that are not colours, the first channel is shown
+        seen = (
+            tuple((name, 3 if shape[0] % 3 == 0 else 1, *shape[1:]) for name, shape in shapes.items()) if images else ()
+        )
+        return cls(*numbers, *names, task.config.control_hz, seen)
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Layout:
         """What :meth:`to_json` wrote."""
         names = {name: tuple(value[name]) for name in ("observations", "actions", "terms")}
-        return cls(**{**value, **names})
+        return cls(**{**value, **names, "images": tuple(map(tuple, value["images"]))})
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -73,6 +81,11 @@ class Layout:
         """Columns of a row."""
         return self.ends[-1]
 
+    @property
+    def image_bytes(self) -> int:
+        """Bytes of the images of a world in one control step."""
+        return sum(channels * height * width for _, channels, height, width in self.images)
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -84,6 +97,8 @@ class Rows:
         values: Shape ``(steps, worlds, layout.width)``, float32.
         marks: Shape ``(steps, worlds, len(MARKS))``, int32.
         lost: Steps before ``first`` that were overwritten before they were read.
+        images: The present frames of ``layout.images`` one after the other, shape ``(steps, worlds, layout.image_bytes)``, uint8; None
+            where the layout has none.
     """
 
     layout: Layout
@@ -91,6 +106,7 @@ class Rows:
     values: np.ndarray
     marks: np.ndarray
     lost: int = 0
+    images: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.values)
@@ -133,3 +149,22 @@ class Rows:
     def mark(self, name: str) -> np.ndarray:
         """One of :data:`MARKS`, shape ``(steps, worlds)``."""
         return self.marks[:, :, MARKS.index(name)]
+
+    def pictures(self, step: int) -> dict[str, np.ndarray]:
+        """What each camera saw after a step, by its group: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
+        found: dict[str, np.ndarray] = {}
+        if self.images is None:
+            return found
+        start = 0
+        for name, channels, height, width in self.layout.images:
+            end = start + channels * height * width
+            frame = self.images[step, :, start:end].reshape(-1, channels, height, width)
+            found[name] = np.ascontiguousarray(np.moveaxis(frame, 1, -1) if channels == 3 else frame[:, 0])
+            start = end
+        return found
+
+    def of_worlds(self, worlds: int, since: int = 0) -> Rows:
+        """Those of the first ``worlds`` worlds, with steps numbered from step ``since``."""
+        images = None if self.images is None else self.images[:, :worlds]
+        parts = self.values[:, :worlds], self.marks[:, :worlds], self.lost, images
+        return Rows(replace(self.layout, worlds=worlds), self.first - since, *parts)

@@ -6,6 +6,8 @@ On the timeline ``time`` are wall-clock times; of a recording its own ones. ``it
 from __future__ import annotations
 
 import contextlib
+import io
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is s
 
 import rerun as rr
 import rerun.blueprint as rrb
+from PIL import Image
 
 _ROOT, _MIDDLE = "world", "middle"
 """Frames: of all worlds, and of what the eye follows."""
@@ -43,12 +46,14 @@ class Look:
         shapes: Binary glTF by link; ``""``: what is fixed to a world, ``"ground"``: what no world has for itself.
         places: Origins of the worlds [m], shape ``(worlds, 3)``.
         terms: Names of the reward terms.
+        cameras: Names of the observation groups of images.
     """
 
     links: tuple[str, ...]
     shapes: Mapping[str, bytes]
     places: np.ndarray
     terms: tuple[str, ...]
+    cameras: tuple[str, ...] = ()
 
 
 class Screen:
@@ -71,7 +76,7 @@ class Screen:
         self._rr.send_recording_name(title)
         self._stand()
         center, position = _eye(self._placed(start[None])[0])
-        self._rr.send_blueprint(_blueprint(center, position, live), make_default=True)
+        self._rr.send_blueprint(_blueprint(center, position, look.cameras, live), make_default=True)
 
     def frames(
         self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
@@ -103,6 +108,30 @@ class Screen:
         self._terms.append((times, steps, rewards, iteration))
         if sum(len(each[0]) for each in self._terms) >= _TERMS:
             self._send_terms()
+
+    def pictures(
+        self,
+        camera: str,
+        times: np.ndarray,
+        steps: np.ndarray,
+        seen: Sequence[np.ndarray],
+        iteration: int | None = None,
+    ) -> None:
+        """Show what a camera saw in all worlds, as one picture of tiles.
+
+        Args:
+            camera: One of the look's.
+            times: [ns since 1970], shape ``(steps,)``.
+            steps: Their numbers.
+            seen: Of each step: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
+            iteration: Of the training, where there is one.
+        """
+        if not len(times):
+            return
+        columns = rr.EncodedImage.columns(
+            blob=[_png(tiled(each)) for each in seen], media_type=["image/png"] * len(seen)
+        )
+        self._rr.send_columns(f"images/{camera}", _index(times, steps, iteration), columns)
 
     def _send_terms(self) -> None:
         """Several steps at once: each chunk that is sent costs the browser about the same, whatever is in it."""
@@ -171,6 +200,23 @@ class Screen:
         return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
 
 
+def tiled(images: np.ndarray) -> np.ndarray:
+    """Images of worlds side by side in rows that are about as many as columns, world 0 at the upper left; shape ``(height, width[, 3])``."""
+    worlds, height, width = images.shape[:3]
+    columns = math.ceil(math.sqrt(worlds))
+    rows = math.ceil(worlds / columns)
+    grid = np.zeros((rows * columns, *images.shape[1:]), np.uint8)
+    grid[:worlds] = images
+    grid = grid.reshape(rows, columns, height, width, -1).swapaxes(1, 2).reshape(rows * height, columns * width, -1)
+    return grid if images.ndim == 4 else grid[..., 0]
+
+
+def _png(image: np.ndarray) -> np.ndarray:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
+    return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
 def _index(times: np.ndarray, steps: np.ndarray, iteration: int | None, rows: int = 1) -> list[rr.TimeColumn]:
     """The place of control steps on the timelines, with so many rows of each."""
     index = [rr.TimeColumn("time", timestamp=np.repeat(times, rows).astype("datetime64[ns]"))]
@@ -192,7 +238,7 @@ def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
 
 
-def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blueprint:
+def _blueprint(center: np.ndarray, position: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Blueprint:
     recent: Any = rrb.VisibleTimeRange(
         "time",
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
@@ -211,7 +257,9 @@ def _blueprint(center: np.ndarray, position: np.ndarray, live: bool) -> rrb.Blue
             tracking_entity="/worlds/middle",
         ),
     )
+    images = [rrb.Spatial2DView(name=f"Images: {camera}", origin=f"/images/{camera}") for camera in cameras]
     curves = rrb.Vertical(
+        *([rrb.Horizontal(*images)] if images else []),
         rrb.TimeSeriesView(name="Return", contents="/return/**"),
         rrb.TimeSeriesView(name="Reward terms", contents="/terms", time_ranges=recent),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import mmap
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,8 +40,9 @@ class Segment:
     def __init__(self, path: Path, layout: Layout, file: int) -> None:
         self.path, self.layout = path, layout
         size, worlds = layout.rows, layout.worlds
-        shapes = (size, worlds, layout.width), (size, worlds, len(MARKS))
-        lengths = 8 * _HEADER, 8 * size, 4 * int(np.prod(shapes[0])), 4 * int(np.prod(shapes[1]))
+        shapes = (size, worlds, layout.width), (size, worlds, len(MARKS)), (size, worlds, layout.image_bytes)
+        counts = [int(np.prod(shape)) for shape in shapes]
+        lengths = 8 * _HEADER, 8 * size, 4 * counts[0], 4 * counts[1], counts[2]
         try:
             if os.fstat(file).st_size != sum(lengths):
                 raise ValueError(f"{path}: it is not the shared memory of such a tap")
@@ -50,8 +52,11 @@ class Segment:
         starts = np.cumsum((0, *lengths)).tolist()
         self._header = np.frombuffer(self._memory, np.int64, _HEADER)
         self._numbers = np.frombuffer(self._memory, np.int64, size, starts[1])
-        self._values = np.frombuffer(self._memory, np.float32, int(np.prod(shapes[0])), starts[2]).reshape(shapes[0])
-        self._marks = np.frombuffer(self._memory, np.int32, int(np.prod(shapes[1])), starts[3]).reshape(shapes[1])
+        self._values = np.frombuffer(self._memory, np.float32, counts[0], starts[2]).reshape(shapes[0])
+        self._marks = np.frombuffer(self._memory, np.int32, counts[1], starts[3]).reshape(shapes[1])
+        self._images = (
+            np.frombuffer(self._memory, np.uint8, counts[2], starts[4]).reshape(shapes[2]) if counts[2] else None
+        )
         self._next = 0
         """What is read next, counted in rows that were written."""
         self._step: int | None = None
@@ -59,13 +64,15 @@ class Segment:
 
     @classmethod
     def create(cls, layout: Layout) -> Segment:
-        """A new one, in memory where the machine has a file system for that. Raises OSError."""
+        """A new one, in memory where the machine has a file system for that with enough space (a container often has 64 MB). Raises OSError."""
         shared = Path("/dev/shm")
-        file, name = tempfile.mkstemp(prefix="muster-tap-", dir=shared if os.access(shared, os.W_OK) else None)
-        row = 8 + 4 * layout.worlds * (layout.width + len(MARKS))
+        row = 8 + layout.worlds * (4 * (layout.width + len(MARKS)) + layout.image_bytes)
+        size = 8 * _HEADER + layout.rows * row
+        fits = os.access(shared, os.W_OK) and shutil.disk_usage(shared).free > size
+        file, name = tempfile.mkstemp(prefix="muster-tap-", dir=shared if fits else None)
         try:
             # takes the memory now: a write to a mapping that finds none is a SIGBUS
-            os.posix_fallocate(file, 0, 8 * _HEADER + layout.rows * row)
+            os.posix_fallocate(file, 0, size)
         except OSError:
             os.close(file)
             os.unlink(name)
@@ -94,6 +101,8 @@ class Segment:
             self._numbers[places] = np.arange(rows.first + part.start, rows.first + part.stop)
             self._values[places] = rows.values[part]
             self._marks[places] = rows.marks[part]
+            if self._images is not None and rows.images is not None:
+                self._images[places] = rows.images[part]
             self._header[_WRITTEN] = end
 
     def skip(self) -> None:
@@ -106,9 +115,11 @@ class Segment:
         first = max(self._next, written - size)
         places = np.arange(first, written) % size
         numbers, values, marks = self._numbers[places], self._values[places], self._marks[places]
+        images = None if self._images is None else self._images[places]
         whole = min(max(0, int(self._header[_BEGUN]) - size - first), len(numbers))
         self._next = written
         numbers, values, marks = numbers[whole:], values[whole:], marks[whole:]
+        images = None if images is None else images[whole:]
         breaks = [0, *(np.flatnonzero(np.diff(numbers) != 1) + 1).tolist(), len(numbers)]
         for start, end in itertools.pairwise(breaks):
             if start == end:
@@ -116,7 +127,8 @@ class Segment:
             step = int(numbers[start])
             lost = 0 if self._step is None else step - self._step
             self._step = step + end - start
-            yield Rows(self.layout, step, values[start:end], marks[start:end], lost)
+            seen = None if images is None else images[start:end]
+            yield Rows(self.layout, step, values[start:end], marks[start:end], lost, seen)
 
     def newest(self) -> Rows | None:
         """The newest control step; None where there is none since the last call. What it passes over counts as lost."""

@@ -7,6 +7,7 @@ written. Body poses are not among the numbers: they follow from the joint coordi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,10 @@ wp.set_module_options({"enable_backward": False})
 
 ROWS = 1024
 """Control steps that the ring holds."""
+IMAGE_MEMORY = 64 << 20
+"""Bytes that the images of a training's ring may take, on the device and, while somebody reads, twice on the host."""
+LEAST_ROWS = 32
+"""A ring of fewer control steps is overwritten before it is read: then images are left out."""
 
 
 @wp.kernel
@@ -72,6 +77,18 @@ def _count(dones: wp.array(dtype=wp.bool), ended: wp.array(dtype=wp.int32), coun
     count[0] = count[0] + wp.int64(1)
 
 
+@wp.kernel
+def _keep_image(
+    source: wp.array2d(dtype=wp.uint8),
+    start: int,
+    count: wp.array(dtype=wp.int64),
+    images: wp.array3d(dtype=wp.uint8),
+):
+    """One byte of one world's present frame, which comes first in its row of ``source``."""
+    world, byte = wp.tid()
+    images[int(count[0] % wp.int64(images.shape[0])), world, start + byte] = source[world, byte]
+
+
 class Tap:
     """The ring of a task's first worlds; :meth:`open` makes the task fill it.
 
@@ -79,32 +96,55 @@ class Tap:
         task: Whose worlds.
         worlds: How many of them.
         rows: Control steps that the ring holds.
+        images: Whether it holds the images that the policy sees, too.
 
     Raises:
         ValueError: ``worlds`` is not from 1 to that of the task, at most ``WATCHED``.
     """
 
-    def __init__(self, task: Task, worlds: int, rows: int = ROWS) -> None:
+    def __init__(self, task: Task, worlds: int, rows: int = ROWS, images: bool = True) -> None:
         most = min(WATCHED, task.world_count)
         if not 1 <= worlds <= most:
             raise ValueError(f"worlds is {worlds}; of these worlds 1 to {most} can be watched")
-        self.layout = Layout.of(task, worlds, rows)
+        self.layout = Layout.of(task, worlds, rows, images)
         self._task, self.device = task, task.device
+        self._seen = [wp.from_torch(task.groups[name].view(task.world_count, -1)) for name, *_ in self.layout.images]
         with on_torch_stream(self.device):
             self._values = wp.zeros((rows, worlds, self.layout.width), dtype=wp.float32, device=self.device)
             self._marks = wp.zeros((rows, worlds, len(MARKS)), dtype=wp.int32, device=self.device)
+            self._images = wp.zeros((rows, worlds, self.layout.image_bytes), dtype=wp.uint8, device=self.device)
             self._ended = wp.zeros(worlds, dtype=wp.int32, device=self.device)
             self._counter = wp.zeros(1, dtype=wp.int64, device=self.device)
             self._ends = wp.array(self.layout.ends, dtype=wp.int32, device=self.device)
         self.values: torch.Tensor = wp.to_torch(self._values)
         self.marks: torch.Tensor = wp.to_torch(self._marks)
+        self.images: torch.Tensor = wp.to_torch(self._images)
         self.count: torch.Tensor = wp.to_torch(self._counter)
+
+    @classmethod
+    def within(cls, task: Task, worlds: int) -> Tap:
+        """A ring whose images take at most :data:`IMAGE_MEMORY`: with fewer rows, or without images where too few would be left."""
+        step = worlds * Layout.of(task, worlds, ROWS).image_bytes
+        rows = min(ROWS, IMAGE_MEMORY // step) if step else ROWS
+        return cls(task, worlds, rows) if rows >= LEAST_ROWS else cls(task, worlds, images=False)
+
+    @property
+    def left_out(self) -> str:
+        """What is said of images that are too large for the ring; nothing where none is missing."""
+        worlds, most = self.layout.worlds, IMAGE_MEMORY // LEAST_ROWS
+        step = worlds * Layout.of(self._task, worlds, ROWS).image_bytes
+        if step == worlds * self.layout.image_bytes:
+            return ""
+        return (
+            f"images are left out: of {worlds} worlds they take {step / 1e6:.1f} MB in each control step, and {most / 1e6:.1f} MB is the "
+            "limit; fewer worlds (--worlds) or smaller images fit"
+        )
 
     def open(self) -> None:
         """Have the task fill the ring from its next step on. A graph that holds the task's step has to be recorded anew."""
         with on_torch_stream(self.device):
             self._fill()  # loads the kernels, which a capture can't do everywhere
-            for array in (self._values, self._marks, self._ended, self._counter):
+            for array in (self._values, self._marks, self._images, self._ended, self._counter):
                 array.zero_()
         self._task.watch(self._fill)
 
@@ -118,6 +158,13 @@ class Tap:
         inputs = [self._ends, episodes.observations, self._task.worlds.arrays, episodes]
         outputs = [self._values, self._marks]
         wp.launch(_fill, dim=shape, inputs=[*inputs, self._ended, self._counter], outputs=outputs, device=self.device)
+        start = 0
+        for source, (_, *sizes) in zip(self._seen, self.layout.images, strict=True):
+            dim = (self.layout.worlds, math.prod(sizes))
+            wp.launch(
+                _keep_image, dim, inputs=[source, start, self._counter], outputs=[self._images], device=self.device
+            )
+            start += dim[1]
         wp.launch(_count, dim=1, inputs=[episodes.dones, self._ended, self._counter], device=self.device)
 
 
@@ -135,6 +182,8 @@ class Reading:
         pinned = {"pin_memory": self._cuda}
         self._values = torch.empty(tap.values.shape, dtype=torch.float32, **pinned)
         self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, **pinned)
+        self._images = torch.empty(tap.images.shape, dtype=torch.uint8, **pinned)
+        self._pairs = (self._values, tap.values), (self._marks, tap.marks), (self._images, tap.images)
         self._counts = torch.zeros(2, dtype=torch.int64, **pinned)
         self.next = 0
         """Number of the step that is read next."""
@@ -152,14 +201,15 @@ class Reading:
         self.next = there
         places = np.arange(first, there) % size
         values, marks = self._values.numpy()[places], self._marks.numpy()[places]
-        return Rows(self._tap.layout, first, values, marks, first - started)
+        images = self._images.numpy()[places] if self._tap.layout.images else None
+        return Rows(self._tap.layout, first, values, marks, first - started, images)
 
     def _copy(self, first: int, end: int) -> None:
         size = self._tap.layout.rows
         while first < end:
             start = first % size
             count = min(end - first, size - start)
-            for target, source in ((self._values, self._tap.values), (self._marks, self._tap.marks)):
+            for target, source in self._pairs:
                 target[start : start + count].copy_(source[start : start + count], non_blocking=True)
             first += count
         self._counts[1:2].copy_(self._tap.count, non_blocking=True)

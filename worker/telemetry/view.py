@@ -25,6 +25,7 @@ from shared_store.logs import LogFollower, LogLine
 from shared_store.metrics import history_of
 from worker.errors import UserError
 from worker.telemetry.page import Page, need_rerun
+from worker.telemetry.progress import Activity, loading
 from worker.telemetry.rows import Rows
 
 if TYPE_CHECKING:
@@ -49,19 +50,23 @@ class Training:
         job: Whose log is shown.
         worlds: How many are wanted.
         stop: Filled when the view is to end.
+        activity: Which tells what takes long.
     """
 
-    def __init__(self, run: Run, job: str, worlds: int, stop: list[int]) -> None:
+    def __init__(self, run: Run, job: str, worlds: int, stop: list[int], activity: Activity) -> None:
         from worker.telemetry.asking import PATIENCE, Asking
         from worker.telemetry.live import stage_of
 
         self._run, self._stop = run, stop
         instead = f"see its newest checkpoint: muster view {run.name}"
         self._asking = Asking(run, worlds, instead, newest=True)
-        self._segment = self._asking.attach(PATIENCE, stop)
+        self._segment = self._asking.attach(PATIENCE, stop, activity)
         try:
+            activity.say(loading(run, self._asking.worlds))
             if self._asking.worlds < worlds:
                 print(f"note: the training has {self._asking.worlds} worlds on its main rank", flush=True)
+            if self._asking.note:
+                print(f"note: {self._asking.note}", flush=True)
             self._stage, _ = stage_of(run, self._asking.worlds)
         except BaseException:
             self._asking.withdraw()
@@ -87,6 +92,8 @@ class Training:
                             closing.callback(screen.close)
                         now, steps = np.array([time.time_ns()]), np.array([rows.first + len(rows)])
                         screen.frames(now, steps, poses, rows.terms[-1:].mean(1), self._iteration)
+                        for camera, seen in rows.pictures(-1).items():
+                            screen.pictures(camera, now, steps, [seen], self._iteration)
                         self.frames += 1
                     if screen is not None and began - looked > _LOOK_SECONDS:
                         looked = began
@@ -115,7 +122,7 @@ class Training:
         worlds = self._stage.worlds
         if rows.layout.worlds < worlds or rows.layout.coordinates != self._stage.model.joint_coord_count // worlds:
             raise UserError("the training went on with other worlds; start the view again")
-        return Rows(rows.layout, rows.first, rows.values[:, :worlds], rows.marks[:, :worlds], rows.lost)
+        return rows.of_worlds(worlds)
 
     def _open(self, page: Page, rows: Rows, poses: np.ndarray) -> Screen:
         from worker.telemetry.screen import Screen
@@ -187,7 +194,10 @@ class Policy:
                 if number % every == 0:
                     page.check()
                     poses = self._stage.pose(rows.coordinates[-1])[None]
-                    screen.frames(np.array([time.time_ns()]), np.array([number]), poses, rows.terms[-1:].mean(1))
+                    now, steps = np.array([time.time_ns()]), np.array([number])
+                    screen.frames(now, steps, poses, rows.terms[-1:].mean(1))
+                    for camera, seen in rows.pictures(-1).items():
+                        screen.pictures(camera, now, steps, [seen])
                     self.frames += 1
                 self._count(screen, rows)
                 if self._stop or (self._episodes is not None and (self._ended >= self._episodes).all()):
@@ -226,7 +236,7 @@ class Policy:
             self._sums[world], self._ended[world] = 0.0, self._ended[world] + 1
 
 
-def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int]) -> None:
+def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int], activity: Activity) -> None:
     """Show a recording until the user ends it. Raises UserError where it can't be read."""
     if path.suffix == ".rrd":
         with start(_checked(path)) as page:
@@ -236,6 +246,7 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int])
     from worker.telemetry.screen import Screen
 
     replay = Replay(path)
+    activity.say(f"reading {path.name} …")
     with start(None) as page, ExitStack() as closing:
         screen: Screen | None = None
         for part in replay.parts():
@@ -244,6 +255,8 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int])
                 screen = Screen(page.server, path.name, replay.look, part.poses[0], live=False)
                 closing.callback(screen.close)
             screen.frames(part.times, part.steps, part.poses, part.rewards)
+            for camera in replay.look.cameras:
+                screen.pictures(camera, *part.pictures(camera))
             screen.say(part.said)
             screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
             if stop:
@@ -260,7 +273,8 @@ def look_of(stage: Stage, rows: Rows) -> Look:
     """What is seen of a stage's worlds, beside each other."""
     from worker.telemetry.screen import Look
 
-    return Look(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms)
+    cameras = tuple(name for name, *_ in rows.layout.images)
+    return Look(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms, cameras)
 
 
 def _checked(path: Path) -> Path:
@@ -288,9 +302,10 @@ def _line(line: LogLine) -> tuple[int, str, str]:
     return int(when.timestamp() * 1e6) * 1000, who, line.text
 
 
-def _start(given: argparse.Namespace) -> Callable[[Path | None], Page]:
+def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | None], Page]:
     def start(file: Path | None) -> Page:
         page = Page(given.port, given.memory, file)
+        activity.end()
         print(f"the view is at {page.url}", flush=True)
         if given.browser:
             webbrowser.open(page.url)
@@ -316,23 +331,28 @@ def main() -> int:
     stop: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stop.append(number))
-    start = _start(given)
     try:
-        need_rerun()
-        if given.file:
-            show_file(given.file, start, stop)
-            return 0
-        source: Any
-        if given.training:
-            source = Training(Run(given.training), given.job, given.worlds, stop)
-        else:
-            source = Policy(Run(given.policy), given.checkpoint, given.worlds, given.episodes, stop)
-        source.show(lambda: start(None))
-        print(f"viewed: {source.frames} frames", flush=True)
-        return 0
+        with Activity() as activity:
+            need_rerun()
+            return _show(given, _start(given, activity), stop, activity)
     except UserError as error:
         print(f"muster: {error}", file=sys.stderr, flush=True)
         return 1
+
+
+def _show(given: argparse.Namespace, start: Callable[[Path | None], Page], stop: list[int], activity: Activity) -> int:
+    if given.file:
+        show_file(given.file, start, stop, activity)
+        return 0
+    source: Any
+    if given.training:
+        source = Training(Run(given.training), given.job, given.worlds, stop, activity)
+    else:
+        activity.say(loading(Run(given.policy), given.worlds))
+        source = Policy(Run(given.policy), given.checkpoint, given.worlds, given.episodes, stop)
+    source.show(lambda: start(None))
+    print(f"viewed: {source.frames} frames", flush=True)
+    return 0
 
 
 if __name__ == "__main__":

@@ -44,6 +44,11 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     live = tmp_path / "live.mcap"
     done = server.muster("record", job, "-o", str(live), "--worlds", "2", "--episodes", "2", timeout=180)
     assert done.returncode == 0, done.stderr
+    waiting, loading, *_ = [line for line in done.stderr.splitlines() if "Warp" not in line]
+    assert (
+        waiting == f"waiting for the training of run {run.name} to answer …"
+        and loading == "loading Cartpole in 2 worlds …"
+    )
     known = episodes(live)
     assert {each["world"] for each in known} == {"0", "1"} and {each["job"] for each in known} == {job}
     assert all(each["length"] == "30" for each in known if each["complete"] == "true" and each["end"] == "time_out")
@@ -59,6 +64,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         "record", f"{run.name}@latest", "-o", str(file), "--worlds", "2", "--episodes", "1", timeout=180
     )
     assert done.returncode == 0, done.stderr + done.stdout
+    assert "loading Cartpole in 2 worlds …" in done.stderr.splitlines() and "loading" not in done.stdout
     facts = episodes(file)
     assert [(each["world"], each["complete"], each["run"]) for each in facts] == [
         (world, "true", run.name) for world in sorted(each["world"] for each in facts)
@@ -82,7 +88,20 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
     assert not list(run.recordings.iterdir()), "what was brought to the user is not kept twice"
 
     iterations = sorted(held)
+    (tmp_path / "cut.mcap.partial").touch()
+    drawn = tmp_path / "curves.png"
+    drawn.touch()
+    kept = file.read_bytes(), picture.read_bytes()
     refused = {
+        ("record", run.name, "-o", str(file)): f"-o {file}: it exists; --overwrite replaces it",
+        (
+            "record",
+            run.name,
+            "-o",
+            str(tmp_path / "cut.mcap"),
+        ): "cut.mcap.partial exists, a recording that was cut short",
+        ("render", run.name, "-o", str(picture)): f"-o {picture}: it exists; --overwrite replaces it",
+        ("compare", run.name, "other", "-o", str(drawn)): f"-o {drawn}: it exists; --overwrite replaces it",
         ("record", "nothing", "-o", "x.mcap"): "run nothing does not exist",
         ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; the nearest is {iterations[0]}",
         ("record", run.name, "-o", str(tmp_path)): "it is a directory; name a file in it",
@@ -98,3 +117,6 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         done = server.muster(*arguments) if recovers else call_muster(*arguments, home=server.home)
         assert done.returncode in (1, 2) and words in done.stderr, (arguments, done.stderr)
         assert len(done.stderr.strip().splitlines()) == 1
+    assert kept == (file.read_bytes(), picture.read_bytes()) and not drawn.stat().st_size
+    done = server.muster("render", job, "-o", str(picture), "--overwrite", *size[:-2], "--seconds", "0.2", timeout=300)
+    assert done.returncode == 0 and picture.read_bytes() != kept[1], done.stderr

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from tests.support.waiting import wait_for
 from worker.errors import UserError
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
+from worker.telemetry.live import main
 from worker.telemetry.recording import Recording, recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
@@ -40,14 +42,16 @@ class Recorded:
         tap = Tap(task, 2, rows=64)
         tap.open()
         reading = Reading(tap)
-        image = np.zeros((2, 8, 16, 3), np.uint8)
-        image[1, 2, 5] = (255, 128, 0)
+        image = np.zeros((1, 2, 3, 8, 16), np.uint8)
+        image[0, 1, :, 2, 5] = (255, 128, 0)
         recording = Recording(path, self.stage, {"run": "taught", "seed": "3"}, {"job.json": b"{}"})
         self.rows: list[Rows] = []
-        for number in range(STEPS):
+        for _ in range(STEPS):
             task.step(torch.full((2, 1), 0.1))
-            self.rows.append(reading.take())
-            recording.write(self.rows[-1], {"eye": image} if number == 0 else None)
+            rows = reading.take()
+            eye = replace(rows.layout, images=(("eye", 3, 8, 16),))
+            self.rows.append(replace(rows, layout=eye, images=image.reshape(1, 2, -1)))
+            recording.write(self.rows[-1])
         self.path = recording.finish()
 
 
@@ -125,7 +129,8 @@ def test_the_links_shapes_are_in_the_file_as_gltf(messages: dict[str, list[Any]]
 def test_a_camera_s_image_reads_back_byte_for_byte(messages: dict[str, list[Any]]) -> None:
     from PIL import Image
 
-    (message,) = messages["/world_1/eye/image/compressed"]
+    message, *others = messages["/world_1/eye/image/compressed"]
+    assert len(others) == STEPS - 1 and len(messages["/world_0/eye/image/compressed"]) == STEPS
     pixels = np.asarray(Image.open(io.BytesIO(bytes(message.data))))
     assert message.format == "png" and pixels.shape == (8, 16, 3)
     assert pixels[2, 5].tolist() == [255, 128, 0] and pixels.sum() == 383
@@ -256,8 +261,24 @@ def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_w
     assert process.returncode == 0
     (said,) = [line for line in said.splitlines() if "Warp" not in line]
     assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
-    path, count = recover(tmp_path / "full.mcap.partial")
-    assert count > 20 and path == tmp_path / "full.mcap" and not os.path.exists(tmp_path / ".full.mcap.tmp")
+    made = recover(tmp_path / "full.mcap.partial")
+    assert made is not None and made[0] == tmp_path / "full.mcap" and made[1] > 20
+    assert not os.path.exists(tmp_path / ".full.mcap.tmp")
+
+
+def test_a_whole_recording_and_one_without_a_step_are_not_recovered_and_nothing_is_made(
+    recorded: Recorded, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap.partial"
+    whole.write_bytes(recorded.path.read_bytes())
+    Recording(tmp_path / "cut.mcap", recorded.stage, {}, {})  # it has its beginning, and is never finished
+    for file, code, words in ((whole, 0, "it is whole already"), (cut, 1, "it ends before the first control step")):
+        monkeypatch.setattr(sys, "argv", ["live", "--recover", str(file)])
+        assert main() == code
+        said = capfd.readouterr()
+        (line,) = (said.out + said.err).splitlines()
+        assert f"{file}: {words}" in line
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap.partial", "whole.mcap"]
 
 
 def test_what_is_no_recording_is_not_recovered(tmp_path: Path) -> None:

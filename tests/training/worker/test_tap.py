@@ -18,7 +18,8 @@ from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
 from worker.tasks.cartpole import Cartpole
 from worker.tasks.configs.cartpole import CartpoleConfig
-from worker.telemetry.attending import Attending, answer_of, request_of
+from worker.telemetry.asking import answer_of, request_of
+from worker.telemetry.attending import Attending
 from worker.telemetry.rows import MARKS, Layout, Rows
 from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 import urllib.error
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.training.worker.test_recording import STEPS, Recorded
 from worker.errors import UserError
@@ -34,6 +36,7 @@ def shown(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[
     file = tmp_path_factory.mktemp("shown") / "two.rrd"
     screen = Screen(file, "two", replay.look, part.poses[0], live=False)
     screen.frames(part.times, part.steps, part.poses, part.rewards)
+    screen.pictures("eye", *part.pictures("eye"))
     screen.say(part.said)
     screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
     screen.close()
@@ -106,6 +109,13 @@ def test_terms_and_returns_are_drawn(recorded: Recorded, shown: dict[str, Any]) 
     drawn = np.array(shown["/terms"]["Scalars:scalars"].to_pylist())
     np.testing.assert_allclose(drawn, [rows.terms[0].mean(0) for rows in recorded.rows], rtol=1e-6, atol=1e-7)
     assert len(shown["/return/episodes"]["Scalars:scalars"]) == 4
+
+
+def test_what_a_camera_saw_is_shown_as_one_picture_of_all_worlds(recorded: Recorded, shown: dict[str, Any]) -> None:
+    blobs = shown["/images/eye"]["EncodedImage:blob"].to_pylist()
+    assert Replay(recorded.path).look.cameras == ("eye",) and len(blobs) == STEPS
+    picture = np.asarray(Image.open(io.BytesIO(bytes(blobs[7][0]))))
+    assert picture.shape == (8, 32, 3) and picture[2, 16 + 5].tolist() == [255, 128, 0] and picture.sum() == 383
 
 
 def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:

@@ -1,0 +1,155 @@
+"""Images of a training that runs: what a recording and the live view have of them is what its worlds' cameras saw, byte for byte."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from shared_store.files import write_json
+from shared_store.layout import Run
+from worker.learning.reporter import Gate
+from worker.tasks.cartpole_pixels import CartpolePixels
+from worker.tasks.overrides import configured
+from worker.telemetry.attending import Attending
+from worker.telemetry.live import record
+from worker.telemetry.progress import Activity
+from worker.telemetry.rows import Layout
+from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.view import Training
+
+torch.set_num_threads(1)
+CONFIG = {"episode_seconds": 0.2, "camera": {"width": 12, "height": 8}}
+"""Episodes of 12 steps; two images of 12 x 8 in colour."""
+
+
+@pytest.fixture(scope="module")
+def task() -> CartpolePixels:
+    return CartpolePixels(configured(CartpolePixels.config_type, CONFIG), 3, seed=3)
+
+
+class Running:
+    """Worlds that step in a thread as a training does, and answer who asks; the action of each step is its number."""
+
+    def __init__(self, task: CartpolePixels, run: Run) -> None:
+        write_json(run.path / "run.json", {"spec": {"train": {"task": "CartpolePixels", "config": CONFIG}}})
+        self.run, self._task = run, task
+        self.seen: list[np.ndarray] = []
+        """Of each step the images of all worlds."""
+        self._attending = Attending(run, task, Gate())
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while not self._over.wait(0.002):
+            self._attending.attend()
+            self._task.step(torch.full((3, 1), float(len(self.seen))))
+            self.seen.append(self._task.observations.numpy().copy())
+
+    def newest(self, step: int, world: int) -> np.ndarray:
+        """The present frame of a world after a step: the first three of its channels."""
+        return self.seen[step][world, :3].transpose(1, 2, 0)
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self._attending.close()
+        self._task.watch(None)
+
+
+@pytest.fixture
+def running(task: CartpolePixels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    monkeypatch.setattr("worker.telemetry.attending.LOOK_SECONDS", 0.05)
+    running = Running(task, Run(tmp_path / "run"))
+    yield running
+    running.close()
+
+
+def test_a_recorded_training_has_the_images_of_each_step(running: Running, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    made = record(running.run, "job", 2, 2, tmp_path / "pixels.mcap", 60.0)
+    found: dict[str, list[np.ndarray]] = {"0": [], "1": []}
+    steps: list[int] = []
+    with made.path.open("rb") as file:
+        for each in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            _, world, *rest = (each.channel.topic + "///").split("/")[:4]
+            if rest[0] == "policy":
+                picture = Image.open(io.BytesIO(bytes(each.decoded_message.data)))
+                found[world.removeprefix("world_")].append(np.asarray(picture))
+            elif (world, *rest) == ("world_0", "rl", "step"):
+                steps.append(int(each.decoded_message.action[0]))
+    assert len(steps) >= 24 and steps == sorted(set(steps))
+    for world, images in found.items():
+        assert len(images) == len(steps)
+        for step, image in zip(steps, images, strict=True):
+            np.testing.assert_array_equal(image, running.newest(step, int(world)))
+    assert len({image.tobytes() for image in found["0"]}) > 5, "the camera sees the cart move"
+
+
+class File:
+    """In place of the page: Rerun's stream goes into a file; after some frames the user ends the view."""
+
+    def __init__(self, server: Path, stop: list[int]) -> None:
+        self.server, self._stop, self._left = server, stop, 40
+
+    def check(self) -> None:
+        self._left -= 1
+        if not self._left:
+            self._stop.append(2)
+
+    def __enter__(self) -> File:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Running, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    stop: list[int] = []
+    view = Training(running.run, "job", 2, stop, Activity())
+    view.show(lambda: File(tmp_path / "view.rrd", stop))  # type: ignore[arg-type,return-value]
+    assert view.frames > 3
+    shown: list[np.ndarray] = []
+    for chunk in RrdReader(tmp_path / "view.rrd").stream().to_chunks():
+        if chunk.entity_path == "/images/policy":
+            blobs = chunk.to_record_batch()["EncodedImage:blob"].to_pylist()
+            shown += [np.asarray(Image.open(io.BytesIO(bytes(blob[0])))) for blob in blobs]
+    assert len(shown) == view.frames
+    both = {
+        np.hstack([running.newest(step, 0), running.newest(step, 1)]).tobytes() for step in range(len(running.seen))
+    }
+    assert all(picture.shape == (8, 24, 3) and picture.tobytes() in both for picture in shown)
+
+
+def test_images_that_are_too_large_are_left_out_and_one_line_says_so(
+    task: CartpolePixels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = 2 * 3 * 12 * 8
+    monkeypatch.setattr("worker.telemetry.tap.IMAGE_MEMORY", 40 * step)
+    tap = Tap.within(task, 2)
+    assert (tap.layout.rows, tap.layout.images, tap.left_out) == (40, (("policy", 3, 8, 12),), "")
+    assert Layout.from_json(tap.layout.to_json()) == tap.layout
+    monkeypatch.setattr("worker.telemetry.tap.IMAGE_MEMORY", 31 * step)
+    tap = Tap.within(task, 2)
+    assert (tap.layout.rows, tap.layout.images) == (1024, ())
+    assert tap.left_out.startswith("images are left out: of 2 worlds they take 0.0 MB in each control step")
+    tap.open()
+    reading = Reading(tap)
+    task.step(torch.zeros(3, 1))
+    rows = reading.take()
+    assert len(rows) == 1 and rows.images is None and rows.pictures(0) == {}
+    tap.close()
