@@ -116,7 +116,7 @@ class Camera:
             middle, radius = self._extent(poses)
             self._offset = middle - seen[0]
             self._targets = seen + self._offset
-            self._distance = 0.85 * radius / math.sin(_FOV / 2)  # the radii of shapes are those of balls around them
+            self._distance = 0.95 * radius / math.sin(_FOV / 2)  # the corners of the box are seldom filled
             return
         self._targets[:, :2] = seen[:, :2] + self._offset[:2]
         self._targets[:, 2] += _SMOOTH * (seen[:, 2] + self._offset[2] - self._targets[:, 2])
@@ -126,12 +126,20 @@ class Camera:
         model = self.stage.model
         owners, bodies, flags = (array.numpy() for array in (model.shape_world, model.shape_body, model.shape_flags))
         radii, places = model.shape_collision_radius.numpy(), model.shape_transform.numpy()
+        scales = model.shape_scale.numpy()
         links = len(self.stage.links)
         least, most = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in np.flatnonzero((owners == 0) & (bodies >= 0) & (flags & int(newton.ShapeFlags.VISIBLE) > 0)):
             pose = wp.transform(*map(float, poses[0, bodies[shape] % links]))
-            center = np.array(wp.transform_point(pose, wp.vec3(*map(float, places[shape][:3]))))
-            least, most = np.minimum(least, center - radii[shape]), np.maximum(most, center + radii[shape])
+            place = pose * wp.transform(*map(float, places[shape]))
+            source = model.shape_source[shape]
+            if isinstance(source, newton.Mesh):  # its origin may be anywhere
+                rotation = np.array(wp.quat_to_matrix(place.q)).reshape(3, 3)
+                points = (source.vertices * scales[shape]) @ rotation.T + np.array(place.p)
+                low, high = points.min(0), points.max(0)
+            else:
+                low, high = np.array(place.p) - radii[shape], np.array(place.p) + radii[shape]
+            least, most = np.minimum(least, low), np.maximum(most, high)
         if not np.isfinite(least).all():
             return poses[0, 0, :3].copy(), 1.0
         return (least + most) / 2, float(np.linalg.norm(most - least)) / 2
