@@ -6,7 +6,8 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperGroup
+
+from orchestrator.cli.misuse import Group
 
 
 class Entry(NamedTuple):
@@ -52,7 +53,7 @@ ENTRIES = (
         "export",
         "export",
         _RUNS,
-        "Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.",
+        "Export a policy as a bundle for a robot: ONNX, contract and self-test, compared with the policy.",
     ),
     Entry(
         "models",
@@ -71,7 +72,7 @@ ENTRIES = (
         "verify-resume",
         "verify",
         _RUNS,
-        "Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.",
+        "Prove that a training survives a crash: train it twice, kill one, compare all that they end with.",
     ),
     Entry(
         "serve", "serving", _SHARED, "Run the controller as a server. Running jobs outlive it; the next one finds them."
@@ -100,7 +101,7 @@ ENTRIES = (
         "doctor",
         "doctor",
         _HERE,
-        "Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing.",
+        "Look whether this machine has what Muster needs; exit 1 where what was asked for is missing.",
     ),
 )
 _MODULES = {entry.name: entry.module for entry in ENTRIES}
@@ -113,7 +114,7 @@ def load(name: str) -> Any:
     return typer.main.get_group(own).commands[name]
 
 
-class Catalogue(TyperGroup):
+class Catalogue(Group):
     """The group that lists placeholders and runs the commands themselves."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -59,7 +59,7 @@ def doctor(
     worker: Annotated[bool, typer.Option("--worker", help="This machine must be able to run nodes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing."""
+    """Look whether this machine has what Muster needs; exit 1 where what was asked for is missing."""
     findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
     if as_json:
         echo_json([asdict(finding) for finding in findings], indent=1)

@@ -48,7 +48,7 @@ def export(
     ] = None,
     store: StoreOption = None,
 ) -> None:
-    """Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.
+    """Export a policy as a bundle for a robot: ONNX, contract and self-test, compared with the policy.
 
     A job writes it to exports/ of the run, with a controller of its own where none is running. The bundle appears only where its
     policy acts as the trained one on recorded observations (1e-5), and does as well on the same simulated worlds.

@@ -12,6 +12,7 @@ from rich.table import Table
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
 from orchestrator.cli.jobs import JsonOption, scored
+from orchestrator.cli.misuse import Group
 from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
@@ -31,6 +32,7 @@ muster models verify ant@1"""
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(
+        cls=Group,
         no_args_is_help=True,
         rich_markup_mode="rich",
         epilog=_EXAMPLES,

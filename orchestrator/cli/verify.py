@@ -37,7 +37,7 @@ def verify_resume(
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.
+    """Prove that a training survives a crash: train it twice, kill one, compare all that they end with.
 
     The spec's training runs for AT + ITERATIONS iterations, once straight and once with SIGKILL of the main rank right after
     iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment; it counts in the first
