@@ -23,6 +23,7 @@ from sqlalchemy.orm import Session
 from orchestrator.backoff import Backoff
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError
+from orchestrator.ownership import is_of_earlier_run
 from orchestrator.tables import Job, WebhookDelivery, now
 from orchestrator.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from shared_store import __version__
@@ -219,6 +220,8 @@ class Deliveries:
 
 def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:
     """The checkpoint that a message names and its evaluation: of a job that evaluates its own, of others the newest one's."""
+    if kind_of(job) == "train" and is_of_earlier_run(job, run):
+        return None, None
     with suppress(OSError, ValueError):  # a volume that is away: the message does without
         if kind_of(job) == "evaluate":
             own = (

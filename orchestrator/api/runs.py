@@ -23,7 +23,7 @@ from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
-from orchestrator.ownership import owner_of
+from orchestrator.ownership import is_of_earlier_run, jobs_of, owner_of
 from orchestrator.spec import ALGORITHMS, Spec, Train, override, validate
 from orchestrator.tables import AutomaticEvaluation, Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
@@ -342,7 +342,7 @@ def newest_job(session: Session, run: Run) -> Job | None:
 def _of_run(run: Run) -> list[ColumnElement[bool]]:
     """Those of the run's jobs that the caller may see: a key with all queues may have continued it in another queue."""
     queues = visible_queues()
-    return [Job.run == run.name, *([] if queues is None else [Job.queue.in_(queues)])]
+    return [*jobs_of(run), *([] if queues is None else [Job.queue.in_(queues)])]
 
 
 def _evaluated(run: Run) -> dict[str, dict[str, Any]]:
@@ -365,12 +365,14 @@ def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str
 def _automatic(session: Session, run: Run) -> dict[str, Any] | None:
     """The newest automatic evaluation of a training, how it is, and how many checkpoints that were due were passed over."""
     row = session.get(AutomaticEvaluation, run.name)
-    if row is None:
+    training = session.get(Job, row.training) if row else None
+    if row is None or (training is not None and is_of_earlier_run(training, run)):
         return None
     job = session.get(Job, row.job) if row.job else None
     job = job if job is not None and is_visible(job) else None  # it may be in a queue that the caller can't see
     return {
         "checkpoint": row.checkpoint,
+        "iteration": int(row.checkpoint.partition("-")[0]) if row.checkpoint else None,
         "job": row.job,
         "status": job.status if job else None,
         "statusReason": job.status_reason if job else None,

@@ -30,7 +30,7 @@ ENTRIES = (
         "Run a job to its end, with a controller of its own where none is running; exit with its result.",
     ),
     Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
-    Entry("list", "jobs", _JOBS, "List jobs, the newest first."),
+    Entry("list", "listing", _JOBS, "List jobs, the newest first."),
     Entry("show", "jobs", _JOBS, "Show a job: its state and why, its attempts and nodes, its run and results."),
     Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
     Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and leaves; `muster resume` goes on from there."),

@@ -15,6 +15,7 @@ from shared_store.checkpoints import best_evaluated, list_checkpoints
 from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, list_evaluations
 from shared_store.files import write_json
 from shared_store.layout import Run
+from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share
@@ -68,7 +69,7 @@ class Evaluation:
         percent = round(100 * self.mean_length / self.max_length)
         return (
             f"evaluation: mean episode length {self.mean_length:.1f} of {self.max_length} ({percent} %), "
-            f"mean return {self.mean_return:.2f} over {self.episodes} episodes"
+            f"mean return {self.mean_return:.2f} over {counted(self.episodes, 'episode')}"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -174,7 +175,9 @@ def best_words(run: Run) -> str:
     if best is None or len(evaluated) < 2:
         return ""
     mean = evaluated[best.name]["mean_return"]
-    return f"best of {len(evaluated)} checkpoints that are evaluated: {best.name}, mean return {mean:.2f}"
+    return (
+        f"best of {len(evaluated)} checkpoints that are evaluated: {run.name}@{best.iteration}, mean return {mean:.2f}"
+    )
 
 
 def _finite(value: Any) -> Any:

@@ -243,4 +243,4 @@ def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_co
         assert best_words(run) == ""
         name = add_checkpoint(store, "taught", iteration).name
         write_json(run.evaluations / f"{name}.json", {**figures, "mean_return": mean})
-    assert best_words(run) == "best of 2 checkpoints that are evaluated: 00000003-e1, mean return 7.25"
+    assert best_words(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"
