@@ -81,9 +81,9 @@ def explain(problem: Mapping[str, Any]) -> str:
     return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
 
 
-def counted(count: int, thing: str) -> str:
-    """A number with what it counts: ``1 episode``, ``100 episodes``; ``thing`` is in the singular, and gets an s."""
-    return f"{count} {thing}{'s' if count != 1 else ''}"
+def counted(count: int, thing: str, things: str = "") -> str:
+    """A number with what it counts: ``1 episode``, ``100 episodes``; ``things``: the plural that is not made with an s."""
+    return f"{count} {thing if count == 1 else things or f'{thing}s'}"
 
 
 def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:

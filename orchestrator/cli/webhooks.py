@@ -11,6 +11,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import Group
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
+from shared_store.wording import counted
 
 
 def register(app: typer.Typer) -> None:
@@ -46,19 +47,25 @@ def list_webhooks(as_json: JsonOption = False) -> None:
     print_cut(table)
     for each in found:
         for message in each["failed"]:
-            echo(f"given up: {each['name']}, job {message['job']}, {message['tries']} tries: {message['problem']}")
+            echo(
+                f"given up: {each['name']}, job {message['job']}, {counted(message['tries'], 'try', 'tries')}: {message['problem']}"
+            )
 
 
 def test(
     name: Annotated[str, typer.Argument(help="Of the webhook.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Send a sample, once; exit 1 where the receiver does not accept it."""
+    """Send a sample, once; exit 1 where the receiver does not accept it.
+
+    It is signed like any message, and is none of those that `muster webhooks list` counts.
+    """
     with Client.connect() as client:
         sent = client.post(f"/api/webhooks/{named(name)}/test", {}, seconds=60)
     if as_json:
         echo_json(sent)
     else:
         echo(f"{name}: {sent['receiver']} {sent['problem'] or 'accepted the sample'} (webhook-id {sent['id']})")
+        echo("a sample is sent once, about no job; it is none of the messages that muster webhooks list counts")
     if sent["problem"]:
         raise typer.Exit(1)
