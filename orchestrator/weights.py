@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from shared_store.wording import counted
+
 LARGEST = 512 << 20
 """Bytes of a policy that is read."""
 
@@ -24,9 +26,9 @@ def difference(before: Path, after: Path) -> str | None:
         return None
     counts = [sum(array.size for array in each.values()) for each in (was, now)]
     if [(name, array.shape) for name, array in was.items()] != [(name, array.shape) for name, array in now.items()]:
-        return f"differ: {counts[0]} parameters became {counts[1]}, of other names or shapes"
+        return f"differ: {counted(counts[0], 'parameter')} became {counts[1]}, of other names or shapes"
     largest = max((float(numpy.abs(now[name] - array).max()) for name, array in was.items() if array.size), default=0.0)
-    return "" if largest == 0.0 else f"differ: {counts[0]} parameters, by {largest:.3g} at most"
+    return "" if largest == 0.0 else f"differ: {counted(counts[0], 'parameter')}, by {largest:.3g} at most"
 
 
 def _parameters(path: Path) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from shared_store.layout import Run
 from shared_store.metrics import history_of
 from shared_store.parent import TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.wording import counted
 
 
 def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
@@ -311,12 +312,14 @@ def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Check
     if changed and wanted != worlds:
         assert chosen is not None
         raise ClientError(
-            f"run {run.name}: checkpoint {chosen.name} holds {worlds} worlds, this job would have {wanted} "
-            f"({after.nodes.max} nodes × {after.ranks_per_node} ranks × {after.train.worlds}); "
+            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {wanted} "
+            f"({counted(after.nodes.max, 'node')} × {counted(after.ranks_per_node, 'rank')} × {after.train.worlds}); "
             "leave train.worlds as it is: the worlds are dealt out to whatever ranks there are"
         )
     if worlds < ranks:
-        raise ClientError(f"run {run.name}: {worlds} worlds can't be dealt out to {ranks} ranks; use fewer nodes")
+        raise ClientError(
+            f"run {run.name}: {counted(worlds, 'world')} can't be dealt out to {counted(ranks, 'rank')}; use fewer nodes"
+        )
     return worlds
 
 

@@ -18,6 +18,7 @@ from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.engines.aws_config import config_path
 from orchestrator.errors import ServerError
 from orchestrator.home import muster_home
+from shared_store.wording import counted
 
 if TYPE_CHECKING:
     from orchestrator.aws_stack import Event, Stack
@@ -101,7 +102,11 @@ def down(
     stays = f"file system {volume}, with all runs and checkpoints, stays" if volume else "there is no volume yet"
     if not yes:
         jobs = stack.jobs(outputs["JobQueueArn"]) if "JobQueueArn" in outputs else {}
-        ended = f"{sum(jobs.values())} jobs in it are ended; " if jobs else ""
+        ended = (
+            f"{counted(sum(jobs.values()), 'job')} in it {'is' if sum(jobs.values()) == 1 else 'are'} ended; "
+            if jobs
+            else ""
+        )
         typer.confirm(f"delete stack {stack_name} in {stack.region}? {ended}images and logs go; {stays}", abort=True)
     began = time.time() - 1
     events = _follow(stack, stack.delete(), began)

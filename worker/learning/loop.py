@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.checkpoints import Checkpoint
 from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.errors import TrainingError
 from worker.evaluation.evaluation import best_words, evaluate
@@ -198,8 +199,7 @@ class Loop:
         self._stall_seconds = self.state.saver.stall
 
     def _beginning(self) -> str:
-        ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
-        there = f"{self.share.total} worlds on {ranks}"
+        there = f"{counted(self.share.total, 'world')} on {counted(self.gang.size, 'rank')}"
         if self.adopted:
             parent = (self.job.run.description() or {}).get("parent") or {}
             of = f"{parent.get('run')}@{self.adopted.iteration} (checkpoint {self.adopted.name})"
@@ -265,11 +265,12 @@ class Loop:
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
         first = f"world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
+        said = f"{counted(resets, 'reset')} of worlds, among them {first}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
                 more = "; from now on only counted" if self._warnings == WARNINGS else ""
-                self._say(f"warning: iteration {iteration}: {resets} resets of worlds, among them {first}{more}")
+                self._say(f"warning: iteration {iteration}: {said}{more}")
             return
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
@@ -281,7 +282,7 @@ class Loop:
         self.gang.greatest(0)  # nobody ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
-            f"{resets} resets of worlds, among them {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
+            f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
             f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
         )
 
