@@ -206,9 +206,8 @@ class Loop:
             return f"starting from the weights of {of}: {there}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
-        size = self.resumed.size / 1e6
         return (
-            f"resumed from checkpoint {self.resumed.name}: {there} ({size:.2f} MB in {self.state.load_seconds:.3f} s)"
+            f"resumed from checkpoint {self.resumed.name}: {there} ({self.resumed.size / 1e6:.2f} MB in {self.state.load_seconds:.3f} s)"
             + "".join(f"; {line}" for line in self.state.set_anew)
         )
 
@@ -264,13 +263,13 @@ class Loop:
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
-        first = f"world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
-        said = f"{counted(resets, 'reset')} of worlds, among them {first}"
+        world += Share.of(rank, self.gang.size, total).first
+        said = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
-                more = "; from now on only counted" if self._warnings == WARNINGS else ""
-                self._say(f"warning: iteration {iteration}: {said}{more}")
+                said += "; from now on only counted" if self._warnings == WARNINGS else ""
+                self._say(f"warning: iteration {iteration}: {said}")
             return
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
