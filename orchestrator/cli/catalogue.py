@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -104,6 +105,8 @@ ENTRIES = (
         "Look whether this machine has what Muster needs; exit 1 where what was asked for is missing.",
     ),
 )
+_LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
+"""Of a line that is not the last one of its paragraph."""
 _MODULES = {entry.name: entry.module for entry in ENTRIES}
 
 
@@ -111,7 +114,11 @@ def load(name: str) -> Any:
     """The command itself. Imports its module."""
     own = typer.Typer(rich_markup_mode="rich")
     import_module(f"orchestrator.cli.{_MODULES[name]}").register(own)
-    return typer.main.get_group(own).commands[name]
+    command: Any = typer.main.get_group(own).commands[name]
+    for each in (command, *getattr(command, "commands", {}).values()):
+        # the lines of a docstring are as long as the source's; where they are broken is for the terminal to say
+        each.help = _LINE_END.sub(" ", each.help or "")
+    return command
 
 
 class Catalogue(Group):

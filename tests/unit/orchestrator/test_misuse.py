@@ -78,3 +78,5 @@ def test_every_command_has_an_example_and_a_summary_of_one_line() -> None:
     without = [name for name, command in every if "xample" not in (command.epilog or "") or not command.help]
     assert without == []
     assert [entry.name for entry in ENTRIES if len(entry.summary) > 100] == []
+    ragged = [name for name, command in every if any("\n" in part for part in command.help.split("\n\n"))]
+    assert ragged == [], "the terminal breaks the lines"
