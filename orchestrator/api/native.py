@@ -76,12 +76,13 @@ def _job(session: Session, reference: str, operation: Operation) -> Job:
 
 def _jobs_of_run(session: Session, reference: str) -> str:
     """Which jobs made the run of this name, for who names it where a job is meant; empty where no visible job did."""
-    query = select(Job).where(Job.run == reference).order_by(Job.created_at.desc())
-    made = [f"{job.name} ({short_id(job.id)})" for job in session.scalars(query) if permissions.is_visible(job)]
+    query = select(Job).where(Job.run == reference).order_by(Job.created_at)
+    made = [job for job in session.scalars(query) if permissions.is_visible(job)]
     if not made:
         return ""
-    which = f"job {made[0]} made" if len(made) == 1 else f"jobs {', '.join(reversed(made[:5]))} made"
-    return f"{reference} is a run, which {which}; see: muster show {made[0].rpartition('(')[2][:-1]}"
+    named = ", ".join(f"{job.name} ({short_id(job.id)})" for job in made[-5:])
+    which = "job" if len(made) == 1 else "jobs"
+    return f"{reference} is a run, which {which} {named} made; see: muster show {short_id(made[-1].id)}"
 
 
 @router.get("/capacity")
