@@ -50,10 +50,9 @@ def told(error: Any, commands: Sequence[str]) -> str:
         near = nearest(option, [name for name in known if name.startswith("--")], see)
         return f"{option}: there is no such option; {near}" + ("" if near == see else f" {see}")
     if option is not None:
-        needs = "needs" if "requires" in message else "takes no"
-        return f"{option} {needs}{' a' if needs == 'needs' else ''} value; {see}"
+        return f"{option} {'needs a' if 'requires' in message else 'takes no'} value; {see}"
     if param is not None:
-        if getattr(error, "param_type", message) is None:
+        if type(error).__name__ == "MissingParameter":
             return f"{_name(param)} is missing; {see}"
         return f"{_name(param)}: {_wanted(error)}; {see}"
     if message.startswith("Got unexpected extra"):
