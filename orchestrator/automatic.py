@@ -27,8 +27,9 @@ from orchestrator.database import DatabaseError
 from orchestrator.definition import gang_needs
 from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
-from orchestrator.evaluating import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
+from orchestrator.evaluating import AUTOMATIC_TAG, Counted, automatic_evaluation, due, first_count, place_of, wanted_of
 from orchestrator.jobs import Status
+from orchestrator.ownership import is_of_earlier_run
 from orchestrator.spec_sections import Evaluation
 from orchestrator.tables import AutomaticEvaluation, Job
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
@@ -198,7 +199,8 @@ class AutomaticEvaluations:
             spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
             with controller.writing, controller.database.session() as session:
                 context = Context(session, controller)
-                answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {})
+                tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
+                answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
                 row = _row(session, training, counted)
                 row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
         except (ClientError, SpecError) as error:
@@ -211,7 +213,7 @@ class AutomaticEvaluations:
             permissions.current_identity.reset(token)
         controller.wake()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
-        log.info("run %s: job %s evaluates checkpoint %s%s", run.name, answer["jobId"][:8], chosen.name, passed)
+        log.info("job %s evaluates %s@%d%s", answer["jobId"][:8], run.name, chosen.iteration, passed)
 
 
 def _is_open(session: Session, row: AutomaticEvaluation) -> bool:
@@ -230,5 +232,7 @@ def _row(session: Session, training: _Training, counted: Counted) -> AutomaticEv
     if row is None:
         row = AutomaticEvaluation(run=training.run.name)
         session.add(row)
+    elif (before := session.get(Job, row.training)) is not None and is_of_earlier_run(before, training.run):
+        row.checkpoint, row.job, row.open, row.problem = None, None, False, None
     row.training, row.seen, row.waiting, row.passed = training.job, counted.seen, counted.waiting, counted.passed
     return row

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
+from shared_store.pairs import are_paired
+
 POINTS = 200
 """Points of the curve of a group."""
 
@@ -22,12 +24,16 @@ class RunFacts:
         spec: Its job YAML; empty where it has none.
         records: Its metrics, one an iteration.
         evaluation: The summary of an evaluation; None where it has none.
+        evaluations: The summaries of all evaluations of the same checkpoint.
+        path: Its directory in the store.
     """
 
     name: str
     spec: Mapping[str, Any]
     records: Sequence[Mapping[str, Any]]
     evaluation: Mapping[str, Any] | None
+    evaluations: Sequence[Mapping[str, Any]] = ()
+    path: str = ""
 
     @property
     def train(self) -> Mapping[str, Any]:
@@ -136,6 +142,12 @@ def grouped(runs: Iterable[RunFacts]) -> list[Group]:
         key = json.dumps([spec, train], sort_keys=True) if run.train else run.name
         groups.setdefault(key, []).append(run)
     return [Group(each) for each in groups.values()]
+
+
+def same_episodes(new: RunFacts, old: RunFacts) -> tuple[Mapping[str, Any], Mapping[str, Any]] | None:
+    """An evaluation of each of two runs that played the same episodes: those that have the most in common; None where none did."""
+    both = [(a, b) for a in new.evaluations for b in old.evaluations if are_paired(a, b)]
+    return max(both, key=lambda pair: min(pair[0]["episodes"], pair[1]["episodes"]), default=None)
 
 
 def _at(curve: Sequence[tuple[float, float]], steps: float) -> float | None:

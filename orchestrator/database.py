@@ -388,6 +388,12 @@ def _tune_sqlite(connection: Any, _record: object) -> None:
     cursor.close()
 
 
+def short_id(job: str) -> str:
+    """The start of a job's id, as commands show it; of an array's child with its index."""
+    parent, colon, index = job.partition(":")
+    return parent[:8] + colon + index
+
+
 def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so (if it is the only one).
 

@@ -67,14 +67,18 @@ def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
     return request
 
 
-def compile_submission(spec: Spec, definition: str, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+def compile_submission(
+    spec: Spec, definition: str, environment: Mapping[str, str] | None = None, tags: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """The ``SubmitJob`` request of a spec whose definition (ARN) is registered.
 
-    ``environment`` is added on every node: the run that is continued, the checkpoint to start from.
+    ``environment`` is added on every node: the run that is continued, the checkpoint to start from. ``tags``: of the job.
     """
     request: dict[str, Any] = {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition}
     if spec.share:
         request["shareIdentifier"] = spec.share
+    if tags:
+        request["tags"] = dict(tags)
     if environment:
         pairs = [{"name": name, "value": value} for name, value in environment.items()]
         request["nodeOverrides"] = {

@@ -6,6 +6,7 @@ at each try. A receiver that is slow or away keeps neither jobs nor other receiv
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import threading
@@ -23,15 +24,17 @@ from sqlalchemy.orm import Session
 from orchestrator.backoff import Backoff
 from orchestrator.controller import Controller
 from orchestrator.database import DatabaseError
-from orchestrator.tables import Job, WebhookDelivery, now
+from orchestrator.ownership import is_of_earlier_run
+from orchestrator.tables import Job, JobQueue, WebhookDelivery, now
 from orchestrator.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from shared_store import __version__
 from shared_store.checkpoints import list_checkpoints
 from shared_store.evaluations import by_checkpoint, evaluation_name, list_evaluations
 from shared_store.layout import Run
+from shared_store.wording import nearest
 
 TIMEOUT = 10.0
-"""Seconds that a receiver may take to be connected, and between two pieces of its answer."""
+"""Seconds that one try may take in all: connecting, sending, and the answer's status."""
 _IDLE = 5.0
 """Seconds between two looks for what is due, where nothing wakes the thread."""
 _SHOWN = ("mean_return", "mean_length", "max_length", "episodes")
@@ -51,9 +54,8 @@ class Deliveries:
         self._backoff = Backoff(log)
         self._ending = threading.Event()
         self._wake = {name: threading.Event() for name in self.webhooks}
-        self._http = httpx.Client(
-            timeout=TIMEOUT, follow_redirects=False, headers={"user-agent": f"muster/{__version__}"}
-        )
+        self._timeout = TIMEOUT
+        self._tls = httpx.create_ssl_context() if webhooks else True  # made once: it takes a while
         self._threads = [
             threading.Thread(target=self._loop, args=(webhook,), name=f"webhook {webhook.name}", daemon=True)
             for webhook in webhooks
@@ -68,8 +70,17 @@ class Deliveries:
                 gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
                 said = "no webhook is called so any more"
                 session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
+                self._name_unknown_queues(session.scalars(select(JobQueue.name)).all())
         for thread in self._threads:
             thread.start()
+
+    def _name_unknown_queues(self, known: Sequence[str]) -> None:
+        """Warn of queues that no job can be in; no more than that, since a queue may be created later."""
+        for webhook in self.webhooks.values():
+            for queue in sorted({*(webhook.queues or ())} - {*known}):
+                log.warning(
+                    "webhook %s: there is no queue %s now; %s", webhook.name, queue[:100], nearest(queue, sorted(known))
+                )
 
     def close(self) -> None:
         """Deliver no more; what is due waits in the database for the next controller."""
@@ -79,7 +90,6 @@ class Deliveries:
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=1)
-        self._http.close()
 
     def note(self, session: Session, job: Job) -> None:
         """A job ends with this transaction: add the messages that tell so to it."""
@@ -177,13 +187,29 @@ class Deliveries:
             )
 
     def _send(self, webhook: Webhook, identity: str, body: bytes) -> str | None:
-        """One try; what was wrong with it, None where the receiver accepted it. The answer's text is not read."""
-        headers = webhook.headers(identity, int(time.time()), body)
-        try:
-            with self._http.stream("POST", webhook.url, content=body, headers=headers) as answer:
+        """One try; what was wrong with it, None where the receiver accepted it. Of the answer only the status counts.
+
+        It has an event loop of its own: from there a try can be left at any point, as while a receiver sends a byte a second. Nothing
+        of the answer is read behind its header.
+        """
+        headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(time.time()), body)}
+
+        async def deliver() -> str | None:
+            async with (
+                httpx.AsyncClient(timeout=None, verify=self._tls, follow_redirects=False) as http,
+                http.stream("POST", webhook.url, content=body, headers=headers) as answer,
+            ):
                 return None if answer.is_success else f"answered {answer.status_code}"
+
+        loop = asyncio.new_event_loop()
+        try:
+            return loop.run_until_complete(asyncio.wait_for(deliver(), self._timeout))
+        except TimeoutError:
+            return f"has not answered within {self._timeout:g} s"
         except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
             return f"can't be reached ({type(error).__name__})"  # its words may have the URL
+        finally:
+            loop.close()
 
     def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
         attempts = self._attempts(job)
@@ -219,6 +245,8 @@ class Deliveries:
 
 def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:
     """The checkpoint that a message names and its evaluation: of a job that evaluates its own, of others the newest one's."""
+    if kind_of(job) == "train" and is_of_earlier_run(job, run):
+        return None, None
     with suppress(OSError, ValueError):  # a volume that is away: the message does without
         if kind_of(job) == "evaluate":
             own = (

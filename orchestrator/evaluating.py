@@ -14,6 +14,9 @@ from orchestrator.spec_sections import Evaluation
 from shared_store.checkpoints import Checkpoint
 from shared_store.wording import explain, path_of
 
+AUTOMATIC_TAG = "muster:automatic-evaluation"
+"""Tag of the jobs that the controller submits by itself; its value is what they evaluate, ``RUN@ITERATION``."""
+
 
 def evaluation_document(
     run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None

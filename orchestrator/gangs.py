@@ -38,6 +38,7 @@ from shared_store.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store, StoreError
 from shared_store.outcomes import read_outcome
+from shared_store.wording import counted
 
 log = logging.getLogger("muster.controller")
 
@@ -420,4 +421,4 @@ def _size(job: Job, nodes: int) -> str:
     most = int(job.node_properties["numNodes"])
     if nodes < most:
         return f"{nodes} of {most} nodes: there is no room for more"
-    return f"{nodes} node{'s' if nodes != 1 else ''}"
+    return counted(nodes, "node")

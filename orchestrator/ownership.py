@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator.definition import gang_needs
@@ -50,6 +50,25 @@ def first_description(run: Run, job: Job, owner: str | None, queue: str) -> dict
     spec = gang_needs(job.node_properties).spec
     facts = {"run": run.name, "job": job.id, "created": now(), "version": __version__, "spec": spec, "name": job.name}
     return {**facts, "owner": owner, "queue": queue}
+
+
+def born_at(run: Run) -> int:
+    """When the run was created [Unix ms]; 0 where it does not say."""
+    try:
+        created = (run.description() or {}).get("created")
+    except (OSError, ValueError, RecursionError):  # damaged
+        created = None
+    return int(created) if isinstance(created, int | float) else 0
+
+
+def is_of_earlier_run(job: Job, run: Run) -> bool:
+    """Whether a job's own run is gone, and ``run`` is another one that was created under its name afterwards."""
+    return job.stopped_at is not None and job.stopped_at < born_at(run)
+
+
+def jobs_of(run: Run) -> list[ColumnElement[bool]]:
+    """Conditions of the jobs that made and continued the run; not those of an earlier run of its name."""
+    return [Job.run == run.name, or_(Job.stopped_at.is_(None), Job.stopped_at >= born_at(run))]
 
 
 def forget_gone_run(session: Session, run: Run) -> None:

@@ -23,7 +23,7 @@ from shared_store.policy_contract import Contract, read
 
 FORMAT = 1
 """Version of the manifest; a newer one is refused."""
-MANIFEST, CONTRACT, REPORT = "manifest.json", "contract.json", "report.json"
+MANIFEST, CONTRACT, REPORT, POLICY = "manifest.json", "contract.json", "report.json", "policy.onnx"
 _PART = r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,199}"
 _PATH = re.compile(rf"{_PART}(?:/{_PART}){{0,7}}")
 """What a file of a bundle may be called: never a path that leads elsewhere."""

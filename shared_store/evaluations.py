@@ -13,6 +13,7 @@ from typing import Any
 
 from shared_store.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.layout import LARGEST_DESCRIPTION, Run
+from shared_store.wording import counted
 
 TERMS_SHOWN = 6
 """Reward terms that a printed table has: those of the greatest size."""
@@ -100,7 +101,7 @@ def kept_checkpoints(run: Run) -> set[str]:
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """An evaluation as a person reads it."""
     task, seed = summary.get("task"), summary.get("seed")
-    yield f"{summary['episodes']} episodes of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
+    yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
     for place, value in flattened(_mapping(summary, "config")):
         yield f"  with config.{place}: {value}"
     yield f"{'':20} {'mean':>10} {'95 % interval':>24} {'std':>10}"
@@ -118,8 +119,8 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     for name in metrics:
         yield _row(f"metric {name}", _mapping(metrics, name))
     causes = _mapping(summary, "causes")
-    counted = ", ".join(f"{name} {_mapping(causes, name).get('count')}" for name in causes)
-    yield f"ended by: {counted}"
+    ends = ", ".join(f"{name} {_mapping(causes, name).get('count')}" for name in causes)
+    yield f"ended by: {ends}"
     if compared := _mapping(summary, "compared"):
         yield _comparison(compared)
 
@@ -138,7 +139,8 @@ def _comparison(compared: Mapping[str, Any]) -> str:
     there = time.strftime(" of %Y-%m-%d %H:%M", time.localtime(when)) if isinstance(when, int | float) else ""
     others = " in other worlds" if compared.get("other_worlds") else ""
     told = _mapping(compared, "return")
-    interval = f" ({_number(told.get('low'), '+')} to {_number(told.get('high'), '+')}, Welch)"
+    method = f"paired over {counted(told['pairs'], 'episode')}" if isinstance(told.get("pairs"), int) else "Welch"
+    interval = f" ({_number(told.get('low'), '+')} to {_number(told.get('high'), '+')}, {method})"
     return (
         f"compared with the evaluation{there} of checkpoint {compared.get('checkpoint')}{others}: "
         f"return {_number(told.get('difference'), '+')}{interval}: {told.get('verdict')}"

@@ -13,7 +13,7 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,10 @@ _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 class ModelError(Exception):
     """There is no such model, or it can't be registered; one line that says what there is."""
+
+
+class AlreadyRegistered(ModelError):
+    """A version of the model has this checkpoint."""
 
 
 class UnknownModel(ModelError):
@@ -126,7 +130,14 @@ _in_progress: set[Path] = set()
 
 
 def register(
-    store: Store, name: str, run: Run, checkpoint: Checkpoint, facts: Mapping[str, Any], registrar: str = ""
+    store: Store,
+    name: str,
+    run: Run,
+    checkpoint: Checkpoint,
+    facts: Mapping[str, Any],
+    registrar: str = "",
+    *,
+    again: bool = True,
 ) -> Model:
     """Keep the bundle of a checkpoint as the next version of a model.
 
@@ -139,8 +150,10 @@ def register(
         checkpoint: It was exported.
         facts: What else ``model.json`` says: who registered it, for whom.
         registrar: Id of the controller, under which no other process registers at the same time.
+        again: Whether a checkpoint that is a version of the model already becomes another one.
 
     Raises:
+        AlreadyRegistered: The checkpoint is a version of the model, and ``again`` is false; nothing is made.
         ModelError: No model can be called so, or the checkpoint has no bundle.
         DamagedBundle: The bundle is not as it was exported.
         OSError, DamagedFile: The volume is full or gone, or has a link where a directory should be.
@@ -165,6 +178,10 @@ def register(
         lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
         while True:
             there = versions(store, name)
+            if not again and (same := _version_of(there, lineage)) is not None:
+                raise AlreadyRegistered(
+                    f"the same checkpoint is {same.reference} already; --again registers it once more"
+                )
             version = there[-1].version + 1 if there else 1
             model = Model(folder / str(version), name, version)
             write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
@@ -180,6 +197,16 @@ def register(
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
         _in_progress.discard(hidden)
+
+
+def _version_of(there: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
+    """The newest version that is of the same checkpoint: by its files, since another run may have had the name of this one."""
+    for model in reversed(there):
+        with contextlib.suppress(DamagedBundle):
+            facts = model.facts()
+            if all(facts.get(key) == lineage[key] for key in ("run", "checkpoint", "checkpoint_files")):
+                return model
+    return None
 
 
 def _clear_leftovers(store: Store, registrar: str) -> None:

@@ -81,6 +81,11 @@ def explain(problem: Mapping[str, Any]) -> str:
     return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
 
 
+def counted(count: int, thing: str, things: str = "") -> str:
+    """A number with what it counts: ``1 episode``, ``100 episodes``; ``things``: the plural that is not made with an s."""
+    return f"{count} {thing if count == 1 else things or f'{thing}s'}"
+
+
 def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:
     """What to say of a name that is none of ``known``: the nearest of them, else ``otherwise``, or all that there are."""
     names = list(known)

@@ -19,6 +19,7 @@ import torch
 from shared_store.checkpoints import Checkpoint, list_checkpoints
 from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import EX_ERROR, EX_USAGE, run_command
 from worker.learning.shards import Shards, read_file
@@ -39,7 +40,7 @@ def compare(first: Run, second: Run) -> str:
         raise Difference(f"checkpoints: {one.name} of {first.name}, {two.name} of {second.name}: other iterations")
     tensors = _compare_files(one, two)
     iterations = _compare_metrics(first, second, one.iteration)
-    return f"{tensors} tensors, {iterations} iterations"
+    return f"{counted(tensors, 'tensor')}, {counted(iterations, 'iteration')}"
 
 
 def _newest(run: Run) -> Checkpoint:
@@ -63,7 +64,9 @@ def _compare_files(one: Checkpoint, two: Checkpoint) -> int:
         for rank in range(ranks[0]):
             tensors += _compare_values(f"rank-{rank}.pt", *(each.rank(rank)["generators"] for each in shards))
     else:
-        print(f"generators are not compared: {ranks[0]} ranks saved them in one run, {ranks[1]} in the other")
+        print(
+            f"generators are not compared: {counted(ranks[0], 'rank')} saved them in one run, {ranks[1]} in the other"
+        )
     facts = [{k: v for k, v in each.manifest.items() if k not in _OF_THE_WRITING} for each in (one, two)]
     _compare_values("manifest.json", *facts)
     return tensors

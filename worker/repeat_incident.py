@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import EX_ERROR, configure, run_command, user_errors
 
@@ -63,7 +64,7 @@ def repeat(path: Path, device: str) -> int:
     task, content = load(path, device)
     actions = content["actions"].to(task.device)
     print(
-        f"iteration {content['iteration']} of {content['train']['task']}: {len(actions)} steps of {task.world_count} worlds"
+        f"iteration {content['iteration']} of {content['train']['task']}: {counted(len(actions), 'step')} of {counted(task.world_count, 'world')}"
     )
     found = 0
     for step, action in enumerate(actions):

@@ -10,9 +10,11 @@ does, the training neither waits nor fails: the metrics are in the store, and ar
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import select
+import socket
 import subprocess
 import sys
 import time
@@ -38,6 +40,38 @@ _PACKAGES = ("muster", "torch", "warp-lang", "newton", "mujoco", "mujoco-warp", 
 _NICE = 10
 
 Say = Callable[[str], None]
+
+
+class Turn:
+    """The right to send a run to a service, which one process has at a time; the kernel takes it back when the process dies.
+
+    Args:
+        run: The run.
+        kind: Name of the service.
+    """
+
+    def __init__(self, run: Run, kind: str) -> None:
+        self._path = run.tracking / f"{kind}.lock"
+        self._file: int | None = None
+
+    def take(self) -> str | None:
+        """Take it, unless it is taken already; returns who else has it, None for nobody. Raises OSError."""
+        if self._file is not None:
+            return None
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(file, 200).decode(errors="replace").strip()
+            os.close(file)
+            return holder or "another process"
+        except OSError:  # a volume without locks
+            pass
+        os.truncate(file, 0)
+        os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        self._file = file
+        return None
 
 
 class Sender:
@@ -167,6 +201,7 @@ def beside_a_rank() -> None:
         return
     tell(ready=True)
     sender = Sender(run, service, order["service"], same_iterations(train), lambda text: tell(said=text))
+    turn, waits_for = Turn(run, order["service"]), None
     resumed_from, ending = None, None
     while ending is None:
         if select.select([0], [], [], LOOK_SECONDS)[0]:
@@ -174,20 +209,32 @@ def beside_a_rank() -> None:
         try:
             check_epoch(run, epoch)
             resumed_from = _resumed_from(run, epoch) if resumed_from is None else resumed_from
-            if resumed_from is not None:  # else this attempt has not begun to train
+            if resumed_from is None:  # this attempt has not begun to train
+                continue
+            other = turn.take()
+            if other is None:
                 sender.step(resumed_from, epoch)
+            elif other != waits_for:
+                tell(said=f"{other} sends this run; what is new is sent after it")
+            waits_for = other
         except StaleEpoch:
             return
         except (OSError, ValueError):  # the volume is away
             continue
     if resumed_from is None:
         tell(done=True)
-    elif sender.step(resumed_from, epoch, at_once=True):
+    elif _is_ours(turn) and sender.step(resumed_from, epoch, at_once=True):
         try:
             sender.finish(ending["end"])
             tell(done=True)
         except Exception as error:
             tell(said=f"warning: its end could not be sent ({one_line(error)})")
+
+
+def _is_ours(turn: Turn) -> bool:
+    with contextlib.suppress(OSError):  # the volume is away
+        return turn.take() is None
+    return False
 
 
 def _resumed_from(run: Run, epoch: int) -> int | None:
@@ -224,6 +271,13 @@ def afterwards(directory: str, kind: str) -> int:
         service.prepare()
     except Refused as refused:
         return _fail(f"{kind}: {refused}")
+    turn = Turn(run, kind)
+    try:
+        other = turn.take()
+    except OSError as error:
+        return _fail(f"{kind}: {run.tracking} can't be written ({error.strerror})")
+    if other is not None:
+        return _fail(f"{kind}: {other} sends this run already; run this again once its training is over")
     sender = Sender(
         run, service, kind, same_iterations(spec["train"]), lambda text: print(f"{kind}: {text}", flush=True)
     )

@@ -65,7 +65,12 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 
 
 def submit(
-    context: Context, spec: Spec, directory: str, what: str, environment: Mapping[str, str]
+    context: Context,
+    spec: Spec,
+    directory: str,
+    what: str,
+    environment: Mapping[str, str],
+    tags: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, Any], Job]:
     """Register and submit the job; nothing is committed. Raises ClientError.
 
@@ -75,10 +80,11 @@ def submit(
         directory: Its working directory.
         what: Begins the words of a refusal.
         environment: Added on every node.
+        tags: Of the job.
     """
     definition = check(context, spec, directory, what)
     registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
-    request = compile_submission(spec, registered["jobDefinitionArn"], environment)
+    request = compile_submission(spec, registered["jobDefinitionArn"], environment, tags)
     answer = submission.submit_job(context, batch.validate("SubmitJob", request))
     context.session.flush()
     job = context.session.get(Job, answer["jobId"])

@@ -15,10 +15,10 @@ from orchestrator.api.permissions import Operation
 from orchestrator.controller import Controller
 from orchestrator.ownership import owner_of
 from orchestrator.tables import RunRecord
-from shared_store import models
+from shared_store import bundles, models
 from shared_store.bundles import DamagedBundle
 from shared_store.files import DamagedFile
-from shared_store.models import Model, ModelError, UnknownModel
+from shared_store.models import AlreadyRegistered, Model, ModelError, UnknownModel
 
 router = APIRouter()
 
@@ -30,6 +30,7 @@ class RegisterRequest(BaseModel):
     checkpoint: int | Literal["best", "latest"] | None = Field(
         default=None, description="iteration; best; latest, the newest, where absent"
     )
+    again: bool = Field(default=False, description="register a checkpoint that is a version of the model already")
 
 
 @router.get("/models")
@@ -47,13 +48,14 @@ def read_model(
     version: int | None = Query(default=None, ge=1, description="the newest where absent"),
     verify: bool = Query(default=False, description="read every file and check its digest"),
 ) -> Any:
-    """A version of a model, with its policy contract and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
+    """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
     controller = controller_of(request)
     model = _find(controller, name, version)
     permissions.check(Operation.READ_MODEL, _owner(model))
     found = _described(model, verify)
     try:
         found["contract"] = model.contract().document()
+        found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
     except DamagedBundle as error:
         found["problem"] = found.get("problem") or str(error)
     return permissions.shown({**found, "versions": [each.version for each in models.versions(controller.store, name)]})
@@ -78,7 +80,11 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
         if there:
             permissions.check(Operation.REGISTER_MODEL, _owner(there[-1]))
         facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
-        model = models.register(controller.store, body.name, run, checkpoint, facts, controller.peers.id)
+        model = models.register(
+            controller.store, body.name, run, checkpoint, facts, controller.peers.id, again=body.again
+        )
+    except AlreadyRegistered as error:
+        raise ClientError(str(error), CONFLICT) from None
     except ModelError as error:
         raise ClientError(str(error)) from None
     except (DamagedBundle, DamagedFile) as error:

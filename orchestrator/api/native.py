@@ -13,6 +13,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
@@ -28,7 +29,7 @@ from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import sources_of
 from orchestrator.bus import BusError
 from orchestrator.controller import Controller
-from orchestrator.database import DatabaseError, find_job
+from orchestrator.database import DatabaseError, find_job, short_id
 from orchestrator.definition import GangNeeds, compile_definition, gang_needs
 from orchestrator.engines.base import EngineError, Gang, Plan, engine_of
 from orchestrator.engines.several import FRESH
@@ -36,7 +37,7 @@ from orchestrator.errors import SpecError
 from orchestrator.evaluating import automatic_evaluation, place_of, wanted_of
 from orchestrator.excerpts import LONGEST_REASON, excerpt
 from orchestrator.jobs import Status
-from orchestrator.ownership import owner_of
+from orchestrator.ownership import is_of_earlier_run, owner_of
 from orchestrator.pools import own_queues, queue_engines
 from orchestrator.scheduling.placement import needs as needed
 from orchestrator.spec import KINDS
@@ -67,9 +68,21 @@ def _job(session: Session, reference: str, operation: Operation) -> Job:
     """The job, where the caller may do this to it. Raises ClientError."""
     job = find_job(session, reference, permissions.visible_queues())
     if job is None:
-        raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
+        hint = _jobs_of_run(session, reference) or f"job {reference} does not exist; `muster list` shows the jobs"
+        raise ClientError(hint, 404)
     permissions.check(operation, job)
     return job
+
+
+def _jobs_of_run(session: Session, reference: str) -> str:
+    """Which jobs made the run of this name, for who names it where a job is meant; empty where no visible job did."""
+    query = select(Job).where(Job.run == reference).order_by(Job.created_at)
+    made = [job for job in session.scalars(query) if permissions.is_visible(job)]
+    if not made:
+        return ""
+    named = ", ".join(f"{job.name} ({short_id(job.id)})" for job in made[-5:])
+    which = "job" if len(made) == 1 else "jobs"
+    return f"{reference} is a run, which {which} {named} made; see: muster show {short_id(made[-1].id)}"
 
 
 @router.get("/capacity")
@@ -209,6 +222,8 @@ def job_detail(request: Request, reference: str) -> Any:
         run = controller.store.run(job.run)
         owner = owner_of(session, run)
         is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
+        is_replaced = is_of_earlier_run(job, run)
+        is_visible = is_visible and not is_replaced
         described = runs.results_of(controller, session, run) if is_visible else None
         with reading(job):
             attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
@@ -218,6 +233,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "name": job.name,
                 "owner": job.owner,
                 "run": job.run,
+                "runIsReplaced": is_replaced,
                 "kind": next((kind for kind in KINDS if (needs.spec or {}).get(kind)), "command"),
                 "status": job.status,
                 "statusReason": controller.reason(job) or job.status_reason,

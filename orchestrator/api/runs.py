@@ -23,7 +23,7 @@ from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.excerpts import LONGEST_REASON, excerpt, shown
 from orchestrator.jobs import Status
-from orchestrator.ownership import owner_of
+from orchestrator.ownership import is_of_earlier_run, jobs_of, owner_of
 from orchestrator.spec import ALGORITHMS, Spec, Train, override, validate
 from orchestrator.tables import AutomaticEvaluation, Job, RunRecord
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat, best_evaluated, list_checkpoints
@@ -33,6 +33,7 @@ from shared_store.layout import Run
 from shared_store.metrics import history_of
 from shared_store.parent import TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.wording import counted
 
 
 def list_runs(controller: Controller, session: Session, after: str, most: int) -> list[dict[str, Any]]:
@@ -311,12 +312,14 @@ def _worlds(session: Session, run: Run, before: Spec, after: Spec, chosen: Check
     if changed and wanted != worlds:
         assert chosen is not None
         raise ClientError(
-            f"run {run.name}: checkpoint {chosen.name} holds {worlds} worlds, this job would have {wanted} "
-            f"({after.nodes.max} nodes × {after.ranks_per_node} ranks × {after.train.worlds}); "
+            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {wanted} "
+            f"({counted(after.nodes.max, 'node')} × {counted(after.ranks_per_node, 'rank')} × {after.train.worlds}); "
             "leave train.worlds as it is: the worlds are dealt out to whatever ranks there are"
         )
     if worlds < ranks:
-        raise ClientError(f"run {run.name}: {worlds} worlds can't be dealt out to {ranks} ranks; use fewer nodes")
+        raise ClientError(
+            f"run {run.name}: {counted(worlds, 'world')} can't be dealt out to {counted(ranks, 'rank')}; use fewer nodes"
+        )
     return worlds
 
 
@@ -342,7 +345,7 @@ def newest_job(session: Session, run: Run) -> Job | None:
 def _of_run(run: Run) -> list[ColumnElement[bool]]:
     """Those of the run's jobs that the caller may see: a key with all queues may have continued it in another queue."""
     queues = visible_queues()
-    return [Job.run == run.name, *([] if queues is None else [Job.queue.in_(queues)])]
+    return [*jobs_of(run), *([] if queues is None else [Job.queue.in_(queues)])]
 
 
 def _evaluated(run: Run) -> dict[str, dict[str, Any]]:
@@ -365,12 +368,14 @@ def _best(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str
 def _automatic(session: Session, run: Run) -> dict[str, Any] | None:
     """The newest automatic evaluation of a training, how it is, and how many checkpoints that were due were passed over."""
     row = session.get(AutomaticEvaluation, run.name)
-    if row is None:
+    training = session.get(Job, row.training) if row else None
+    if row is None or (training is not None and is_of_earlier_run(training, run)):
         return None
     job = session.get(Job, row.job) if row.job else None
     job = job if job is not None and is_visible(job) else None  # it may be in a queue that the caller can't see
     return {
         "checkpoint": row.checkpoint,
+        "iteration": int(row.checkpoint.partition("-")[0]) if row.checkpoint else None,
         "job": row.job,
         "status": job.status if job else None,
         "statusReason": job.status_reason if job else None,

@@ -9,7 +9,8 @@ import sys
 
 import typer
 
-from orchestrator.cli.catalogue import Catalogue, add_placeholders
+from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
+from orchestrator.cli.misuse import Misuse, told
 from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
@@ -47,7 +48,14 @@ def main() -> None:
     """Entry point of the command."""
     log_visibly()
     try:
-        app()
+        sys.exit(app(standalone_mode=False) or 0)
+    except Misuse as error:
+        if words := told(error, [entry.name for entry in ENTRIES]):
+            echo(f"muster: {one_line(words)}", err=True)
+        sys.exit(2)
+    except typer.Abort:
+        echo("muster: nothing was done", err=True)
+        sys.exit(1)
     except (SpecError, UsageError, NoUrl) as error:
         _fail(error, 2)
     except ApiError as error:

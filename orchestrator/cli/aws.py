@@ -13,10 +13,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.misuse import Group
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.engines.aws_config import config_path
 from orchestrator.errors import ServerError
 from orchestrator.home import muster_home
+from shared_store.wording import counted
 
 if TYPE_CHECKING:
     from orchestrator.aws_stack import Event, Stack
@@ -29,8 +31,10 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(
+        cls=Group,
         no_args_is_help=True,
         help="The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch).",
+        epilog="Examples:  muster aws up --region eu-west-1   then   muster serve --engine aws-batch",
     )
     group.command(epilog="Example:  muster aws up --region eu-west-1 --parameter InstanceTypes=g6.4xlarge")(up)
     group.command(epilog="Example:  muster aws down")(down)
@@ -98,7 +102,11 @@ def down(
     stays = f"file system {volume}, with all runs and checkpoints, stays" if volume else "there is no volume yet"
     if not yes:
         jobs = stack.jobs(outputs["JobQueueArn"]) if "JobQueueArn" in outputs else {}
-        ended = f"{sum(jobs.values())} jobs in it are ended; " if jobs else ""
+        ended = (
+            f"{counted(sum(jobs.values()), 'job')} in it {'is' if sum(jobs.values()) == 1 else 'are'} ended; "
+            if jobs
+            else ""
+        )
         typer.confirm(f"delete stack {stack_name} in {stack.region}? {ended}images and logs go; {stays}", abort=True)
     began = time.time() - 1
     events = _follow(stack, stack.delete(), began)

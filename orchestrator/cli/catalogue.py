@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperGroup
+
+from orchestrator.cli.misuse import Group
 
 
 class Entry(NamedTuple):
@@ -29,7 +31,7 @@ ENTRIES = (
         "Run a job to its end, with a controller of its own where none is running; exit with its result.",
     ),
     Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
-    Entry("list", "jobs", _JOBS, "List jobs, the newest first."),
+    Entry("list", "listing", _JOBS, "List jobs, the newest first."),
     Entry("show", "jobs", _JOBS, "Show a job: its state and why, its attempts and nodes, its run and results."),
     Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
     Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and leaves; `muster resume` goes on from there."),
@@ -52,7 +54,7 @@ ENTRIES = (
         "export",
         "export",
         _RUNS,
-        "Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.",
+        "Export a policy as a bundle for a robot: ONNX, contract and self-test, compared with the policy.",
     ),
     Entry(
         "models",
@@ -71,7 +73,7 @@ ENTRIES = (
         "verify-resume",
         "verify",
         _RUNS,
-        "Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.",
+        "Prove that a training survives a crash: train it twice, kill one, compare all that they end with.",
     ),
     Entry(
         "serve", "serving", _SHARED, "Run the controller as a server. Running jobs outlive it; the next one finds them."
@@ -100,9 +102,11 @@ ENTRIES = (
         "doctor",
         "doctor",
         _HERE,
-        "Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing.",
+        "Look whether this machine has what Muster needs; exit 1 where what was asked for is missing.",
     ),
 )
+_LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
+"""Of a line that is not the last one of its paragraph."""
 _MODULES = {entry.name: entry.module for entry in ENTRIES}
 
 
@@ -110,10 +114,14 @@ def load(name: str) -> Any:
     """The command itself. Imports its module."""
     own = typer.Typer(rich_markup_mode="rich")
     import_module(f"orchestrator.cli.{_MODULES[name]}").register(own)
-    return typer.main.get_group(own).commands[name]
+    command: Any = typer.main.get_group(own).commands[name]
+    for each in (command, *getattr(command, "commands", {}).values()):
+        # the lines of a docstring are as long as the source's; where they are broken is for the terminal to say
+        each.help = _LINE_END.sub(" ", each.help or "")
+    return command
 
 
-class Catalogue(TyperGroup):
+class Catalogue(Group):
     """The group that lists placeholders and runs the commands themselves."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

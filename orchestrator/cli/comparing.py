@@ -14,8 +14,11 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from orchestrator.compared import Group, RunFacts, grouped
+from orchestrator.compared import Group, RunFacts, grouped, same_episodes
+from orchestrator.curves import ENDINGS, draw
 from orchestrator.errors import UsageError
+from shared_store.pairs import paired, read_returns
+from shared_store.wording import counted
 
 _PAGE = 10_000
 
@@ -30,7 +33,10 @@ def compare(
         typer.Argument(metavar="RUN…", help="Runs, or patterns of them in quotes: 'ant-*'. Two or more in all."),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Draw the return against the steps into this PNG file.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", help=f"Write the return against the steps into this file: {', '.join(ENDINGS)}."
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -38,8 +44,10 @@ def compare(
     """Compare runs, or groups of runs that differ in their seed alone; draw their curves.
 
     A group has the mean over its runs ± their standard deviation. EVALUATED is the return of each run's best checkpoint in its
-    evaluations (its last checkpoint has one); an interval of 95 % where the group is a single run.
+    evaluations (its last checkpoint has one); an interval of 95 % where the group is a single run. Single runs that `muster evaluate`
+    had play the same episodes (the same --seed) are compared with the first one episode by episode.
     """
+    _check_output(output)
     if output is not None:
         refuse_existing(output, overwrite)
     with Client.connect() as client:
@@ -47,8 +55,9 @@ def compare(
         groups = grouped([_facts(client, name) for name in names])
     if output is not None:
         _draw(groups, output)
+    versus = [_versus(group, groups[0]) for group in groups]
     if as_json:
-        echo_json([group.describe() for group in groups], indent=1)
+        echo_json([{**group.describe(), "against": told} for group, told in zip(groups, versus, strict=True)], indent=1)
         return
     table = Table(box=None, pad_edge=False)
     for column in ("RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS"):
@@ -56,8 +65,33 @@ def compare(
     for group in groups:
         table.add_row(*group.cells())
     print_cut(table)
+    for told in filter(None, versus):
+        low, high = (f"{end:+.2f}" if end is not None else "-" for end in (told["low"], told["high"]))
+        echo(
+            f"{told['new']} against {told['old']}: return {told['difference']:+.2f} ({low} to {high}, paired over "
+            f"{counted(told['pairs'], 'episode')}): {told['verdict']}"
+        )
     if output is not None:
-        echo(f"drawn: {output}")
+        echo(f"written: {output}")
+
+
+def _versus(group: Group, first: Group) -> dict[str, Any] | None:
+    """How a single run differs from the first one in the same episodes; None where there are no such, or they can't be read here."""
+    if group is first or len(group.runs) > 1 or len(first.runs) > 1:
+        return None
+    new, old = group.runs[0], first.runs[0]
+    pair = same_episodes(new, old)
+    if pair is None:
+        return None
+    tables = [
+        Path(run.path) / "evaluations" / f"{each['name']}.parquet" for run, each in zip((new, old), pair, strict=True)
+    ]
+    try:
+        told = paired(*map(read_returns, tables))
+    except (ImportError, OSError, ValueError):  # the store is on another machine, say
+        return None
+    names = [f"{run.name}@{each['iteration']}" for run, each in zip((new, old), pair, strict=True)]
+    return {"new": names[0], "old": names[1], **told}
 
 
 def _chosen(client: Client, patterns: Sequence[str]) -> list[str]:
@@ -98,20 +132,30 @@ def _facts(client: Client, name: str) -> RunFacts:
     best = next((each for each in listed if each["best"] and each["evaluated"]), None)
     judged = best or next((each for each in reversed(listed) if each["evaluated"]), None)
     evaluations = client.get(f"/api/runs/{named(name)}/evaluations")
+    of_it = [each for each in evaluations if judged and each["checkpoint"] == judged["name"]]
     called = judged["evaluated"]["name"] if judged else None
     evaluation = next((each for each in evaluations if each["name"] == called), None)
-    return RunFacts(name, described["spec"] or {}, records, evaluation)
+    return RunFacts(name, described["spec"] or {}, records, evaluation, of_it, described["path"])
+
+
+def _check_output(output: Path | None) -> None:
+    """Refuse what can't be written before anything is asked. Raises UsageError."""
+    if output is None:
+        return
+    if output.suffix not in ENDINGS:
+        raise UsageError(f"-o {output}: the ending says what is written; there are {', '.join(ENDINGS)}")
+    if not output.parent.is_dir():
+        raise UsageError(f"-o {output}: {output.parent} is no directory")
 
 
 def _draw(groups: Sequence[Group], output: Path) -> None:
     """Raises UsageError."""
-    if not output.parent.is_dir():
-        raise UsageError(f"-o {output}: {output.parent} is no directory")
-    try:
-        from orchestrator.curves import draw
-    except ImportError:
-        raise UsageError("-o needs matplotlib, which this environment lacks: pip install 'muster[plot]'") from None
     try:
         draw(groups, output)
+    except ImportError:
+        raise UsageError(
+            f"-o {output}: a picture needs matplotlib, which this environment lacks: pip install 'muster[plot]'; "
+            ".csv needs nothing"
+        ) from None
     except (OSError, ValueError) as error:
         raise UsageError(f"-o {output}: {getattr(error, 'strerror', None) or error}") from None

@@ -28,6 +28,7 @@ from orchestrator.errors import ApiError, Unreachable
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
 from shared_store.files import write_json
+from shared_store.wording import counted
 
 _WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
 _LEAST_SHARED_MEMORY = 256
@@ -59,7 +60,7 @@ def doctor(
     worker: Annotated[bool, typer.Option("--worker", help="This machine must be able to run nodes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Look whether this machine has what Muster needs; exit 1 where something that was asked for is missing."""
+    """Look whether this machine has what Muster needs; exit 1 where what was asked for is missing."""
     findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
     if as_json:
         echo_json([asdict(finding) for finding in findings], indent=1)
@@ -151,4 +152,4 @@ def _engine(name: str) -> str:
     # an engine that launches nothing writes nothing there
     hosts = [host for host in make_engine(name, muster_home()).capacity() if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
-    return f"{len(hosts)} host{'s' if len(hosts) != 1 else ''}, {cpus:g} CPUs, {gpus} GPUs"
+    return f"{counted(len(hosts), 'host')}, {cpus:g} CPU{'s' if cpus != 1 else ''}, {counted(gpus, 'GPU')}"

@@ -17,6 +17,7 @@ from orchestrator.spec import override, validate
 from shared_store import bundles
 from shared_store.files import read_json
 from shared_store.layout import Store
+from shared_store.wording import counted
 
 _EXAMPLES = """Examples:  muster export ant-1f2e3d4c -o ant-policy
 muster export ant-1f2e3d4c@300 --episodes 64 --set resources.gpus=1"""
@@ -48,7 +49,7 @@ def export(
     ] = None,
     store: StoreOption = None,
 ) -> None:
-    """Export a policy as a bundle for a robot: ONNX, TorchScript, contract and self-test, compared with the policy.
+    """Export a policy as a bundle for a robot: ONNX, contract and self-test, compared with the policy.
 
     A job writes it to exports/ of the run, with a controller of its own where none is running. The bundle appears only where its
     policy acts as the trained one on recorded observations (1e-5), and does as well on the same simulated worlds.
@@ -115,6 +116,6 @@ def _tell(place: Path, output: Path | None) -> None:
     if judged:
         a, b = judged["trained"]["mean_return"], judged["bundle"]["mean_return"]
         echo(
-            f"  judged:      return {b:.2f} of the bundle, {a:.2f} of the trained policy, {judged['episodes']} episodes"
+            f"  judged:      return {b:.2f} of the bundle, {a:.2f} of the trained policy, {counted(judged['episodes'], 'episode')}"
         )
     echo(f"  bundle:      {output or place} ({len(manifest['files']) + 1} files, {size / 1024:.0f} KiB)")

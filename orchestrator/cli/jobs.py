@@ -1,4 +1,4 @@
-"""``muster submit``, ``list``, ``show``, ``stop``, ``schema``."""
+"""``muster submit``, ``show``, ``stop``, ``schema``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 
 from orchestrator import specfile
 from orchestrator.cli.progress import best_told, evaluated, follow
-from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line, print_cut
+from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.engines import ENGINES
@@ -23,6 +23,7 @@ from orchestrator.engines.base import engine_of
 from orchestrator.errors import SpecError
 from orchestrator.spec import Spec
 from orchestrator.spec_schema import contract_schema, schema
+from shared_store.wording import counted
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 SetOption = Annotated[
@@ -38,12 +39,13 @@ JobArgument = Annotated[
 
 _PATIENCE = 3.0
 """Seconds after which a stop that takes its time says why."""
-_COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
+_OF_RUN = {"evaluate": "evaluates", "export": "exports", "record": "records", "render": "renders"}
+"""What a job of each kind does with another run."""
+COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
 def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster submit job_specs/ant.yaml --set train.iterations=600 -f")(submit)
-    app.command("list", epilog="Example:  muster list --json | jq '.[].jobId'")(list_jobs)
     app.command(epilog="Example:  muster show ant")(show)
     app.command(epilog="Example:  muster stop ant   then   muster resume RUN")(stop)
     app.command(epilog="Example:  muster checkpoint ant")(checkpoint)
@@ -163,60 +165,6 @@ def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
         echo(f"\n{plan['document']}")
 
 
-def list_jobs(
-    all_: Annotated[bool, typer.Option("--all", "-a", help="All jobs, not the newest 20.")] = False,
-    queue: Annotated[str | None, typer.Option(help="Only of this queue.")] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """List jobs, the newest first."""
-    with Client.connect() as client:
-        queues = [queue] if queue else client.get("/api/capacity")["queues"]
-        summaries = [summary for name in queues for summary in _list_queue(client, name, all_)]
-    summaries.sort(key=lambda summary: -summary["createdAt"])
-    shown = summaries if all_ else summaries[:20]
-    if as_json:
-        echo_json(shown, indent=1)
-        return
-    if not shown:
-        echo("no jobs yet; start one with: muster submit job_specs/cartpole.yaml")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("JOB", "NAME", "STATUS", "NODES", "CREATED", "TOOK"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("REASON", no_wrap=True, overflow="ellipsis")
-    for summary in shown:
-        colour = _COLOURS.get(summary["status"], "white")
-        took = _took(summary.get("startedAt"), summary.get("stoppedAt"))
-        reason = summary.get("statusReason", "") if summary["status"] != "SUCCEEDED" else ""
-        nodes = _nodes(summary)
-        created = _when(summary["createdAt"])
-        table.add_row(
-            *(summary["jobId"][:8], summary["jobName"], f"[{colour}]{summary['status']}[/]", nodes, created, took),
-            escape(one_line(reason)),  # a compiler's message has lines, and brackets that are no markup
-        )
-    print_cut(table)
-
-
-def _list_queue(client: Client, queue: str, all_: bool) -> list[dict[str, Any]]:
-    """The newest 20 jobs of a queue, or all."""
-    summaries: list[dict[str, Any]] = []
-    more: dict[str, str] = {}
-    while True:
-        # a filter, because a listing by status shows one status at a time
-        everything = [{"name": "AFTER_CREATED_AT", "values": ["0"]}]
-        page = client.batch("ListJobs", jobQueue=queue, filters=everything, **more)
-        summaries += page["jobSummaryList"]
-        if not page.get("nextToken") or (not all_ and len(summaries) >= 20):
-            return summaries
-        more = {"nextToken": page["nextToken"]}
-
-
-def _nodes(summary: dict[str, Any]) -> str:
-    if size := summary.get("arrayProperties", {}).get("size"):
-        return f"1 × {size}"
-    return str(summary.get("nodeProperties", {}).get("numNodes", 1))
-
-
 def _counted(summary: dict[str, int]) -> str:
     """The children of an array by state."""
     return ", ".join(f"{count} {status}" for status, count in summary.items() if count)
@@ -238,7 +186,7 @@ def _gpus(node: dict[str, Any]) -> str:
     known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
     if known:
         return f", GPUs {','.join(known)}"
-    return f", {len(node['gpus'])} GPU{'s' if len(node['gpus']) != 1 else ''}"
+    return f", {counted(len(node['gpus']), 'GPU')}"
 
 
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
@@ -250,14 +198,15 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         echo_json(detail, indent=1)
         return
     console = Console(highlight=False, soft_wrap=True)
-    colour = _COLOURS.get(detail["status"], "white")
+    colour = COLOURS.get(detail["status"], "white")
     console.print(f"[bold]{detail['name']}[/]  {detail['id']}  [{colour}]{detail['status']}[/]")
     facts = {
         "why": "" if detail["status"] == "SUCCEEDED" else one_line(detail["statusReason"] or ""),
-        "created": _when(detail["createdAt"]),
-        "took": _took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
+        "created": when(detail["createdAt"]),
+        "took": took(next((a["startedAt"] for a in detail["attempts"] if a["startedAt"]), None), detail["stoppedAt"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),
-        "run": detail["run"],
+        "run": detail["run"] + (" (gone; another run has its name now)" if detail["runIsReplaced"] else ""),
+        _OF_RUN.get(detail["kind"], ""): _source(detail),
         "started from": started_from((detail["results"] or {}).get("parent")),
         "definition": detail["job"]["jobDefinition"].rpartition("/")[2],
     }
@@ -271,8 +220,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
-    facts["best"] = best_told(results.get("best"))
-    facts["evaluating"] = _automatic(results.get("automatic"))
+    facts["best"] = best_told(detail["run"], results.get("best"))
+    facts["evaluating"] = _automatic(detail["run"], results.get("automatic"))
     facts |= {name: results.get(name) for name in ("checkpoint", "plot", "picture")} | {
         "directory": results.get("path")
     }
@@ -289,9 +238,9 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         if spent < attempt["number"]:  # of those that are allowed, attempts that left on request are none
             number = f"{attempt['number']} ({spent} of {detail['attemptsAllowed']} spent)"
         reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] and ended != "succeeded" else ""
-        took = _took(attempt["startedAt"], attempt["stoppedAt"])
+        lasted = took(attempt["startedAt"], attempt["stoppedAt"])
         console.print(
-            f"  attempt {number} (epoch {attempt['epoch']}, {took}{_used(attempt, detail['kind'] == 'train')}) {ended}{counted}{reason}",
+            f"  attempt {number} (epoch {attempt['epoch']}, {lasted}{_used(attempt, detail['kind'] == 'train')}) {ended}{counted}{reason}",
             markup=False,
         )
         for node in attempt["nodes"]:
@@ -303,7 +252,15 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             console.print(f"      {node['log']}", markup=False, style="dim")
 
 
-def _automatic(told: Mapping[str, Any] | None) -> str:
+def _source(detail: Mapping[str, Any]) -> str:
+    """What a job reads of another run, as ``RUN@ITERATION``."""
+    section = (detail["spec"] or {}).get(detail["kind"])
+    if not isinstance(section, dict) or "run" not in section:
+        return ""
+    return f"{section['run']}@{section.get('checkpoint', 'latest')}"
+
+
+def _automatic(run: str, told: Mapping[str, Any] | None) -> str:
     """The newest automatic evaluation of a training in one line."""
     if not told:
         return ""
@@ -311,10 +268,10 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     if told["job"]:
         reason = f": {one_line(told['statusReason'] or '')}" if told["status"] not in ("SUCCEEDED", None) else ""
         parts.append(
-            f"checkpoint {told['checkpoint']} by job {told['job'][:8]}, {told['status'] or 'which can not be seen'}{reason}"
+            f"{run}@{told['iteration']} by job {told['job'][:8]}, {told['status'] or 'which can not be seen'}{reason}"
         )
     if told["passed"]:
-        parts.append(f"{told['passed']} that were due were passed over for newer ones")
+        parts.append(f"{counted(told['passed'], 'checkpoint')} passed over for newer ones")
     if told["problem"]:
         parts.append(one_line(told["problem"]))
     return "; ".join(parts)
@@ -391,11 +348,11 @@ def print_schema(
     echo_json(contract_schema() if contract else schema(), indent=2)
 
 
-def _when(milliseconds: int | None) -> str:
+def when(milliseconds: int | None) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(milliseconds / 1000)) if milliseconds else "-"
 
 
-def _took(start: int | None, end: int | None) -> str:
+def took(start: int | None, end: int | None) -> str:
     if not start:
         return "-"
     seconds = (

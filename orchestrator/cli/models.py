@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -12,14 +13,17 @@ from rich.table import Table
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
 from orchestrator.cli.jobs import JsonOption, scored
+from orchestrator.cli.misuse import Group
 from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.errors import UsageError
+from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
 from shared_store.evaluations import flattened
 from shared_store.policy_contract import differences, read
+from shared_store.wording import counted
 
 ModelArgument = Annotated[
     str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version where none is named.")
@@ -31,6 +35,7 @@ muster models verify ant@1"""
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(
+        cls=Group,
         no_args_is_help=True,
         rich_markup_mode="rich",
         epilog=_EXAMPLES,
@@ -47,13 +52,16 @@ def register(app: typer.Typer) -> None:
 def register_model(
     source: CheckpointArgument,
     name: Annotated[str, typer.Option(help="Of the model; its versions count up from 1.")],
+    again: Annotated[
+        bool, typer.Option("--again", help="Make another version of a checkpoint that the model has already.")
+    ] = False,
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Keep the bundle of a checkpoint, which `muster export` made, as the next version of a model."""
     run, checkpoint = split_reference(source)
     with controller(store, None) as connect:
-        body = {"name": name, "checkpoint": checkpoint}
+        body = {"name": name, "checkpoint": checkpoint, "again": again}
         found = connect().post(f"/api/runs/{named(run)}/models", body, seconds=300)
     if as_json:
         echo_json(found, indent=1)
@@ -108,7 +116,7 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
         )
     if judged := found.get("judged"):
         echo(
-            f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {judged['episodes']} episodes"
+            f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {counted(judged['episodes'], 'episode')}"
         )
     versions = ", ".join(f"{name} {version}" for name, version in (found.get("made_with") or {}).items())
     echo(f"  made with:   {versions or 'not known'}")
@@ -127,7 +135,7 @@ def diff(
     store: StoreOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what differs between two versions: contract, settings, versions. A line each; exit 1 where anything differs."""
+    """Say what differs between two versions: contract, settings, programs, weights. A line each; exit 1 where anything does."""
     now = _read(model, store)
     if other is None:
         earlier = [version for version in now["versions"] if version < now["version"]]
@@ -144,11 +152,13 @@ def diff(
         raise UsageError(str(error)) from None
     for section in ("task", "algorithm", "train", "settings", "made_with", "code"):
         lines += _changed(section, before.get(section), now.get(section))
+    if weights := _weights(before, now):
+        lines.append(weights)
     if as_json:
         echo_json(lines, indent=1)
     else:
         names = [f"{each['name']}@{each['version']}" for each in (before, now)]
-        for line in lines or [f"{names[0]} and {names[1]} have the same contract, settings and versions"]:
+        for line in lines or [f"{names[0]} and {names[1]} have the same contract, settings, versions and weights"]:
             echo(line)
     if lines:
         raise typer.Exit(1)
@@ -172,6 +182,17 @@ def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
         wanted = {"version": int(version)} if sign else {}
         found: dict[str, Any] = connect().get(f"/api/models/{named(name)}", seconds=300, **wanted, **options)
     return found
+
+
+def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """How the weights differ, in one line; empty where they are the same."""
+    digests = [str(each.get("weights")) for each in (before, now)]
+    if digests[0] == digests[1]:
+        return ""
+    from orchestrator.weights import difference  # imports what reads ONNX, where there is such a package
+
+    told = difference(*(Path(each["path"]) / "bundle" / POLICY for each in (before, now)))
+    return "" if told == "" else f"weights {told or f'differ: SHA-256 {digests[0][:12]} became {digests[1][:12]}'}"
 
 
 def _changed(place: str, before: Any, now: Any) -> list[str]:

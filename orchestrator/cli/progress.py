@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client
 from orchestrator.errors import Unreachable
+from shared_store.wording import counted
 
 _TERMINAL = ("SUCCEEDED", "FAILED")
 _POLL = 0.3
@@ -80,7 +81,7 @@ def summary(client: Client, job_id: str) -> int:
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
         console.print(f"  evaluation:  {evaluated(evaluation)}")
-    if succeeded and (best := best_told(results.get("best"))):
+    if succeeded and (best := best_told(detail["run"], results.get("best"))):
         console.print(f"  best:        {best}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
     known = {name: results.get(name) for name in ("checkpoint", "plot", "picture")}
@@ -98,15 +99,15 @@ def evaluated(figures: dict[str, Any]) -> str:
     length, longest = figures["mean_length"], figures["max_length"]
     return (
         f"mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
-        f"mean return {figures['mean_return']:.2f} over {figures['episodes']} episodes"
+        f"mean return {figures['mean_return']:.2f} over {counted(figures['episodes'], 'episode')}"
     )
 
 
-def best_told(best: Mapping[str, Any] | None) -> str:
+def best_told(run: str, best: Mapping[str, Any] | None) -> str:
     """The best checkpoint by evaluations in one line; nothing where none can be compared with another."""
     if not best:
         return ""
-    return f"checkpoint {best['checkpoint']}, mean return {best['mean']:.2f}, of {best['of']} that are evaluated"
+    return f"{run}@{best['iteration']}, mean return {best['mean']:.2f}, of {best['of']} checkpoints that are evaluated"
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
@@ -203,7 +204,7 @@ class _Display:
     def state(self, job: dict[str, Any]) -> str:
         """State and reason, with what a first start is busy with."""
         if job["status"] == "RUNNING":
-            return f"starting {self.nodes} nodes: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
+            return f"starting {counted(self.nodes, 'node')}: loading libraries, compiling kernels the first time ({time.monotonic() - self.started:.0f} s)"
         return f"{job['status']}: {one_line(job.get('statusReason', ''))}"
 
 
@@ -234,7 +235,7 @@ class _Bar(_Display):
             iteration = record["iteration"]
             text = (
                 f"{iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-                f"{values['rate']} steps/s  ETA {self.eta(record)}  {self.nodes} node{'s' if self.nodes != 1 else ''}"
+                f"{values['rate']} steps/s  ETA {self.eta(record)}  {counted(self.nodes, 'node')}"
             )
             self._progress.update(self._task, completed=iteration, text=text)
         elif task.completed == 0 or job["status"] not in ("RUNNING", *_TERMINAL):

@@ -16,6 +16,7 @@ from orchestrator.client import Client
 from orchestrator.errors import SpecError
 from orchestrator.spec import Spec
 from orchestrator.spec_sections import Resources, Retry
+from shared_store.wording import counted
 
 Connect = Callable[[], Client]
 
@@ -37,7 +38,7 @@ def verify_resume(
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Prove that a training survives a crash: train it twice, kill one of the two, compare all that they end with.
+    """Prove that a training survives a crash: train it twice, kill one, compare all that they end with.
 
     The spec's training runs for AT + ITERATIONS iterations, once straight and once with SIGKILL of the main rank right after
     iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment; it counts in the first
@@ -91,7 +92,9 @@ def _notes(spec: Spec, at: int) -> list[str]:
             "the restart begins at iteration 0"
         )
     if spec.nodes.min != spec.nodes.max:
-        notes.append(f"note: both runs take {spec.nodes.max} nodes; another number of ranks adds in another order")
+        notes.append(
+            f"note: both runs take {counted(spec.nodes.max, 'node')}; another number of ranks adds in another order"
+        )
     if spec.resources.gpus:
         notes.append("note: GPUs add in no fixed order; a difference in the last bits is no defect there")
     return notes

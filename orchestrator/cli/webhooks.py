@@ -8,15 +8,19 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.misuse import Group
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
+from shared_store.wording import counted
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(
+        cls=Group,
         no_args_is_help=True,
         help="Webhooks of a controller: who is told when jobs end.\n\nThey are those of `muster serve --webhooks FILE`, a JSON "
         'object of names: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}.',
+        epilog="Examples:  muster webhooks test chat   then   muster webhooks list",
     )
     group.command("list", epilog="Example:  muster webhooks list --json | jq '.[].failed'")(list_webhooks)
     group.command(epilog="Example:  muster webhooks test chat")(test)
@@ -43,19 +47,25 @@ def list_webhooks(as_json: JsonOption = False) -> None:
     print_cut(table)
     for each in found:
         for message in each["failed"]:
-            echo(f"given up: {each['name']}, job {message['job']}, {message['tries']} tries: {message['problem']}")
+            echo(
+                f"given up: {each['name']}, job {message['job']}, {counted(message['tries'], 'try', 'tries')}: {message['problem']}"
+            )
 
 
 def test(
     name: Annotated[str, typer.Argument(help="Of the webhook.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Send a sample, once; exit 1 where the receiver does not accept it."""
+    """Send a sample, once; exit 1 where the receiver does not accept it.
+
+    It is signed like any message, and is none of those that `muster webhooks list` counts.
+    """
     with Client.connect() as client:
         sent = client.post(f"/api/webhooks/{named(name)}/test", {}, seconds=60)
     if as_json:
         echo_json(sent)
     else:
         echo(f"{name}: {sent['receiver']} {sent['problem'] or 'accepted the sample'} (webhook-id {sent['id']})")
+        echo("a sample is sent once, about no job; it is none of the messages that muster webhooks list counts")
     if sent["problem"]:
         raise typer.Exit(1)

@@ -31,6 +31,7 @@ from shared_store.files import DamagedFile
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT
 from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
+from shared_store.wording import counted
 
 _OVER = ("SUCCEEDED", "FAILED")
 _PORT = 29500
@@ -379,7 +380,7 @@ def _waiting(
     if parent["status"] == "RUNNING":
         return f"AWS Batch starts node {index} now that the main node runs"
     return (
-        f"AWS Batch gets {count} instance{'s' if count > 1 else ''} for queue {queue} ({status}); "
+        f"AWS Batch gets {counted(count, 'instance')} for queue {queue} ({status}); "
         "if that lasts, see `muster aws status` for limits and the account's quota of vCPUs"
     )
 

@@ -13,6 +13,7 @@ from orchestrator.scheduling.placement import affordable, count_of, needs
 from orchestrator.scheduling.quota import Quota
 from orchestrator.scheduling.room import Room, Seat
 from orchestrator.scheduling.snapshot import Pool, Shape
+from shared_store.wording import counted
 
 NO_ROOM = "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY"
 
@@ -97,6 +98,6 @@ class Lane:
             limit = self.quota.limit(shape.uses_gpus, self.room.totals(pool), self._max_cpus(pool))
             used = self.quota.used_of(pool, shape.uses_gpus)
             parts.append(f"its queue uses {used:g} of the {count_of(limit, what)} that it may use of {pool}")
-        shares = f"{self.quota.active} active share{'s' if self.quota.active != 1 else ''}"
+        shares = f"{counted(self.quota.active, 'active share')}"
         kept = f"{100 * self.quota.kept:.3g}% is kept for shares that are not active ({shares} now)"
         return f"{NO_ROOM} - {needs(shape)}; {'; '.join(parts)}: {kept}"

@@ -7,6 +7,7 @@ from math import inf
 
 from orchestrator.engines.base import Host, Placement
 from orchestrator.scheduling.snapshot import NodeShape, Shape
+from shared_store.wording import counted
 
 EPSILON = 1e-9
 """CPUs are fractions that are added and taken away: this much [CPUs] is rounding."""
@@ -101,7 +102,7 @@ def less(host: Host, taken: Iterable[Placement]) -> Host:
 def needs(shape: Shape) -> str:
     """What the gang needs at the least, in words."""
     at_least = "at least " if shape.minimum < len(shape.nodes) else ""
-    nodes = f"{shape.minimum} node{'s' if shape.minimum != 1 else ''}"
+    nodes = counted(shape.minimum, "node")
     return f"needs {at_least}{nodes} with {amounts(*shape.least)} in all"
 
 

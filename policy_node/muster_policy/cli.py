@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from muster_policy import __version__
 from muster_policy.bundle import Bundle, open_bundle
@@ -53,9 +54,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that refuses in one line, with the nearest option."""
+
+    def error(self, message: str) -> NoReturn:
+        words = message.removeprefix("argument ")
+        if unknown := re.match(r"unrecognized arguments: (\S+)", message):
+            word, options = unknown[1], [name for name in self._option_string_actions if name.startswith("--")]
+            words = f"{word}: more arguments than the command takes"
+            if word.startswith("-"):
+                near = nearest(word, options)
+                words = f"{word}: there is no such option" + (f"; {near}" if near.startswith("did") else "")
+        elif missing := re.match(r"the following arguments are required: (.*)", message):
+            words = f"{missing[1].upper()} is missing"
+        self.exit(2, f"{self.prog}: {words}{'' if words.endswith('?') else ';'} see: {self.prog} --help\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """Of the command line."""
-    found = argparse.ArgumentParser(
+    found = _Parser(
         prog="muster-policy",
         description="Run a policy that `muster export` wrote on a robot, as a ROS 2 node on rmw_zenoh's wire.",
         epilog=EXAMPLES,
@@ -81,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
     add("--remap", action="append", default=[], metavar="TOPIC:=NAME", help="use another topic; may be repeated")
     add("--controller", metavar="NAME", help="publish std_msgs/Float64MultiArray on NAME/commands, too")
     add("--strict-limits", action="store_true", help="keep position targets within the joints' ranges")
-    add("--domain", type=int, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
+    add("--domain", type=_whole, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
     add("--namespace", default="/", help="of the node")
     add("--name", default="muster_policy", help="of the node (default: muster_policy)")
     add("--distro", choices=DISTRIBUTIONS, default="jazzy", help="ROS 2 of the robot (default: jazzy)")
@@ -205,6 +222,13 @@ def _positive(text: str) -> float:
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"expected a number above 0, found {text}")
     return value
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, found {text}") from None
 
 
 def _say(line: str) -> None:

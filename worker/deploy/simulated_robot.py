@@ -18,6 +18,7 @@ import warp
 
 from shared_store.bundles import DamagedBundle, read_contract, verify
 from shared_store.policy_contract import Contract, brief, differences
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import configure, run_command, user_errors
 
@@ -240,13 +241,13 @@ def play(
         if bool(task.dones[0]):
             returns.append(total)
             told(
-                f"episode {len(returns)} of {episodes}: return {total:.2f}, {steps} steps, {late} without a new command"
+                f"episode {len(returns)} of {episodes}: return {total:.2f}, {counted(steps, 'step')}, {late} without a new command"
             )
             total, late, steps = 0.0, 0, 0
             actions = torch.zeros_like(actions)
             newest.clear()
             reset.publish(empty)
-    told(f"mean return {np.mean(returns):.2f} of {len(returns)} episodes")
+    told(f"mean return {np.mean(returns):.2f} of {counted(len(returns), 'episode')}")
     return returns
 
 

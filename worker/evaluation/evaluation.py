@@ -15,6 +15,8 @@ from shared_store.checkpoints import best_evaluated, list_checkpoints
 from shared_store.evaluations import by_checkpoint, checkpoint_of, evaluation_name, list_evaluations
 from shared_store.files import write_json
 from shared_store.layout import Run
+from shared_store.pairs import are_paired, paired, read_returns
+from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share
@@ -68,7 +70,7 @@ class Evaluation:
         percent = round(100 * self.mean_length / self.max_length)
         return (
             f"evaluation: mean episode length {self.mean_length:.1f} of {self.max_length} ({percent} %), "
-            f"mean return {self.mean_return:.2f} over {self.episodes} episodes"
+            f"mean return {self.mean_return:.2f} over {counted(self.episodes, 'episode')}"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -115,7 +117,7 @@ class Evaluation:
         summary = {**self.summary(), **facts, "job": job or None, "table": f"{name}.parquet", "time": time.time()}
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
         if earlier:
-            summary["compared"] = self._compared(earlier[-1], facts.get("config") or {})
+            summary["compared"] = self._compared(run, earlier[-1], summary)
         summary = _finite(summary)
         write_table(run.evaluations / summary["table"], self.played, self.seed)
         write_json(run.evaluations / f"{name}.json", summary)
@@ -127,17 +129,25 @@ class Evaluation:
     def _described(self, term: str) -> dict[str, float | None]:
         return Sample.of(self.played.term(term)).describe()
 
-    def _compared(self, old: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-        """How this one differs from an earlier one of the run."""
+    def _compared(self, run: Run, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+        """How this one differs from an earlier one of the run: episode by episode where both played the same ones."""
         std = old.get("std_return")
         before = Sample(int(old["episodes"]), float(old["mean_return"]), float(std or 0.0))
         return {
             "name": old["name"],
             "checkpoint": checkpoint_of(old["name"]),
             "time": old["time"],
-            "other_worlds": (old.get("config") or {}) != config,
-            "return": difference(Sample.of(self.played.returns), before),
+            "other_worlds": (old.get("config") or {}) != (new.get("config") or {}),
+            "return": self._pairs(run, old, new) or difference(Sample.of(self.played.returns), before),
         }
+
+    def _pairs(self, run: Run, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any] | None:
+        if not are_paired(new, old):
+            return None
+        try:
+            return paired(self.played.returns.tolist(), read_returns(run.evaluations / f"{old['name']}.parquet"))
+        except (OSError, ValueError):  # its table is gone, or damaged
+            return None
 
 
 def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
@@ -174,7 +184,9 @@ def best_words(run: Run) -> str:
     if best is None or len(evaluated) < 2:
         return ""
     mean = evaluated[best.name]["mean_return"]
-    return f"best of {len(evaluated)} checkpoints that are evaluated: {best.name}, mean return {mean:.2f}"
+    return (
+        f"best of {len(evaluated)} checkpoints that are evaluated: {run.name}@{best.iteration}, mean return {mean:.2f}"
+    )
 
 
 def _finite(value: Any) -> Any:

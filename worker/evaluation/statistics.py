@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-LEVEL = 0.95
+from shared_store.pairs import LEVEL, quantile, verdict
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Sample:
         """``mean``, ``std``, and ``low`` and ``high``: mean ∓ t(n - 1) · std / √n; no interval of one value."""
         if self.count < 2:
             return {"mean": self.mean, "std": None, "low": None, "high": None}
-        half = _quantile(self.count - 1) * self.std / math.sqrt(self.count)
+        half = quantile(self.count - 1) * self.std / math.sqrt(self.count)
         return {"mean": self.mean, "std": self.std, "low": self.mean - half, "high": self.mean + half}
 
 
@@ -71,13 +71,6 @@ def difference(new: Sample, old: Sample) -> dict[str, Any]:
         freedom = variance**2 / sum(
             part**2 / (sample.count - 1) for part, sample in zip(parts, (new, old), strict=True)
         )
-        half = _quantile(freedom) * math.sqrt(variance)
-    verdict = "better" if apart - half > 0 else "worse" if apart + half < 0 else "within noise"
-    return {"difference": apart, "low": apart - half, "high": apart + half, "verdict": verdict}
-
-
-def _quantile(freedom: float) -> float:
-    """Student's t that a 95 % interval needs."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(freedom, 0.5 + LEVEL / 2))
+        half = quantile(freedom) * math.sqrt(variance)
+    low, high = apart - half, apart + half
+    return {"difference": apart, "low": low, "high": high, "verdict": verdict(low, high)}

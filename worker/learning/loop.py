@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.checkpoints import Checkpoint
 from shared_store.files import write_atomic
 from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.errors import TrainingError
 from worker.evaluation.evaluation import best_words, evaluate
@@ -198,17 +199,15 @@ class Loop:
         self._stall_seconds = self.state.saver.stall
 
     def _beginning(self) -> str:
-        ranks = f"{self.gang.size} rank{'s' if self.gang.size != 1 else ''}"
-        there = f"{self.share.total} worlds on {ranks}"
+        there = f"{counted(self.share.total, 'world')} on {counted(self.gang.size, 'rank')}"
         if self.adopted:
             parent = (self.job.run.description() or {}).get("parent") or {}
             of = f"{parent.get('run')}@{self.adopted.iteration} (checkpoint {self.adopted.name})"
             return f"starting from the weights of {of}: {there}"
         if self.resumed is None:
             return f"starting from new weights: {there}"
-        size = self.resumed.size / 1e6
         return (
-            f"resumed from checkpoint {self.resumed.name}: {there} ({size:.2f} MB in {self.state.load_seconds:.3f} s)"
+            f"resumed from checkpoint {self.resumed.name}: {there} ({self.resumed.size / 1e6:.2f} MB in {self.state.load_seconds:.3f} s)"
             + "".join(f"; {line}" for line in self.state.set_anew)
         )
 
@@ -264,12 +263,13 @@ class Loop:
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
-        first = f"world {Share.of(rank, self.gang.size, total).first + world}: {cause}"
+        world += Share.of(rank, self.gang.size, total).first
+        said = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
-                more = "; from now on only counted" if self._warnings == WARNINGS else ""
-                self._say(f"warning: iteration {iteration}: {resets} resets of worlds, among them {first}{more}")
+                said += "; from now on only counted" if self._warnings == WARNINGS else ""
+                self._say(f"warning: iteration {iteration}: {said}")
             return
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
@@ -281,7 +281,7 @@ class Loop:
         self.gang.greatest(0)  # nobody ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
-            f"{resets} resets of worlds, among them {first}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
+            f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
             f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
         )
 

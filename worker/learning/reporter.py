@@ -15,6 +15,7 @@ from typing import Any
 
 from shared_store.epoch import check_epoch
 from shared_store.layout import Run
+from shared_store.wording import counted
 
 _EVERY = 1.0
 """Seconds between two reads of the epoch."""
@@ -121,7 +122,10 @@ class Reporter:
         if not done.wait(_FAREWELL) or self._dropped:
             print(f"warning: the volume did not take the last metrics ({self._dropped} were dropped)", flush=True)
         if self._failed:
-            print(f"warning: {self._failed} reports failed and were lost", flush=True)
+            print(
+                f"warning: {counted(self._failed, 'report')} failed and {'was' if self._failed == 1 else 'were'} lost",
+                flush=True,
+            )
 
     def _run(self) -> None:
         while True:

@@ -27,6 +27,7 @@ from shared_store.checkpoints import (
 from shared_store.epoch import check_epoch
 from shared_store.policy_contract import brief, differences
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.wording import counted
 from worker.distributed import Gang
 from worker.errors import UserError
 from worker.learning.algorithm import Algorithm, Share
@@ -326,8 +327,8 @@ class TrainingState:
         total, bounds = checkpoint.manifest["worlds"], checkpoint.manifest["shards"]
         if total != self.share.total:
             raise UserError(
-                f"checkpoint {checkpoint.name} holds {total} worlds ({len(bounds)} ranks of {bounds[0][1]}), this job has "
-                f"{self.share.total} ({self.gang.size} ranks of {self.share.count}): set `worlds` and `nodes` so that their product "
+                f"checkpoint {checkpoint.name} holds {counted(total, 'world')} ({counted(len(bounds), 'rank')} of {bounds[0][1]}), this job has "
+                f"{self.share.total} ({counted(self.gang.size, 'rank')} of {self.share.count}): set `worlds` and `nodes` so that their product "
                 f"is {total}"
             )
         shards = Shards(checkpoint)

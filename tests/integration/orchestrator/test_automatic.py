@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from orchestrator.server import Server
 from orchestrator.tables import Job
 from shared_store.checkpoints import list_checkpoints, retain
 from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
-from tests.conftest import call_muster
+from tests.conftest import call_muster, submit_gang
 from tests.support.orchestrator.trained import SPEC, add_checkpoint
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
@@ -125,13 +126,65 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
     assert controller.newest()["passed"] == 1, "40, or 60"
     shown = " ".join(call_muster("show", training, home=controller.home).stdout.split())
-    assert "evaluating: checkpoint 00000070-e1 by job " in shown and "1 that were due were passed over" in shown
+    assert "evaluating: taught@70 by job " in shown and "1 checkpoint passed over" in shown
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
     assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"
     with controller.server.controller.database.session() as session:
         owners = set(session.scalars(select(Job.owner)))
     assert len(owners) == 1, "the evaluations are the training's owner's"
+
+
+def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate_as_other_commands_take_it(
+    controller: Controller,
+) -> None:
+    training = controller.train({"every": 1})
+    controller.save(10)
+    controller.look()
+    listed = call_muster("list", home=controller.home).stdout.splitlines()
+    assert [line.split()[0] for line in listed[1:-1]] == [training[:8]]
+    assert listed[-1] == "1 automatic evaluation is not shown; --all shows it"
+    first = controller.newest()["job"]
+    controller.end(first)
+    controller.save(20)
+    controller.look()
+    said = call_muster("list", home=controller.home).stdout
+    assert said.endswith("2 automatic evaluations are not shown; --all shows them\n")
+    every = call_muster("list", "--all", home=controller.home).stdout
+    assert (
+        "evaluates taught@20" in every and "evaluates taught@10; the test says so" in every and "not shown" not in every
+    )
+    told = json.loads(call_muster("list", "--json", home=controller.home).stdout)
+    assert [each.get("automaticEvaluation") for each in told] == ["taught@20", "taught@10", None]
+    shown = " ".join(call_muster("show", first, home=controller.home).stdout.split())
+    assert "evaluates: taught@10" in shown and controller.newest()["iteration"] == 20
+
+
+def test_what_is_known_of_a_run_that_is_gone_is_not_told_of_another_one_of_its_name(controller: Controller) -> None:
+    former = controller.train({"every": 1})
+    controller.save(10)
+    controller.look()
+    evaluation = controller.newest()["job"]
+    controller.end(evaluation)
+    controller.end(former)
+    controller.look()
+    shutil.rmtree(controller.server.store.run("taught").path)
+    training = controller.train({"every": 1})
+    found = controller.client.get("/api/runs/taught")
+    assert found["automatic"] is None and [job["id"] for job in found["jobs"]] == [training]
+    controller.look()
+    assert controller.newest()["job"] is None and controller.newest()["checkpoint"] is None
+    old = controller.client.get(f"/api/jobs/{former}")
+    assert old["runIsReplaced"] and old["results"] is None and old["progress"] is None
+    assert "taught (gone; another run has its name now)" in call_muster("show", former, home=controller.home).stdout
+    assert not controller.client.get(f"/api/jobs/{training}")["runIsReplaced"]
+
+
+def test_who_shows_a_run_is_told_which_jobs_made_it(controller: Controller) -> None:
+    job = submit_gang(controller.client, "pass", name="short")
+    refused = call_muster("show", f"short-{job[:8]}", home=controller.home)
+    line = f"muster: short-{job[:8]} is a run, which job short ({job[:8]}) made; see: muster show {job[:8]}\n"
+    assert (refused.returncode, refused.stderr) == (2, line)
 
 
 def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_evaluation(

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from shared_store.files import write_json
@@ -45,7 +47,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     server.close()
 
 
-def evaluated(store: Store, run: str, name: str, mean: float) -> None:
+def evaluated(store: Store, run: str, name: str, mean: float, **facts: Any) -> None:
     figures = {
         "mean_return": mean,
         "mean_length": 9.0,
@@ -56,7 +58,7 @@ def evaluated(store: Store, run: str, name: str, mean: float) -> None:
     }
     share = {"share": 0.75, "low": 0.66, "high": 0.82, "count": 75}
     interval = {"mean": mean, "std": 2.0, "low": mean - 0.5, "high": mean + 0.5}
-    write_json(store.run(run).evaluations / f"{name}.json", {**figures, "success": share, "return": interval})
+    write_json(store.run(run).evaluations / f"{name}.json", {**figures, "success": share, "return": interval, **facts})
 
 
 def submitted(server: Serving, tmp_path: Path, section: dict[str, Any], *options: str) -> Any:
@@ -126,9 +128,43 @@ def test_compare_puts_seeds_into_one_group_and_draws_curves(full: Serving, tmp_p
     assert header.split() == ["RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS"]
     assert "taught* (2)" in both and "1, 2" in both and "12.00 ± 2.83" in both and "27.00 ± 2.83" in both
     assert both.rstrip().endswith("75.0 %") and "3.00" in slow and slow.rstrip().endswith("-")
-    assert drawn == f"drawn: {picture}" and picture.read_bytes().startswith(b"\x89PNG")
+    assert drawn == f"written: {picture}" and picture.read_bytes().startswith(b"\x89PNG")
     (group, _) = json.loads(call_muster("compare", "taught*", "slow", "--json", home=full.home).stdout)
     assert group["runs"] == ["taught", "taught-b"] and group["evaluated"]["mean"] == 27.0
+
+
+def test_single_runs_that_played_the_same_episodes_are_compared_pair_by_pair(full: Serving, tmp_path: Path) -> None:
+    store = Store(full.home / "store")
+    returns = {"fast": [10.0, 20.0, 30.0, 41.0], "sure": [11.0, 21.5, 31.0, 42.5, 99.0], "odd": [1.0, 2.0, 3.0, 4.0]}
+    for worlds, (name, values) in enumerate(returns.items(), 5):
+        add_run(store, name, {**SPEC, "name": name, "train": {**SPEC["train"], "worlds": worlds}})
+        add_checkpoint(store, name, 9)
+        table = store.run(name).evaluations / "00000009-e1-job.parquet"
+        evaluated(
+            store, name, "00000009-e1-job", sum(values) / len(values), seed=8 if name == "odd" else 7, iteration=9
+        )
+        columns = {"episode": list(range(len(values))), "return": values}
+        pyarrow.parquet.write_table(pyarrow.table(columns), table)
+    try:
+        done = call_muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"), home=full.home)
+        assert done.returncode == 2 and "there is nothing to draw" in done.stderr
+        done = call_muster("compare", "fast", "sure", "odd", home=full.home)
+        # the differences are 1, 1.5, 1, 1.5: mean 1.25, s = 0.5 / sqrt(3), and t(3) = 3.182446, so that half is 0.459
+        line = "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"
+        assert done.stdout.splitlines()[-1] == line, "other worlds are not paired"
+        told = json.loads(call_muster("compare", "fast", "sure", "odd", "--json", home=full.home).stdout)
+        assert [each["against"] and each["against"]["verdict"] for each in told] == [None, "better", None]
+    finally:
+        for name in returns:
+            shutil.rmtree(store.run(name).path)
+
+
+def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) -> None:
+    table = tmp_path / "curves.csv"
+    assert call_muster("compare", "taught", "slow", "-o", str(table), home=full.home).returncode == 0
+    header, *rows = table.read_text().splitlines()
+    assert header == "group,env_steps,return,std,runs" and len(rows) == 18
+    assert rows[0] == "taught,100.0,10.0,0.0,1" and rows[-1] == "slow,900.0,3.0,0.0,1"
 
 
 def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) -> None:
@@ -137,6 +173,10 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
         (["taught", "slwo"], "did you mean slow"),
         (["robot-*", "slow"], "no run is called like robot-*"),
         (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is no directory"),
+        (
+            ["taught", "slow", "-o", str(tmp_path / "x.xyz")],
+            "the ending says what is written; there are .png, .svg, .pdf",
+        ),
         (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run is called like of-*"),
     ):
         done = call_muster("compare", *options, home=full.home)

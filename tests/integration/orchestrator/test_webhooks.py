@@ -6,6 +6,7 @@ import base64
 import hashlib
 import hmac
 import json
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,7 +117,9 @@ def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serv
     sent = command("test", "chat")
     ((headers, body),) = receiver.messages
     place = f"http://127.0.0.1:{receiver.server_port}"
-    assert sent.stdout == f"chat: {place} accepted the sample (webhook-id {headers['webhook-id']})\n", sent.stderr
+    accepted, note = sent.stdout.splitlines()
+    assert accepted == f"chat: {place} accepted the sample (webhook-id {headers['webhook-id']})", sent.stderr
+    assert note == "a sample is sent once, about no job; it is none of the messages that muster webhooks list counts"
     assert is_signed(headers, body) and json.loads(body)["type"] == "webhook.test"
     receiver.answers = [302]
     refused = command("test", "chat")
@@ -156,6 +159,33 @@ def test_what_no_receiver_takes_is_given_up_after_the_last_try_and_shown(
     assert SECRET not in caplog.text and "a-path-that-is-secret" not in caplog.text
     database = b"".join(path.read_bytes() for path in (tmp_path / "home").glob("muster.db*"))
     assert SECRET.encode() not in database and b"a-path-that-is-secret" not in database
+
+
+def test_a_receiver_that_answers_a_byte_at_a_time_is_left_after_the_deadline_of_the_whole_try(tmp_path: Path) -> None:
+    with receiving() as dripping:
+        dripping.drip = threading.Event()
+        file = write_webhooks(tmp_path / "hooks.json", chat={"url": dripping.url})
+        server = Server(tmp_path / "home", cpus=1, webhooks=file)
+        server.deliveries._timeout = 0.5
+        try:
+            problem = server.deliveries.test(server.deliveries.webhooks["chat"])["problem"]
+        finally:
+            server.close()
+        assert problem == "has not answered within 0.5 s"
+        assert dripping.drip.wait(30), "the connection is closed, not kept"
+
+
+def test_a_queue_that_is_not_there_is_named_at_the_start_with_the_nearest(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = write_webhooks(
+        tmp_path / "hooks.json", chat={"url": "http://127.0.0.1:1/", "queues": ["default", "defualt"]}
+    )
+    server = Server(tmp_path / "home", cpus=1, webhooks=file)
+    server.start()
+    server.close()
+    told = [each.getMessage() for each in caplog.records if each.name == "muster.webhooks"]
+    assert told == ["webhook chat: there is no queue defualt now; did you mean default?"]
 
 
 def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: Path) -> None:

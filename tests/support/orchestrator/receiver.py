@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -25,6 +26,8 @@ class Receiver(ThreadingHTTPServer):
         self.messages: list[tuple[dict[str, str], bytes]] = []
         self.gate = threading.Event()
         self.gate.set()
+        self.drip: threading.Event | None = None
+        """Where it is set to an event: an answer comes a byte every 0.1 s; the event is set once the sender has gone."""
 
     @property
     def url(self) -> str:
@@ -42,9 +45,20 @@ class _Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers["content-length"]))
         self.server.messages.append(({name.lower(): value for name, value in self.headers.items()}, body))
         self.server.gate.wait()
+        if self.server.drip is not None:
+            self._drip(self.server.drip)
+            return
         self.send_response(self.server.answers.pop(0) if self.server.answers else 204)
         self.send_header("location", "http://127.0.0.1:1/elsewhere")
         self.end_headers()
+
+    def _drip(self, gone: threading.Event) -> None:
+        try:
+            for byte in b"HTTP/1.1 204 No Content\r\nx-long: " + 200 * b"x" + b"\r\n\r\n":
+                self.wfile.write(bytes([byte]))
+                time.sleep(0.1)
+        except OSError:
+            gone.set()
 
     def log_message(self, *_: Any) -> None:
         """Nothing on the test's output."""

@@ -90,7 +90,7 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
         ("train.ppo.hidden_sizes=[8]", ["train.ppo.hidden_sizes is not set and can't become [8]", "has learnt"]),
         ("train.ppo.activation=relu", ["train.ppo.activation is not set and can't become 'relu'"]),
         ("train.ppo.init_std=0.5", ["train.ppo.init_std is not set and can't become 0.5", "has learnt"]),
-        ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 nodes × 1 ranks × 9)", "leave train.worlds"]),
+        ("train.worlds=9", ["holds 8 worlds, this job would have 9 (1 node × 1 rank × 9)", "leave train.worlds"]),
         ("nodes=9", ["8 worlds can't be dealt out to 9 ranks; use fewer nodes"]),
     ],
 )
@@ -173,7 +173,7 @@ def go_on(store: Path, **changes: Any) -> Loop:
         ({"config": {"limit": 2.0}}, "train.config is None there and {'limit': 2.0} here"),
         ({"ppo": {"hidden_sizes": [8]}}, r"ppo.hidden_sizes is \[16, 16\] there and \[8\] here"),
         ({"ppo": {"normalize_observations": False}}, "ppo.normalize_observations is True there and False here"),
-        ({"worlds": 9}, r"holds 8 worlds \(1 ranks of 8\), this job has 9"),
+        ({"worlds": 9}, r"holds 8 worlds \(1 rank of 8\), this job has 9"),
     ],
 )
 def test_the_worker_refuses_what_differs(trained: Path, changes: dict[str, Any], difference: str) -> None:

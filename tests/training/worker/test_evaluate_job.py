@@ -77,7 +77,7 @@ def test_the_same_episodes_are_the_same_bytes_on_one_rank_in_two_rounds_and_on_t
     table = pyarrow.parquet.read_table(one).to_pydict()
     assert len(table["episode"]) == 40 and set(table["seed"]) == {held_out_seed(5)}
     assert "40 episodes of Cartpole, checkpoint 00000002-e1" in outputs[0][1]
-    assert "compared with the evaluation" in outputs[1][1] and "within noise" in outputs[1][1]
+    assert "compared with the evaluation" in outputs[1][1] and "paired over 40 episodes): within noise" in outputs[1][1]
 
 
 def test_changed_worlds_an_older_checkpoint_and_another_seed_are_recorded(run: Run) -> None:

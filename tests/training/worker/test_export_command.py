@@ -39,9 +39,12 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     report = json.loads((output / "report.json").read_text())
     assert report["judged"]["episodes"] == 4 and report["parity"]["observations"]["rollout"] >= 1000
     assert (output / "robot" / "cartpole.xml").exists()
-    for version in (1, 2):
-        done = run_muster("models", "register", f"{run.name}@2", "--name", "cart", home=home)
+    for version, options in ((1, ()), (2, ("--again",))):
+        done = run_muster("models", "register", f"{run.name}@2", "--name", "cart", *options, home=home)
         assert f"as cart@{version}" in done.stdout, done.stdout + done.stderr
+    twice = run_muster("models", "register", f"{run.name}@2", "--name", "cart", home=home)
+    line = "muster: the same checkpoint is cart@2 already; --again registers it once more\n"
+    assert (twice.returncode, twice.stdout, twice.stderr) == (1, "", line)
     unexported = run_muster("models", "register", f"{run.name}@1", "--name", "cart", home=home)
     assert f"is not exported; export it first: muster export {run.name}@1" in unexported.stderr
     listed = json.loads(run_muster("models", "list", "--json", home=home).stdout)
@@ -49,7 +52,9 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     shown = run_muster("models", "show", "cart@1", home=home).stdout
     assert "of versions 1, 2" in shown and f"run {run.name}, checkpoint 00000002-e1" in shown
     same = run_muster("models", "diff", "cart", home=home)
-    assert same.returncode == 0 and "have the same contract" in same.stdout, same.stdout + same.stderr
+    assert same.returncode == 0 and "have the same contract, settings, versions and weights" in same.stdout, (
+        same.stdout + same.stderr
+    )
     assert run_muster("models", "verify", "cart", home=home).returncode == 0
     onnx = home / "store" / "models" / "cart" / "2" / "bundle" / "policy.onnx"
     os.chmod(onnx, 0o644)

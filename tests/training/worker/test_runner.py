@@ -88,7 +88,7 @@ def test_worlds_are_dealt_out_again_to_another_number_of_ranks(two_ranks: Path) 
 
 def test_another_number_of_worlds_is_refused(two_ranks: Path) -> None:
     with pytest.raises(
-        UserError, match=r"holds 16 worlds \(2 ranks of 8\), this job has 5 \(1 ranks of 5\).*product is 16"
+        UserError, match=r"holds 16 worlds \(2 ranks of 8\), this job has 5 \(1 rank of 5\).*product is 16"
     ):
         runner(training(two_ranks, run="stopped", worlds=5, epoch=4))
 

@@ -1,23 +1,28 @@
 """W&B and MLflow for real: a training that is killed and goes on, one without a key, one whose server is away.
 
-W&B offline, whose files are read again; MLflow on a database file. Both packages are extras: `make services` installs them.
+W&B offline, whose files are read again; MLflow on a database file, and over HTTP with its own server. Both packages are extras:
+`make services` installs them.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Run, Store
 from shared_store.metrics import read_metrics
-from tests.conftest import PATIENCE
+from tests.conftest import PATIENCE, wait_for
 from tests.support.worker.ranks import ROOT, free_port
 from tests.support.worker.wandb_files import history, records
 
@@ -91,6 +96,64 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
     assert config["train"] == TRAIN and config["run"] == "taught" and "newton" in config["versions"]
     saved = {each.path for record in records(file) if record.HasField("files") for each in record.files.files}
     assert {"reward.png", "00000040-e2.json"} <= saved
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """MLflow's own server, with a database file and a directory of artifacts; its address."""
+    pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
+    pytest.importorskip("flask", reason="of the extra dev, with which the server runs")
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    places = [
+        "--backend-store-uri",
+        f"sqlite:///{tmp_path}/served.db",
+        "--artifacts-destination",
+        str(tmp_path / "artifacts"),
+    ]
+    with open(tmp_path / "server.log", "wb") as log:
+        process = subprocess.Popen(
+            command + places,
+            # its scheduler of jobs, which no tracking needs, would want the whole package
+            env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
+            cwd=tmp_path,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+
+    def answers() -> bool:
+        assert process.poll() is None, (tmp_path / "server.log").read_text()
+        try:
+            return httpx.get(f"{url}/health", trust_env=False).is_success
+        except httpx.TransportError:
+            return False
+
+    try:
+        wait_for(answers, 120, "MLflow's server")
+        yield url
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def test_over_http_a_training_that_was_killed_and_goes_on_is_one_run_of_mlflow_s_server(run: Run, server: str) -> None:
+    track = {"mlflow": {"uri": server, "experiment": "poles"}}
+    code, output = train(run, 1, track, MUSTER_KILL_AT="33")
+    assert code == -9, output
+    code, output = train(run, 2, track)
+    assert code == 0 and "resumed from checkpoint 000000" in output and ": warning" not in output, output
+    client = importlib.import_module("mlflow").MlflowClient(server)
+    [there] = client.search_runs([client.get_experiment_by_name("poles").experiment_id])
+    assert there.info.status == "FINISHED" and there.info.run_name == "taught"
+    expected = read_metrics(run)
+    for name, key in (("train/env_steps", "env_steps"), ("train/kl", "kl")):
+        told = client.get_metric_history(there.info.run_id, name)
+        assert [(each.step, each.value) for each in told] == [(each["iteration"], each[key]) for each in expected]
+    assert [each["iteration"] for each in expected] == list(range(1, 41))
+    assert {each.path for each in client.list_artifacts(there.info.run_id)} == {"reward.png", "00000040-e2.json"}
+    assert len(list((run.path.parent.parent.parent / "artifacts").rglob("reward.png"))) == 1, "sent through the server"
 
 
 def test_without_a_key_a_training_ends_before_it_begins_with_one_line_and_no_prompt(run: Run) -> None:

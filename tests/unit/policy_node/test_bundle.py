@@ -175,6 +175,27 @@ def test_wrong_use_is_one_line(
     assert said in line
 
 
+@pytest.mark.parametrize(
+    ("typed", "line"),
+    [
+        ("", "BUNDLE is missing; see: muster-policy --help"),
+        (
+            "x --strct-limits",
+            "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help",
+        ),
+        ("x y", "y: more arguments than the command takes; see: muster-policy --help"),
+        ("x --domain ten", "--domain: expected a whole number, found ten; see: muster-policy --help"),
+        ("x --rate", "--rate: expected one argument; see: muster-policy --help"),
+    ],
+)
+def test_options_that_do_not_fit_are_one_line_without_the_usage(
+    typed: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(typed.split())
+    assert ended.value.code == 2 and capsys.readouterr().err == f"muster-policy: {line}\n"
+
+
 def test_a_domain_that_is_no_number_is_one_line(
     bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

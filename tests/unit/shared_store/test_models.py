@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from shared_store.bundles import DamagedBundle, publish, seal
 from shared_store.checkpoints import Checkpoint
 from shared_store.files import DamagedFile
 from shared_store.layout import Run, Store
-from shared_store.models import Model, ModelError
+from shared_store.models import AlreadyRegistered, Model, ModelError
 
 PARENT = {"run": "base", "checkpoint": "00000002-e1", "iteration": 2}
 
@@ -29,7 +30,7 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "store").open()
 
 
-def exported(store: Store, iteration: int = 4) -> tuple[Run, Checkpoint]:
+def exported(store: Store, iteration: int = 4, **facts: Any) -> tuple[Run, Checkpoint]:
     """A run with a bundle of a checkpoint."""
     run = store.run("ant")
     name = f"{iteration:08d}-e1"
@@ -38,7 +39,7 @@ def exported(store: Store, iteration: int = 4) -> tuple[Run, Checkpoint]:
     bundle.mkdir(parents=True)
     (bundle / "policy.onnx").write_bytes(b"weights")
     (bundle / "report.json").write_text(json.dumps({"judged": {"episodes": 16}}))
-    seal(bundle, {"task": "Ant", "score": 812.3, "versions": {"muster": "0.1.0"}, "code": {"module": "ant"}})
+    seal(bundle, {"task": "Ant", "score": 812.3, "versions": {"muster": "0.1.0"}, "code": {"module": "ant"}, **facts})
     run.evaluations.mkdir(exist_ok=True)
     (run.evaluations / f"{name}.json").write_text(json.dumps(EVALUATED))
     return run, Checkpoint(run.checkpoints / name, iteration, 1)
@@ -75,6 +76,22 @@ def test_versions_count_up_and_what_is_there_stays(store: Store) -> None:
     assert models.find(store, "ant").version == 4 and models.find(store, "ant", 2).version == 2
     assert models.model_names(store) == ["ant"]
     assert all(os.stat(path).st_mode & 0o222 == 0 for path in before), "nothing of it may be written"
+
+
+def test_a_checkpoint_that_is_a_version_already_is_one_again_only_on_request(store: Store) -> None:
+    run, checkpoint = exported(store)
+    first = models.register(store, "ant", run, checkpoint, {}, again=False)
+    with pytest.raises(
+        AlreadyRegistered, match=r"^the same checkpoint is ant@1 already; --again registers it once more$"
+    ):
+        models.register(store, "ant", run, checkpoint, {}, again=False)
+    assert os.listdir(store.models / "ant") == ["1"], "nothing is made"
+    assert models.register(store, "other", run, checkpoint, {}, again=False).reference == "other@1"
+    assert models.register(store, "ant", run, checkpoint, {}, again=True).reference == "ant@2"
+    shutil.rmtree(run.path)  # and another run of its name, whose checkpoint of that name is another one
+    run, checkpoint = exported(store, checkpoint_files={"learner.pt": "other"})
+    assert models.register(store, "ant", run, checkpoint, {}, again=False).reference == "ant@3"
+    first.verify()
 
 
 REGISTER = """

@@ -13,6 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from shared_store.evaluations import lines
 from shared_store.files import write_json
 from shared_store.layout import Run, Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
@@ -212,6 +213,17 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
     assert (
         second["compared"]["return"]["difference"] == 0.0 and second["compared"]["return"]["verdict"] == "within noise"
     )
+    assert "method" not in second["compared"]["return"], "the worlds are others"
+    third = result_of(task, played, "00000009-e1", 7, 0.0).write(run, "third-job", config={"angle_limit": 0.3})
+    assert third["compared"]["return"] == {
+        **{"difference": 0.0, "low": 0.0, "high": 0.0, "verdict": "within noise"},
+        **{"method": "paired", "pairs": 6},
+    }
+    last = list(lines(json.loads(json.dumps(third))))[-1]
+    assert last.endswith(": return +0.00 (+0.00 to +0.00, paired over 6 episodes): within noise"), last
+    (run.evaluations / third["table"]).unlink()
+    fourth = result_of(task, played, "00000012-e1", 7, 0.0).write(run, "fourth-job", config={"angle_limit": 0.3})
+    assert fourth["compared"]["name"] == "00000009-e1-third-jo" and "method" not in fourth["compared"]["return"]
     assert json.loads((run.evaluations / "00000006-e1-second-j.json").read_text()) == json.loads(json.dumps(second))
 
 
@@ -243,4 +255,4 @@ def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_co
         assert best_words(run) == ""
         name = add_checkpoint(store, "taught", iteration).name
         write_json(run.evaluations / f"{name}.json", {**figures, "mean_return": mean})
-    assert best_words(run) == "best of 2 checkpoints that are evaluated: 00000003-e1, mean return 7.25"
+    assert best_words(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from shared_store.pairs import are_paired, paired
 from worker.evaluation.statistics import Sample, difference, share
 
 
@@ -42,6 +43,30 @@ def test_a_difference_is_welch_s() -> None:
     assert (found["low"], found["high"]) == (pytest.approx(5 - half, abs=1e-3), pytest.approx(5 + half, abs=1e-3))
     assert difference(old, new)["verdict"] == "worse"
     assert difference(Sample(10, 16.0, 4.0), old)["verdict"] == "within noise"
+
+
+def test_the_interval_of_paired_differences_is_student_s() -> None:
+    """Student (1908), table of the Cushny and Peebles data: additional hours of sleep by two drugs, ten patients."""
+    first = [0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0]
+    second = [1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4]
+    found = paired(second, [*first, 1e9])
+    half = 2.262157163 * 1.229995484 / math.sqrt(10)  # t of 9 degrees of freedom; s of the differences
+    assert found["difference"] == pytest.approx(1.58) and found["pairs"] == 10 and found["method"] == "paired"
+    assert (found["low"], found["high"]) == (pytest.approx(1.58 - half), pytest.approx(1.58 + half))
+    assert found["verdict"] == "better" and paired(first, second)["verdict"] == "worse"
+    apart = difference(Sample.of(torch.tensor(second)), Sample.of(torch.tensor(first)))
+    assert apart["verdict"] == "within noise", "what pairs tell apart, samples do not"
+    assert paired([2.0], [1.0])["verdict"] == "unknown" and paired(first, first)["verdict"] == "within noise"
+
+
+def test_episodes_are_paired_where_seed_task_and_changes_of_the_worlds_are_the_same() -> None:
+    one = {"seed": 7, "task": "Cartpole", "config": {}}
+    assert are_paired(one, {**one, "config": None, "episodes": 9})
+    for other in ({"seed": 8}, {"task": "Ant"}, {"config": {"angle_limit": 0.3}}):
+        assert not are_paired(one, {**one, **other})
+    assert not are_paired({**one, "seed": None}, {**one, "seed": None}), (
+        "the ends of two trainings: each in its own worlds"
+    )
 
 
 def test_samples_without_spread_are_told_apart_and_those_of_one_value_are_not() -> None:

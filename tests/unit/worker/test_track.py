@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 
 from shared_store.epoch import raise_epoch
+from shared_store.files import write_json
 from shared_store.layout import Run, Store
 from shared_store.metrics import MetricsWriter, scalars
 from tests.conftest import REPOSITORY
@@ -19,7 +21,7 @@ from worker import track
 from worker.learning.job import Job
 from worker.telemetry.services import Ending
 from worker.telemetry.tracking import Tracking
-from worker.track import Sender
+from worker.track import Sender, Turn
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}
 
@@ -108,6 +110,47 @@ def test_other_settings_from_the_last_iteration_on_continue_the_same_run(run: Ru
     write(run, 2, 5, 6)
     assert sender(run, service, [], {"task": "Ant"}).step(5, 2)
     assert service.sent == {"ant": [(i, 1.0) for i in range(1, 6)] + [(6, 2.0)]}
+
+
+def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(run: Run) -> None:
+    code = (
+        "import sys; from pathlib import Path; from shared_store.layout import Run; from worker.track import Turn; "
+        "turn = Turn(Run(Path(sys.argv[1])), 'mlflow'); print(turn.take(), flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(run.path)],
+        cwd=REPOSITORY,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert other.stdout is not None and other.stdout.readline() == "None\n"
+        holder = f"process {other.pid} on {socket.gethostname()}"
+        turn = Turn(run, "mlflow")
+        assert turn.take() == holder and Turn(run, "wandb").take() is None
+        write_json(
+            run.path / "run.json", {"run": run.name, "spec": {"train": TRAIN, "track": {"mlflow": {"uri": "x"}}}}
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", _WITH_MEMORY, str(run.path)], cwd=REPOSITORY, capture_output=True, text=True
+        )
+        line = f"error: mlflow: {holder} sends this run already; run this again once its training is over\n"
+        assert (done.returncode, done.stderr) == (2, line)
+    finally:
+        other.kill()  # as a rank's death would end it
+        other.wait()
+        other.communicate()
+    assert turn.take() is None and turn.take() is None
+
+
+_WITH_MEMORY = """
+import sys
+from tests.unit.worker.test_track import Memory
+from worker import track
+track.SERVICES = {"mlflow": lambda tracked, settings: Memory()}
+sys.exit(track.afterwards(sys.argv[1], "mlflow"))
+"""
 
 
 def test_while_a_service_is_away_one_line_says_so_and_later_everything_is_sent(

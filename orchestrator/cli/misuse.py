@@ -1,0 +1,81 @@
+"""Wrong use of the command, in one line: what was typed, what is wrong with it, the nearest name, and which help to read."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from orchestrator.errors import UsageError
+from shared_store.wording import explain, nearest
+
+Misuse: type[Exception] = typer.BadParameter.__mro__[2]
+"""What the parser raises. Typer has it from click, or brings its own: the name of the module differs from version to version."""
+
+_EXPECTED = {
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_parsing": "a number",
+    "bool_parsing": "true or false",
+}
+
+
+class Group(TyperGroup):
+    """A group of commands that refuses an unknown one with the nearest name."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if self.get_command(ctx, args[0]) is None:
+            near = nearest(args[0], self.commands, _see(ctx.command_path))
+            raise UsageError(f"{args[0]}: there is no such command; {near}")
+        return super().resolve_command(ctx, args)
+
+
+def told(error: Any, commands: Sequence[str]) -> str:
+    """What is wrong with the command line; empty where the error is that nothing was given, whose help is printed already.
+
+    Args:
+        error: A :data:`Misuse`.
+        commands: Names of all commands: the parser does not always say which one it was at.
+    """
+    message = error.format_message().strip()
+    ctx = getattr(error, "ctx", None)
+    given = [word for word in sys.argv[1:2] if word in commands]
+    see = _see(ctx.command_path if ctx else " ".join(["muster", *given]))
+    param, option = getattr(error, "param", None), getattr(error, "option_name", None)
+    if option is not None and ctx is not None:
+        known = [name for each in ctx.command.get_params(ctx) for name in (*each.opts, *each.secondary_opts)]
+        near = nearest(option, [name for name in known if name.startswith("--")], see)
+        return f"{option}: there is no such option; {near}" + ("" if near == see else f" {see}")
+    if option is not None:
+        return f"{option} {'needs a' if 'requires' in message else 'takes no'} value; {see}"
+    if param is not None:
+        if type(error).__name__ == "MissingParameter":
+            return f"{_name(param)} is missing; {see}"
+        return f"{_name(param)}: {_wanted(error)}; {see}"
+    if message.startswith("Got unexpected extra"):
+        return f"{message.partition('(s) (')[2].removesuffix(')')}: more arguments than the command takes; {see}"
+    return f"{message[:1].lower()}{message[1:].rstrip('.')}; {see}" if message else ""
+
+
+def _see(path: str) -> str:
+    return f"see: {path} --help"
+
+
+def _name(param: Any) -> str:
+    if param.param_type_name == "option":
+        return str(max(param.opts, key=len))
+    return str(param.metavar or param.name.upper())
+
+
+def _wanted(error: Any) -> str:
+    """What was expected of a value, and what was found."""
+    cause = error.__cause__
+    if not hasattr(cause, "errors"):
+        return str(error.message).rstrip(".")
+    first = cause.errors(include_url=False)[0]
+    if (expected := _EXPECTED.get(first["type"])) is not None:
+        return f"expected {expected}, found {str(first['input'])[:60]}"
+    return explain(first)
