@@ -47,6 +47,8 @@ WARM, STRETCH, ROUNDS = 8, 40 if CUDA else 20, 3
 CHANGES = ("recorded", "left", "viewed")
 TAPPED, EPISODES = 4, 2
 """Worlds that are recorded, and episodes of each of a checkpoint's recording."""
+JUDGED = 256
+"""Worlds of the evaluation: blocks of 32 act one after the other, so that its rate is the same with more of them."""
 
 
 def watched(loop: Loop) -> list[int]:
@@ -119,13 +121,13 @@ def recorded(run: Run, folder: Path) -> dict[str, float]:
 
 
 def judged(run: Run, worlds: int) -> dict[str, float]:
-    """Policy steps and episodes a second of an evaluation in as many worlds as the training has."""
-    count = -(-worlds // SIZE) * SIZE
+    """Policy steps and episodes a second of an evaluation in at most as many worlds as the training has."""
+    count = -(-min(worlds, JUDGED) // SIZE) * SIZE
     rollout = Rollout.of(run, None, count)
     policies = [load_policy(rollout.checkpoint, str(rollout.task.device)) for _ in range(count // SIZE)]
     gang = connect(Placement())
     best: dict[str, float] = {}
-    for _ in range(2):  # the first loads kernels
+    for _ in range(2):  # the first records the step
         started = time.perf_counter()
         played = play([rollout.task], Blocks(policies), gang)
         if CUDA:
@@ -133,7 +135,12 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
         seconds = time.perf_counter() - started
         # worlds step on to the longest episode's end
         steps = float(played.lengths.max()) * count
-        best = {"evaluation_rate": steps / seconds, "episodes": count / seconds, "length": float(played.lengths.mean())}
+        best = {
+            "judged": count,
+            "evaluation_rate": steps / seconds,
+            "episodes": count / seconds,
+            "length": float(played.lengths.mean()),
+        }
     gang.close()
     return best
 
@@ -188,12 +195,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         "",
         "Of its checkpoint:",
         "",
-        f"| task | recording of {TAPPED} worlds [control steps/s] | a simulated minute | training [steps/s] | evaluation, as many worlds "
+        f"| task | recording of {TAPPED} worlds [control steps/s] | a simulated minute | training [steps/s] | worlds of the evaluation | its rate "
         "[steps/s] | episodes/s | their mean length [steps] | export, judged on 16 episodes [s] |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     lines += [
-        f"| {row['task']} | {row['record_rate']:,.0f} | {row['minute'] / 1e6:.1f} MB | {row['training_rate']:,.0f} | "
+        f"| {row['task']} | {row['record_rate']:,.0f} | {row['minute'] / 1e6:.1f} MB | {row['training_rate']:,.0f} | {row['judged']} | "
         f"{row['evaluation_rate']:,.0f} | {row['episodes']:,.0f} | {row['length']:,.0f} | {row['export']:.1f} |"
         for row in rows
     ]
