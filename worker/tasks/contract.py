@@ -151,7 +151,7 @@ def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[fl
         Action(
             name,
             "position",
-            term.unit or ("m" if axis in AXES[:3] else "rad"),
+            term.unit or ("m" if axis in AXES[:3] else "rad" if axis in AXES else "1"),
             scale=value_of(plan, driven.scale, index, 1.0),
             default_position=0.0,
             offset=value_of(plan, driven.offset, index, 0.0),
