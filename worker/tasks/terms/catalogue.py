@@ -27,6 +27,7 @@ GROUPS = (
     "ground",
     "footing",
     "manipulation",
+    "selecting",
     "tracking",
     "following",
 )
