@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.conftest import REPOSITORY
 from tests.support.worker.robots import need_mjlab
@@ -69,3 +71,13 @@ def test_what_it_says_of_mjlab_s_solver_is_in_mjlab_s_files() -> None:
     arm = (tasks / "manipulation" / "config" / "yam" / "env_cfgs.py").read_text()
     assert "cfg.sim.nconmax = max(cfg.sim.nconmax or 55, 55 + num_cubes * 120)" in arm and "num_cubes: int = 3" in arm
     assert MJLAB["LiftCubes"] == MJLAB["LiftCube"] | {"nconmax": 55 + 3 * 120}
+
+
+@pytest.mark.parametrize("name", ["go1-flat", "go1-rough", "g1-flat", "g1-rough", "lift-cube", "lift-cubes"])
+def test_a_job_s_file_says_how_many_steps_it_takes_and_how_to_try_it_without_a_gpu(name: str) -> None:
+    text = (REPOSITORY / "job_specs" / f"{name}.yaml").read_text()
+    train = yaml.safe_load(text)["train"]
+    steps = train["worlds"] * train["iterations"] * sketch(train["task"]).config.ppo.steps
+    said = re.search(r"It takes (\d+) million steps[.;]", text)
+    assert said is not None and int(said[1]) == round(steps / 1e6)
+    assert f"muster run job_specs/{name}.yaml --set resources.gpus=0" in text

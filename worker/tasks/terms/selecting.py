@@ -1,6 +1,6 @@
-"""Several objects, of which one counts: an ``ObjectSelection`` names them, a command chooses one for each world.
+"""Several objects, of which one counts: a selection names them, a command chooses one for each world.
 
-The hand and the target are as for manipulation; the target is in the world frame.
+The selection is a sensor, ``ObjectSelection("cube_*")``. The hand and the target are as for manipulation; the target is in the world frame.
 """
 
 from __future__ import annotations
