@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from orchestrator.cli.tasks import _numbers, _terms
 from orchestrator.cli.terminal import Console
 from tests.support.worker.robots import need_mjlab
-from worker.tasks import BUILT_IN
+from worker.tasks import BUILT_IN, find_task
 from worker.tasks.__main__ import describe, main
 from worker.tasks.declaration import Image
 
@@ -23,16 +24,20 @@ def _files() -> None:
     need_mjlab()
 
 
-def plan_of(name: str) -> Any:
-    from worker.tasks import find_task
+@functools.cache
+def told(name: str) -> dict[str, Any]:
+    return describe(name, whole=True)
 
+
+@functools.cache
+def plan_of(name: str) -> Any:
     kind = find_task(name)
     return kind.sketch(kind.config_type()).plan  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str) -> None:
-    found, plan = describe(name, whole=True), plan_of(name)
+    found, plan = told(name), plan_of(name)
     declared = plan.declaration
     expected = {
         section: list(getattr(declared, section))
@@ -42,15 +47,17 @@ def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str)
     for group, terms in declared.groups.items():
         assert not isinstance(terms, Image)
         expected["observations" if group == "policy" else f"observations of {group}"] = list(terms)
-    told = {section: [row["name"] for row in rows] for section, rows in found["tables"].items() if section != "success"}
-    assert told == {section: names for section, names in expected.items() if names}
+    rows_of = {
+        section: [row["name"] for row in rows] for section, rows in found["tables"].items() if section != "success"
+    }
+    assert rows_of == {section: names for section, names in expected.items() if names}
     success = found["tables"].get("success", [])
     assert [[*row.values()] for row in success] == ([[declared.success]] if declared.success else [])
 
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> None:
-    found, plan = describe(name, whole=True), plan_of(name)
+    found, plan = told(name), plan_of(name)
     columns = sum(int(row["columns"]) for row in found["tables"]["observations"])
     assert columns == len(found["observations"]) == len(plan.names)
     assert {row["name"]: float(row["weight"]) for row in found["tables"]["rewards"]} == pytest.approx(found["rewards"])

@@ -158,8 +158,8 @@ def move_frame(world: int, ik: IkArrays, index: int, value: float):
     Which of both, and which axes, the ``DifferentialIK`` says; it makes position targets of them, once a control step. A movement
     begins where the body or site is at the control step's start; a pose is a position [m] and a quaternion xyzw.
 
-    mjlab: DifferentialIKAction (which solves in every physics step, and takes quaternions wxyz). Isaac Lab:
-    DifferentialInverseKinematicsAction (which solves in every physics step).
+    mjlab: DifferentialIKAction (which solves in every physics step, and takes quaternions wxyz).
+    Isaac Lab: DifferentialInverseKinematicsAction (which solves in every physics step, and takes quaternions wxyz).
     """
     ik.wanted[world, index] = value
 
