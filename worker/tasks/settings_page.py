@@ -30,7 +30,7 @@ HEAD = """\
 # Settings of the robots' tasks
 
 Every number of `Go1Flat`, `Go1Rough`, `G1Flat`, `G1Rough`, `LiftCube` and `LiftCubes` as they are by default. Where a cell is empty, the
-task does not have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-and-g1rough) says what the terms mean, what differs from mjlab, and
+task does not have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-g1rough) says what the terms mean, what differs from mjlab, and
 what a job's YAML changes. This page is written by `python -m worker.tasks.settings_page` from the declarations; `muster tasks NAME` prints
 the same of any task.
 """
