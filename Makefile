@@ -40,7 +40,7 @@ long: $(READY) kernels
 	$(PYTEST) tests/long
 
 robots: $(READY)
-	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube
+	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes
 	$(PYTEST) tests/robots
 
 services: $(READY) kernels

@@ -66,7 +66,10 @@ def submit_spec(
     if problem := client.post("/api/fit", {"definition": definition, "queue": spec.queue})["problem"]:
         if problem.startswith("evaluation: "):
             raise SpecError(f"{source}: {problem}; change evaluation.resources or evaluation.queue")
-        raise SpecError(f"{source}: resources: {problem}; lower nodes or resources (cpus may be a fraction)")
+        lower = "lower nodes or resources (cpus may be a fraction)"
+        if spec.train and spec.resources.gpus:
+            lower += "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly"
+        raise SpecError(f"{source}: resources: {problem}; {lower}")
     registered = client.batch("RegisterJobDefinition", **definition)
     return client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"], environment))
 

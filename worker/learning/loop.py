@@ -121,7 +121,7 @@ class Loop:
         Raises TrainingError where a loss is not finite; the last checkpoint stands.
         """
         progress = self.state.progress
-        report = Report(self.job, self.training.iterations, progress.iteration) if self.gang.is_main else None
+        report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
         attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
         self._say(self._beginning())
         self._stopwatch.begin()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from shared_store.metrics import MetricsWriter, scalars
-from worker.learning.job import Job
+
+if TYPE_CHECKING:
+    from worker.learning.training import Training
 
 
 class Stopwatch:
@@ -54,13 +56,27 @@ class Stopwatch:
         return [before.elapsed_time(after) / 1000.0 for before, after in pairs]
 
 
-class Report:
-    """Writes the records of one attempt. Main rank only. A volume that refuses a record costs the record, not the run."""
+LONG_HOURS = 6.0
+"""A training without a GPU that is to take longer than this is warned of."""
+WARMED = 2
+"""The iteration of an attempt from which on its rate is told: the first one also loads kernels."""
 
-    def __init__(self, job: Job, iterations: int, resumed_from: int) -> None:
+
+class Report:
+    """Writes the records of one attempt. Main rank only. A volume that refuses a record costs the record, not the run.
+
+    Args:
+        training: What is trained.
+        resumed_from: The last iteration that is done already.
+        device: Where it is trained, ``"cpu"`` or ``"cuda:<n>"``.
+    """
+
+    def __init__(self, training: Training, resumed_from: int, device: str) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._iterations = iterations
+        job, self._iterations = training.job, training.iterations
+        self._task = str(job.section.get("task"))
+        self._rated_at = resumed_from + WARMED if device == "cpu" else 0
         self._warned = False
         self._metrics = MetricsWriter(job.run, job.epoch, resumed_from)
         self._events = SummaryWriter(
@@ -79,6 +95,8 @@ class Report:
             f"{_learnt(record)}{mishaps}{_slow(record)}",
             flush=True,
         )
+        if record["iteration"] == self._rated_at and (warning := self._long(record)):
+            print(warning, flush=True)
         finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
         try:
             self._metrics.write({**finite, "time": time.time()})
@@ -88,6 +106,18 @@ class Report:
             if not self._warned:
                 print(f"warning: metrics can't be written ({error}); training goes on without them", flush=True)
             self._warned = True
+
+    def _long(self, record: dict[str, float | int | None]) -> str:
+        """What to know of a training that takes days without a GPU; empty where it does not."""
+        left = self._iterations - int(record["iteration"] or 0)
+        hours = left * float(record["iteration_seconds"] or 0.0) / 3600.0
+        if hours <= LONG_HOURS:
+            return ""
+        takes = f"{hours / 24.0:.1f} days" if hours >= 48.0 else f"{hours:.0f} hours"
+        return (
+            f"no GPU: {self._task} trains at about {record['steps_per_second']:.0f} steps/s on these processors, so that the other "
+            f"{left:,} iterations take about {takes}; --set train.worlds=16 --set train.iterations=20 tries it"
+        )
 
     def close(self) -> None:
         """Flush everything."""

@@ -57,6 +57,7 @@ _PUBLIC = {
     "worker.simulation.sensors.imu": ("Imu", "ImuArrays"),
     "worker.simulation.sensors.momentum": ("AngularMomentum", "MomentumArrays"),
     "worker.simulation.sensors.rays": ("LidarPattern", "RayArrays", "RayCaster"),
+    "worker.simulation.sensors.selection": ("ObjectSelection", "SelectionArrays"),
     "worker.simulation.sensors.wrench": ("ExternalWrench", "WrenchArrays"),
     "worker.simulation.terrain": ("Terrain",),
     "worker.simulation.terrain_patches": (
@@ -92,6 +93,7 @@ BUILT_IN = {
     "G1Flat": "worker.tasks.g1:G1Flat",
     "G1Rough": "worker.tasks.g1:G1Rough",
     "LiftCube": "worker.tasks.lift:LiftCube",
+    "LiftCubes": "worker.tasks.lift_cubes:LiftCubes",
 }
 """Tasks that are there even where the distribution's metadata is not (a source tree on the path)."""
 

@@ -38,7 +38,12 @@ def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[
             "or index: int, value: float and one of the type IkArrays"
         )
     if frame:
-        bound.element_names = frame.rows(views)[: len(bound.elements or [])]  # by number where size= says how many
+        columns = frame.rows(views)
+        bound.element_names = columns[: len(bound.elements or [])]  # by number where size= says how many
+        if frame.absolute and len(bound.element_names) < len(columns):
+            raise ValueError(
+                f"{place}: size is {len(bound.element_names)}, and an absolute target has {len(columns)} columns; leave size= out"
+            )
         return
     view = views[term.robot]
     lacking = [joint for joint in bound.elements or [] if view.actuators[joint] < 0]

@@ -59,7 +59,7 @@ def described(plan: Plan, seen: Seen, back: int = 0) -> list[Observation]:
     kind = term.kind or ("command" if seen.bound.takes("command") else None)
     kind = kind or ("previous_action" if seen.bound.takes("action") else "measured")
     ranges: Sequence[Any] = [None] * len(names)
-    if kind == "command":
+    if kind == "command" and seen.bound.takes("command"):
         units, ranges = _commanded(plan, seen, units)
     clip = None if seen.clip is None else (plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1])
     return [
@@ -151,7 +151,7 @@ def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[fl
         Action(
             name,
             "position",
-            term.unit or ("m" if axis in AXES[:3] else "rad"),
+            term.unit or ("m" if axis in AXES[:3] else "rad" if axis in AXES else "1"),
             scale=value_of(plan, driven.scale, index, 1.0),
             default_position=0.0,
             offset=value_of(plan, driven.offset, index, 0.0),

@@ -77,7 +77,7 @@ def test_more_than_any_host_has_is_refused_before_anything_is_registered(shared_
         "ListJobs", jobQueue="default", filters=[{"name": "AFTER_CREATED_AT", "values": ["0"]}]
     )
     for change, parts in [
-        ("resources.gpus=99", ["99 GPUs", "the largest host has"]),
+        ("resources.gpus=99", ["99 GPUs", "the largest host has", "gpus=0 and train.worlds=16 try it on CPUs"]),
         ("resources.cpus=512", ["512 CPUs", "the largest host has 8 CPUs"]),
         ("nodes=200", ["needs 200 nodes", "all hosts together have"]),
     ]:

@@ -55,7 +55,7 @@ def resume(saved: str, out: str) -> None:
 
 def test_every_built_in_task_is_tested() -> None:
     """Those of real robots and the arm in tests/robots."""
-    robots = {"Go1Flat", "Go1Rough", "G1Flat", "G1Rough", "LiftCube"}
+    robots = {"Go1Flat", "Go1Rough", "G1Flat", "G1Rough", "LiftCube", "LiftCubes"}
     assert SETTINGS.keys() | robots >= BUILT_IN.keys()
 
 

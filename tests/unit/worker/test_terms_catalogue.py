@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 
 import pytest
 import warp as wp
@@ -29,6 +30,12 @@ def test_every_term_is_reached_by_its_name_and_says_what_it_is() -> None:
         assert entry.meaning.endswith("."), entry.name
         assert "world" in inspect.signature(function.func).parameters
         assert (entry.returns == "") == (inspect.signature(function.func).return_annotation is inspect.Signature.empty)
+
+
+def test_every_public_term_is_on_the_page_and_the_page_has_no_other() -> None:
+    public = {name for name, each in vars(terms).items() if isinstance(each, wp.Function)}
+    told = re.findall(r"^\| `(\w+)` \|", (REPOSITORY / "docs" / "tasks" / "terms.md").read_text(), re.MULTILINE)
+    assert len(told) == len({*told}) and {*told} == public == {entry.name for entry in entries()}
 
 
 def test_mjlabs_own_terms_have_one_here() -> None:

@@ -13,189 +13,25 @@ import torch
 import warp as wp
 
 from shared_store.wording import nearest
-from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.kinematics import root_rotation_of
-from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.ik_kernels import Chain, IkArrays, begin_targets, move_frame
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names
 from worker.simulation.sensors.sensor import SensorContext, views_of
-from worker.simulation.worlds import WorldArrays
-
-wp.set_module_options({"enable_backward": False})
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""What of a frame may be moved: along the root's axes [m], and about them [rad]."""
-
-
-@wp.struct
-class IkArrays:
-    """How a frame shall move in the coming control step, one row a world.
-
-    Attributes:
-        wanted: Displacement along and turn about the axes of the robot's root [m, rad], shape ``(worlds, columns)``; a column for each of
-            the declared ``axes``. The joints' targets are computed from it when all actions are written; then it is 0 again.
-    """
-
-    wanted: wp.array2d(dtype=wp.float32)
-
-
-@wp.struct
-class _Chain:
-    """The joints and the frame that they move, and room for the equations; a world comes last, so that threads read side by side.
-
-    Attributes:
-        body, pose: Column of the frame's body, and the frame in it [m, quaternion xyzw].
-        rows: Of each column, its index in ``AXES``, shape ``(columns,)``.
-        weights: Of each column, squared, shape ``(columns,)``.
-        children: Columns of the bodies that the joints move, shape ``(joints,)``.
-        slides: 1 of a joint that slides, 0 of one that turns, shape ``(joints,)``.
-        anchors, axes: Of the joints, in the frames of these bodies [m], shape ``(joints,)``.
-        joints: Indices of the joints in ``RobotArrays``, shape ``(joints,)``.
-        ranges: Least and greatest target of each joint [m, rad], shape ``(joints,)``.
-        damping, posture, limits: Squares of these weights.
-        max_step: How far a joint's target is from the joint, at most [m, rad].
-        jacobian: Movement of the columns for one unit of each joint, in the root's frame, shape ``(columns, joints, worlds)``.
-        matrix: Of the normal equations, then its Cholesky factor, shape ``(joints, joints, worlds)``; only the lower triangle is used.
-        steps: Their right side, then the joints' displacements [m, rad], shape ``(joints, worlds)``.
-        goes_on: Whether a step goes on from the last targets.
-        targets: Those [m, rad], shape ``(worlds, joints)``.
-    """
-
-    body: int
-    pose: wp.transform
-    rows: wp.array(dtype=wp.int32)
-    weights: wp.array(dtype=wp.float32)
-    children: wp.array(dtype=wp.int32)
-    slides: wp.array(dtype=wp.int32)
-    anchors: wp.array(dtype=wp.vec3)
-    axes: wp.array(dtype=wp.vec3)
-    joints: wp.array(dtype=wp.int32)
-    ranges: wp.array(dtype=wp.vec2)
-    damping: float
-    posture: float
-    limits: float
-    max_step: float
-    jacobian: wp.array3d(dtype=wp.float32)
-    matrix: wp.array3d(dtype=wp.float32)
-    steps: wp.array2d(dtype=wp.float32)
-    goes_on: bool
-    targets: wp.array2d(dtype=wp.float32)
-
-
-@wp.func
-def _movement(chain: _Chain, bodies: BodyArrays, world: int, joint: int, position: wp.vec3):
-    """Linear and angular movement of what is at ``position``, in the world frame, for one unit of a joint."""
-    pose = bodies.poses[world, chain.children[joint]]
-    axis = wp.transform_vector(pose, chain.axes[joint])
-    linear = axis
-    angular = wp.vec3(0.0, 0.0, 0.0)
-    if chain.slides[joint] == 0:
-        linear = wp.cross(axis, position - wp.transform_point(pose, chain.anchors[joint]))
-        angular = axis
-    return linear, angular
-
-
-@wp.func
-def _fill_jacobian(chain: _Chain, bodies: BodyArrays, world: int, root: wp.quat):
-    position = wp.transform_get_translation(place_pose(bodies, world, chain.body, chain.pose))
-    for joint in range(chain.joints.shape[0]):
-        linear, angular = _movement(chain, bodies, world, joint, position)
-        linear = wp.quat_rotate_inv(root, linear)
-        angular = wp.quat_rotate_inv(root, angular)
-        for column in range(chain.rows.shape[0]):
-            row = chain.rows[column]
-            if row < 3:
-                chain.jacobian[column, joint, world] = linear[row]
-            else:
-                chain.jacobian[column, joint, world] = angular[row - 3]
-
-
-@wp.func
-def _fill_equations(chain: _Chain, worlds: WorldArrays, robot: RobotArrays, ik: IkArrays, world: int):
-    """(J^T W J + D) dq = J^T W dx + r: D and r are of damping, posture and exceeded limits."""
-    for first in range(chain.joints.shape[0]):
-        joint = chain.joints[first]
-        place = worlds.joint_q[world, robot.coordinates[joint]]
-        ends = chain.ranges[first]
-        excess = wp.clamp(place, ends[0], ends[1]) - place
-        right = chain.posture * (robot.defaults[joint] - place) + chain.limits * excess
-        for column in range(chain.rows.shape[0]):
-            right += chain.weights[column] * chain.jacobian[column, first, world] * ik.wanted[world, column]
-        chain.steps[first, world] = right
-        for second in range(first + 1):
-            total = float(0.0)
-            for column in range(chain.rows.shape[0]):
-                moves = chain.jacobian[column, first, world] * chain.jacobian[column, second, world]
-                total += chain.weights[column] * moves
-            if first == second:
-                total += chain.damping + chain.posture
-                if excess != 0.0:
-                    total += chain.limits
-            chain.matrix[first, second, world] = total
-
-
-@wp.func
-def _solve_equations(chain: _Chain, world: int):
-    """Cholesky's factor in place of the matrix, then the solution in place of the right side."""
-    count = chain.joints.shape[0]
-    for row in range(count):
-        for column in range(row + 1):
-            total = chain.matrix[row, column, world]
-            for each in range(column):
-                total -= chain.matrix[row, each, world] * chain.matrix[column, each, world]
-            if row == column:
-                # without rounding it is never less than the damping
-                chain.matrix[row, row, world] = wp.sqrt(wp.max(total, chain.damping))
-            else:
-                chain.matrix[row, column, world] = total / chain.matrix[column, column, world]
-    for row in range(count):
-        total = chain.steps[row, world]
-        for each in range(row):
-            total -= chain.matrix[row, each, world] * chain.steps[each, world]
-        chain.steps[row, world] = total / chain.matrix[row, row, world]
-    for back in range(count):
-        row = count - 1 - back
-        total = chain.steps[row, world]
-        for each in range(row + 1, count):
-            total -= chain.matrix[each, row, world] * chain.steps[each, world]
-        chain.steps[row, world] = total / chain.matrix[row, row, world]
-
-
-@wp.kernel
-def _move_frame(worlds: WorldArrays, bodies: BodyArrays, robot: RobotArrays, chain: _Chain, ik: IkArrays):
-    """Position targets of the joints of one world."""
-    world = wp.tid()
-    _fill_jacobian(chain, bodies, world, root_rotation_of(worlds, robot, world))
-    _fill_equations(chain, worlds, robot, ik, world)
-    _solve_equations(chain, world)
-    for index in range(chain.joints.shape[0]):
-        joint = chain.joints[index]
-        place = worlds.joint_q[world, robot.coordinates[joint]]
-        target = place + chain.steps[index, world]
-        if chain.goes_on:
-            target = chain.targets[world, index] + chain.steps[index, world]
-        ends = chain.ranges[index]
-        target = wp.clamp(wp.clamp(target, place - chain.max_step, place + chain.max_step), ends[0], ends[1])
-        chain.targets[world, index] = target
-        worlds.controls[world, robot.actuators[joint]] = target
-    for column in range(chain.rows.shape[0]):
-        ik.wanted[world, column] = 0.0
-
-
-@wp.kernel
-def _begin(worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, chain: _Chain):
-    """In a world that was placed afresh the last targets are where the joints are."""
-    world = wp.tid()
-    if episodes.ages[world] == 0:
-        for index in range(chain.joints.shape[0]):
-            chain.targets[world, index] = worlds.joint_q[world, robot.coordinates[chain.joints[index]]]
+"""What of a frame may be moved: along the axes of the root, or of the world [m], and about them [rad]."""
+QUATERNION = ("qx", "qy", "qz", "qw")
+"""The columns of an absolute orientation."""
+FRAMES = ("root", "world")
+"""Whose axes these are."""
 
 
 @dataclass(frozen=True)
 class DifferentialIK:
-    """Joints that move a frame of a robot: ``terms.move_frame`` says how far, damped least squares make position targets of it.
+    """Joints that move a frame of a robot: ``terms.move_frame`` says how far, or whereto; damped least squares make position targets of it.
 
-    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx. They hold for a control step; their
+    The targets are q + dq, or the last targets + dq, with dq of (J^T W J + damping^2 1) dq = J^T W dx; dx is the movement, or what is
+    left to an absolute target. They hold for a control step; their
     actuators must be position servos. J and q are those at the step's start: mjlab and Isaac Lab solve anew in every physics step. A joint
     whose encoder has a bias is moved from where it is, not from where the encoder shows it.
 
@@ -205,8 +41,11 @@ class DifferentialIK:
         joints: Pattern or patterns of the joints that move it. Each turns or slides about one axis, lies between root and frame and has
             an actuator; it belongs to one declaration.
         robot: Whose they are.
-        axes: The columns, of :data:`AXES`: along and about the axes of the robot's root. What is not named here is left free. Turns
-            about several axes are one rotation vector.
+        axes: The columns, of :data:`AXES`: along and about the axes of ``frame``. What is not named here is left free. Turns about
+            several axes are one rotation vector. Where it is ``absolute``: some of x, y, z, and for an orientation qx, qy, qz, qw.
+        absolute: Whether an action is the frame's position [m] and orientation (quaternion xyzw, which need not have the length 1; of
+            length 0: as it is), not a displacement. Then all columns belong to one action.
+        frame: ``"root"``: axes, positions and orientations are those in the frame of the robot's root; ``"world"``: in the world's.
         position_weight: Of errors along x, y and z [1/m].
         orientation_weight: Of errors about them [1/rad].
         damping: Weight of the joints' displacements [1/rad, 1/m]: small steps where the arm is stretched, and less than is wanted.
@@ -223,6 +62,8 @@ class DifferentialIK:
     joints: str | Sequence[str] = "*"
     robot: str = "robot"
     axes: Sequence[str] = ("x", "y", "z")
+    absolute: bool = False
+    frame: str = "root"
     position_weight: float = 1.0
     orientation_weight: float = 1.0
     damping: float = 0.05
@@ -244,14 +85,27 @@ class DifferentialIK:
         names = place_names(views, "DifferentialIK", self.robot, bodies=self.body, sites=self.site)
         if len(names) != 1:
             raise ValueError(f"DifferentialIK: name one body or site; the pattern matches {', '.join(names)}")
-        if isinstance(self.axes, str) or not self.axes or len({*self.axes}) != len(self.axes):
-            raise ValueError(f"DifferentialIK.axes is {self.axes!r}; give some of {', '.join(AXES)}, each once")
-        for axis in self.axes:
-            if axis not in AXES:
-                raise ValueError(f"DifferentialIK.axes: there is no axis {axis!r}; {nearest(str(axis), AXES)}")
+        self._check_axes()
         self._check_numbers()
         self._check_joints(views[self.robot], names[0])
         return [f"{names[0]}_{axis}" for axis in self.axes]
+
+    def _check_axes(self) -> None:
+        known = AXES[:3] + QUATERNION if self.absolute else AXES
+        if isinstance(self.axes, str) or not self.axes or len({*self.axes}) != len(self.axes):
+            raise ValueError(f"DifferentialIK.axes is {self.axes!r}; give some of {', '.join(known)}, each once")
+        for axis in self.axes:
+            if axis not in known:
+                raise ValueError(f"DifferentialIK.axes: there is no axis {axis!r}; {nearest(str(axis), known)}")
+        turns = [axis for axis in self.axes if axis in QUATERNION]
+        if turns and " ".join(QUATERNION) not in " ".join(self.axes):
+            raise ValueError(
+                f"DifferentialIK.axes has {', '.join(turns)}; an orientation is {', '.join(QUATERNION)}, in this order"
+            )
+        if self.frame not in FRAMES:
+            raise ValueError(f"DifferentialIK.frame is {self.frame!r}; {nearest(str(self.frame), FRAMES)}")
+        if self.absolute and self.from_targets:
+            raise ValueError("DifferentialIK.from_targets adds up movements; leave it out where absolute=True")
 
     def _check_numbers(self) -> None:
         for name in ("position_weight", "orientation_weight", "damping", "max_step", "soft_factor"):
@@ -292,8 +146,9 @@ class DifferentialIK:
         names = ("position_weight", "orientation_weight", "damping", "max_step", "posture_weight", "limit_weight")
         numbers = ", ".join(f"{name} = {getattr(self, name):g}" for name in (*names, "soft_factor"))
         moved = f"the body {self.body}" if self.site is None else f"the site {self.site}"
+        verb, how = ("bring", "to") if self.absolute else ("move", "by")
         return (
-            f"damped least squares make position targets of {joints} that move {moved} in the root's frame by "
+            f"damped least squares make position targets of {joints} that {verb} {moved} in the {self.frame}'s frame {how} "
             f"{', '.join(self.axes)} ({numbers})"
             f"{', each from the last targets' if self.from_targets else ''}"
         )
@@ -327,15 +182,22 @@ class IkSolver:
         joints, count = declared.driven(context.views), context.worlds.world_count
         self.arrays = IkArrays()
         self.arrays.wanted = context.array((count, len(self.names)), wp.float32)
-        self._chain = chain = _Chain()
+        self._chain = chain = Chain()
         chain.body, chain.pose = place.body, place.pose
         self._read_joints(context.views[declared.robot], joints)
         self._read_ranges(context.views[declared.robot], joints, declared.soft_factor)
-        rows = [AXES.index(axis) for axis in declared.axes]
+        rows = [AXES.index(axis) for axis in declared.axes if axis in AXES]
+        columns = [column for column, axis in enumerate(declared.axes) if axis in AXES]
+        chain.in_world, chain.absolute, chain.turn = declared.frame == "world", declared.absolute, -1
+        if QUATERNION[0] in declared.axes:
+            chain.turn = [*declared.axes].index(QUATERNION[0])
+            rows, columns = [*rows, 3, 4, 5], [*columns, 0, 0, 0]
         weights = [(declared.position_weight if row < 3 else declared.orientation_weight) ** 2 for row in rows]
-        chain.rows, chain.weights = self._array(rows, wp.int32), self._array(weights, wp.float32)
+        chain.rows, chain.columns = self._array(rows, wp.int32), self._array(columns, wp.int32)
+        chain.weights = self._array(weights, wp.float32)
         chain.damping, chain.max_step = declared.damping**2, declared.max_step
         chain.posture, chain.limits = declared.posture_weight**2, declared.limit_weight**2
+        chain.errors = context.array((len(rows), count), wp.float32)
         chain.jacobian = context.array((len(rows), len(joints), count), wp.float32)
         chain.matrix = context.array((len(joints), len(joints), count), wp.float32)
         chain.steps = context.array((len(joints), count), wp.float32)
@@ -369,7 +231,7 @@ class IkSolver:
     def act(self) -> None:
         """Write the joints' targets, when all actions are written. ``Worlds.update_bodies`` must have been called."""
         inputs = [self._worlds.arrays, self._bodies, self._robot, self._chain, self.arrays]
-        wp.launch(_move_frame, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+        wp.launch(move_frame, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def advance(self) -> None:
         """Nothing: it acts before the physics."""
@@ -378,7 +240,7 @@ class IkSolver:
         """Forget the last targets where an episode begins."""
         if self._chain.goes_on:
             inputs = [self._worlds.arrays, self._episodes, self._robot, self._chain]
-            wp.launch(_begin, dim=self._worlds.world_count, inputs=inputs, device=self._device)
+            wp.launch(begin_targets, dim=self._worlds.world_count, inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """The last targets, where the next ones are counted from them."""

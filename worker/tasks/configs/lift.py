@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import field
 from types import MappingProxyType
+from typing import Annotated
 
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from worker.learning.ppo.settings import PPOConfig
@@ -74,3 +76,18 @@ class LiftCubeConfig(TaskConfig):
         )
     )
     """How the task is trained."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class LiftCubesConfig(LiftCubeConfig):
+    """Grip one of several cubes, the one that is chosen, as :class:`LiftCubeConfig`; what the rewards say of the cube is of that one.
+
+    Ranges are those of mjlab 1.6's ``Mjlab-Multi-Cube-Seg-Yam``.
+    """
+
+    cubes: Annotated[int, Field(ge=1, le=6)] = 3
+    """How many cubes there are, 1 to 6."""
+    cube_x: Range = (0.25, 0.4)
+    """Where each cube is put along x [m], uniform."""
+    cube_y: Range = (-0.15, 0.15)
+    """Where each cube is put along y [m], uniform."""

@@ -275,6 +275,19 @@ from worker.tasks.terms.root import (
     vertical_com_velocity_squared,
     vertical_velocity_squared,
 )
+from worker.tasks.terms.selecting import (
+    bring_chosen_object,
+    chosen_object_at_target,
+    chosen_object_height,
+    chosen_object_target_distance,
+    chosen_object_to_target,
+    chosen_object_was_at_target,
+    hand_to_chosen_object,
+    hand_to_each_object,
+    lift_one_command,
+    object_is_chosen,
+    reach_and_bring_chosen_object,
+)
 from worker.tasks.terms.sensing import (
     angular_momentum,
     angular_momentum_squared,

@@ -153,12 +153,13 @@ def two_velocities_target(
 
 @wp.func
 def move_frame(world: int, ik: IkArrays, index: int, value: float):
-    """A movement of a body or site: from where it is at the control step's start, by ``value`` along or about one axis [m, rad].
+    """A movement of a body or site by ``value`` along or about one axis [m, rad], or one number of the pose that it shall have.
 
-    The axes are those of the robot's root that the ``DifferentialIK`` names; it makes position targets of them, once a control step.
+    Which of both, and which axes, the ``DifferentialIK`` says; it makes position targets of them, once a control step. A movement
+    begins where the body or site is at the control step's start; a pose is a position [m] and a quaternion xyzw.
 
-    mjlab: DifferentialIKAction (which also takes absolute poses, has the world's axes, and solves in every physics
-    step). Isaac Lab: DifferentialInverseKinematicsAction (which also takes absolute poses, and solves in every physics step).
+    mjlab: DifferentialIKAction (which solves in every physics step, and takes quaternions wxyz).
+    Isaac Lab: DifferentialInverseKinematicsAction (which solves in every physics step, and takes quaternions wxyz).
     """
     ik.wanted[world, index] = value
 

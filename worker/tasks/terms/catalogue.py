@@ -27,6 +27,7 @@ GROUPS = (
     "ground",
     "footing",
     "manipulation",
+    "selecting",
     "tracking",
     "following",
 )
@@ -35,7 +36,7 @@ FILLED = ("world", "stream", "value", "terminated", "seconds")
 """Parameters that a task fills by itself, which a declaration says nothing of."""
 SHARED = ("WorldArrays", "EpisodeArrays", "BodyArrays", "TerrainArrays")
 """Structs of which a task has one."""
-_NAMES = re.compile(r"^ *mjlab: (.*?)\. Isaac Lab: (.*)\.$", re.DOTALL | re.MULTILINE)
+_NAMES = re.compile(r"^ *mjlab: (.*?)\.\s+Isaac Lab: (.*)\.$", re.DOTALL | re.MULTILINE)
 
 
 @dataclass(frozen=True)

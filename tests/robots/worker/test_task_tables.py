@@ -1,0 +1,85 @@
+"""What `muster tasks NAME` tells of every task that comes with Muster is complete: each table has a row for each declared term."""
+
+from __future__ import annotations
+
+import functools
+import json
+from typing import Any
+
+import pytest
+
+from orchestrator.cli.tasks import _numbers, _terms
+from orchestrator.cli.terminal import Console
+from tests.support.worker.robots import need_mjlab
+from worker.tasks import BUILT_IN, find_task
+from worker.tasks.__main__ import describe, main
+from worker.tasks.declaration import Image
+
+DECLARED = sorted({*BUILT_IN} - {"CartpolePixels"})
+"""Its policy sees an image; its terms are Cartpole's."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _files() -> None:
+    need_mjlab()
+
+
+@functools.cache
+def told(name: str) -> dict[str, Any]:
+    return describe(name, whole=True)
+
+
+@functools.cache
+def plan_of(name: str) -> Any:
+    kind = find_task(name)
+    return kind.sketch(kind.config_type()).plan  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str) -> None:
+    found, plan = told(name), plan_of(name)
+    declared = plan.declaration
+    expected = {
+        section: list(getattr(declared, section))
+        for section in ("rewards", "metrics", "terminations", "commands", "events", "curricula", "sensors", "randomize")
+    }
+    expected["actions"] = list(declared.actions)
+    for group, terms in declared.groups.items():
+        assert not isinstance(terms, Image)
+        expected["observations" if group == "policy" else f"observations of {group}"] = list(terms)
+    rows_of = {
+        section: [row["name"] for row in rows] for section, rows in found["tables"].items() if section != "success"
+    }
+    assert rows_of == {section: names for section, names in expected.items() if names}
+    success = found["tables"].get("success", [])
+    assert [[*row.values()] for row in success] == ([[declared.success]] if declared.success else [])
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> None:
+    found, plan = told(name), plan_of(name)
+    columns = sum(int(row["columns"]) for row in found["tables"]["observations"])
+    assert columns == len(found["observations"]) == len(plan.names)
+    assert {row["name"]: float(row["weight"]) for row in found["tables"]["rewards"]} == pytest.approx(found["rewards"])
+    values = plan.numbers.values
+    for place, (first, count) in plan.numbers.places.items():
+        assert found["numbers"][place] == values[first : first + count]
+    console = Console(width=400)
+    with console.capture() as captured:
+        for section, rows in found["tables"].items():
+            console.print(_terms(section, rows))
+        console.print(_numbers(found["numbers"]))
+    text = captured.get()
+    for rows in found["tables"].values():
+        assert all(row["name"] in text for row in rows if "name" in row)
+    assert all(place in text for place in found["numbers"])
+
+
+def test_a_name_that_there_is_no_task_of_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["LiftCub"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert "no task is called 'LiftCub'; did you mean LiftCube" in captured.err
+    assert main(["LiftCubes"]) == 0
+    (found,) = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["class"] == "worker.tasks.lift_cubes:LiftCubes" and found["tables"]["rewards"]

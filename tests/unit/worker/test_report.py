@@ -1,0 +1,58 @@
+"""What a training says of itself where there is no GPU: once, and only where it would take long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from shared_store.epoch import raise_epoch
+from shared_store.layout import Store
+from worker.learning.report import Report
+
+
+def said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int = 0
+) -> list[str]:
+    """The lines without an iteration's figures, of three iterations of 1,000 that take so long each."""
+    run = Store(tmp_path).open().run("r")
+    run.create({})
+    raise_epoch(run, 1)
+    job = SimpleNamespace(run=run, epoch=1, section={"task": "G1Rough"})
+    report = Report(SimpleNamespace(job=job, iterations=1000), resumed, device)  # type: ignore[arg-type]
+    for iteration in range(resumed + 1, resumed + 4):
+        report.iteration(
+            {
+                "iteration": iteration,
+                "reward": None,
+                "episode_length": None,
+                "steps_per_second": 98304.0 / seconds,
+                "iteration_seconds": seconds,
+            }
+        )
+    report.close()
+    return [line for line in capsys.readouterr().out.splitlines() if not line.startswith("iteration")]
+
+
+def test_a_training_of_days_without_a_gpu_says_so_once_and_how_to_try_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # 998 iterations of 200 s are 199,600 s, 2.31 days; 98,304 steps in 200 s are 491.5 a second
+    assert said(tmp_path, capsys, 200.0, "cpu") == [
+        "no GPU: G1Rough trains at about 492 steps/s on these processors, so that the other 998 iterations take about 2.3 days; "
+        "--set train.worlds=16 --set train.iterations=20 tries it"
+    ]
+
+
+def test_what_is_left_of_a_resumed_training_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # 1,000 - 402 = 598 iterations of 60 s are 9.97 hours
+    (line,) = said(tmp_path, capsys, 60.0, "cpu", resumed=400)
+    assert "the other 598 iterations take about 10 hours" in line
+
+
+@pytest.mark.parametrize(("seconds", "device"), [(20.0, "cpu"), (200.0, "cuda:0")], ids=["5.5 hours", "on a GPU"])
+def test_a_training_that_ends_today_or_has_a_gpu_says_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str
+) -> None:
+    assert said(tmp_path, capsys, seconds, device) == []

@@ -1,0 +1,109 @@
+"""Several objects, of which each world has one that counts at present. It measures nothing: a command chooses, terms read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import warp as wp
+
+from worker.simulation.patterns import find
+from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.sensor import SensorContext, views_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class SelectionArrays:
+    """Objects, and which of them counts in each world.
+
+    Attributes:
+        chosen: 1 of the object that counts, 0 of the others, shape ``(worlds, objects)``.
+        coordinates: First column of each object's root in ``WorldArrays.joint_q`` (position, quaternion xyzw), shape ``(objects,)``.
+        dofs: First column of each object's root in ``WorldArrays.joint_qd`` (linear, angular), shape ``(objects,)``.
+    """
+
+    chosen: wp.array2d(dtype=wp.float32)
+    coordinates: wp.array(dtype=wp.int32)
+    dofs: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def object_at(objects: SelectionArrays, index: int) -> RobotArrays:
+    """An object by its column; only its root is told."""
+    found = RobotArrays()
+    found.root_coordinate = objects.coordinates[index]
+    found.root_dof = objects.dofs[index]
+    return found
+
+
+@wp.func
+def chosen_one(objects: SelectionArrays, world: int) -> RobotArrays:
+    """The object that counts; only its root is told."""
+    chosen = objects.coordinates.shape[0] - 1
+    for index in range(chosen):
+        if objects.chosen[world, index] > 0.5:
+            chosen = index
+    return object_at(objects, chosen)
+
+
+@dataclass(frozen=True)
+class ObjectSelection:
+    """Objects of which one counts: ``terms.lift_one_command`` draws which, and ``terms.chosen_object_...`` are about that one.
+
+    Attributes:
+        objects: Pattern or patterns of names, as the task's ``objects`` gives them. Their roots are free.
+    """
+
+    objects: str | Sequence[str]
+    arrays_type: ClassVar[Any] = SelectionArrays
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each object.
+
+        Raises:
+            ValueError: A pattern matches nothing, or an object that is fixed to the world.
+        """
+        names = [*views]
+        found = [names[index] for index in find(names, self.objects, "object")]
+        for name in found:
+            if views[name].root_coordinate < 0:
+                raise ValueError(f"ObjectSelection: {name} is fixed to the world; leave it out")
+        return found
+
+    def build(self, context: SensorContext) -> Selection:
+        """The selection of these worlds. Raises ValueError as :meth:`rows`."""
+        return Selection(self.rows(context.views), context)
+
+
+class Selection:
+    """:class:`ObjectSelection` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+
+    Args:
+        names: Of the objects.
+        context: The worlds.
+    """
+
+    needs_bodies = False
+
+    def __init__(self, names: list[str], context: SensorContext) -> None:
+        self.names = tuple(names)
+        self.arrays = SelectionArrays()
+        self.arrays.chosen = context.array((context.worlds.world_count, len(names)), wp.float32)
+        for field, own in (("coordinates", "root_coordinate"), ("dofs", "root_dof")):
+            columns = [getattr(context.views[name], own) for name in names]
+            setattr(self.arrays, field, wp.array(columns, dtype=wp.int32, device=context.device))
+
+    def advance(self) -> None:
+        """Nothing: there is nothing to measure."""
+
+    def settle(self) -> None:
+        """Nothing: the command of a new episode chooses."""
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """Which object counts."""
+        return views_of(self.arrays, "chosen")

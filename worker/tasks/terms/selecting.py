@@ -1,0 +1,220 @@
+"""Several objects, of which one counts: a selection names them, a command chooses one for each world.
+
+The selection is a sensor, ``ObjectSelection("cube_*")``. The hand and the target are as for manipulation; the target is in the world frame.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from worker.simulation.episodes import EpisodeArrays
+from worker.simulation.kinematics import quaternion_from_angles, root_position_of, set_root_pose
+from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.sensors.frames import FrameArrays
+from worker.simulation.sensors.selection import SelectionArrays, chosen_one, object_at
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.term_needs import needs
+from worker.tasks.terms import manipulation
+
+wp.set_module_options({"enable_backward": False})
+
+TRIES = wp.constant(16)
+"""How often an object's place is drawn before it is put above the others."""
+
+
+@wp.func
+def touches_others(
+    world: int, worlds: WorldArrays, objects: SelectionArrays, count: int, place: wp.vec3, apart: float
+) -> bool:
+    """Whether a place is closer than ``apart`` [m], seen from above, to one of the first ``count`` objects."""
+    found = bool(False)
+    for index in range(count):
+        way = root_position_of(worlds, object_at(objects, index), world) - place
+        if wp.length(wp.vec2(way[0], way[1])) < apart:
+            found = True
+    return found
+
+
+@needs(command=3)
+@wp.func
+def lift_one_command(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    objects: SelectionArrays,
+    command: int,
+    stream: wp.uint32,
+    x: wp.vec2,
+    y: wp.vec2,
+    z: wp.vec2,
+    object_x: wp.vec2,
+    object_y: wp.vec2,
+    object_z: wp.vec2,
+    object_yaw: wp.vec2,
+    apart: float = 0.0,
+):
+    """Draw a target in the world frame [m] and the object that is to go there, and put all objects down at rest elsewhere; 3 numbers.
+
+    Each object's place and yaw are drawn from the same ranges of the world frame [m, rad], again where it is closer than ``apart`` to one
+    before it, seen from above [m]; after 16 tries it is put above them all.
+
+    mjlab: MultiCubeLiftingCommand (whose cubes may be put into one another). Isaac Lab: -.
+    """
+    episodes.memory[world, command] = wp.randf(stream, x[0], x[1])
+    episodes.memory[world, command + 1] = wp.randf(stream, y[0], y[1])
+    episodes.memory[world, command + 2] = wp.randf(stream, z[0], z[1])
+    count = objects.coordinates.shape[0]
+    chosen = wp.randi(stream, 0, count)
+    for index in range(count):
+        objects.chosen[world, index] = wp.where(index == chosen, 1.0, 0.0)
+        place = wp.vec3(0.0, 0.0, 0.0)
+        touching = bool(True)
+        for _try in range(TRIES):
+            if touching:
+                place = wp.vec3(
+                    wp.randf(stream, object_x[0], object_x[1]),
+                    wp.randf(stream, object_y[0], object_y[1]),
+                    wp.randf(stream, object_z[0], object_z[1]),
+                )
+                touching = touches_others(world, worlds, objects, index, place, apart)
+        if touching:
+            place[2] = place[2] + float(index) * (apart + object_z[1] - object_z[0])
+        one = object_at(objects, index)
+        rotation = quaternion_from_angles(0.0, 0.0, wp.randf(stream, object_yaw[0], object_yaw[1]))
+        set_root_pose(worlds, one, world, wp.transform(place, rotation))
+        for axis in range(6):
+            worlds.joint_qd[world, one.root_dof + axis] = 0.0
+
+
+@wp.func
+def object_is_chosen(world: int, objects: SelectionArrays, index: int) -> float:
+    """1 of the object that counts, 0 of each other one: called for all, a one-hot vector.
+
+    mjlab: camera_target_cube_mask (which shows it in an image). Isaac Lab: -.
+    """
+    return objects.chosen[world, index]
+
+
+@needs(columns=("objects",))
+@wp.func
+def hand_to_each_object(
+    world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays, index: int
+) -> wp.vec3:
+    """Way from the hand to an object, along the axes of the robot's root [m]; called for each of them.
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return manipulation.hand_to_object(world, worlds, robot, object_at(objects, index), hand)
+
+
+@wp.func
+def hand_to_chosen_object(
+    world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays
+) -> wp.vec3:
+    """Way from the hand to the object that counts, along the axes of the robot's root [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return manipulation.hand_to_object(world, worlds, robot, chosen_one(objects, world), hand)
+
+
+@needs(command=3)
+@wp.func
+def chosen_object_to_target(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    robot: RobotArrays,
+    objects: SelectionArrays,
+    command: int,
+) -> wp.vec3:
+    """Way from the object that counts to its target, along the axes of the robot's root [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return manipulation.object_to_target(world, worlds, episodes, robot, chosen_one(objects, world), command)
+
+
+@wp.func
+def chosen_object_height(world: int, worlds: WorldArrays, objects: SelectionArrays) -> float:
+    """Height of the object that counts above z = 0 [m].
+
+    mjlab: -. Isaac Lab: -.
+    """
+    return root_position_of(worlds, chosen_one(objects, world), world)[2]
+
+
+@needs(command=3)
+@wp.func
+def chosen_object_target_distance(
+    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int
+) -> float:
+    """Distance between the object that counts and its target [m].
+
+    mjlab: position_error (of MultiCubeLiftingCommand). Isaac Lab: -.
+    """
+    return manipulation.object_target_distance(world, worlds, episodes, chosen_one(objects, world), command)
+
+
+@needs(command=3)
+@wp.func
+def bring_chosen_object(
+    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, std: float
+) -> float:
+    """exp(-d^2 / std^2), d the distance between the object that counts and its target [m].
+
+    mjlab: multi_cube_bring_object_reward. Isaac Lab: -.
+    """
+    return manipulation.bring_object(world, worlds, episodes, chosen_one(objects, world), command, std)
+
+
+@needs(command=3)
+@wp.func
+def reach_and_bring_chosen_object(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    hand: FrameArrays,
+    objects: SelectionArrays,
+    command: int,
+    reaching_std: float,
+    bringing_std: float,
+) -> float:
+    """r (1 + b), r and b as of ``reach_and_bring_object``, of the object that counts, in [0, 2]; the others earn nothing.
+
+    mjlab: multi_cube_staged_position_reward. Isaac Lab: -.
+    """
+    return manipulation.reach_and_bring_object(
+        world, worlds, episodes, chosen_one(objects, world), hand, command, reaching_std, bringing_std
+    )
+
+
+@needs(command=3)
+@wp.func
+def chosen_object_at_target(
+    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, distance: float
+) -> float:
+    """1 where the object that counts is closer to its target than ``distance`` [m], else 0.
+
+    mjlab: at_goal (of MultiCubeLiftingCommand). Isaac Lab: -.
+    """
+    return manipulation.object_at_target(world, worlds, episodes, chosen_one(objects, world), command, distance)
+
+
+@needs(command=3, memory=1)
+@wp.func
+def chosen_object_was_at_target(
+    world: int,
+    worlds: WorldArrays,
+    episodes: EpisodeArrays,
+    objects: SelectionArrays,
+    command: int,
+    memory: int,
+    distance: float,
+) -> float:
+    """1 from the step on in which the object that counted was closer to its target than ``distance`` [m], until the episode ends.
+
+    mjlab: episode_success (of MultiCubeLiftingCommand, which forgets it when a target is drawn). Isaac Lab: -.
+    """
+    one = chosen_one(objects, world)
+    return manipulation.object_was_at_target(world, worlds, episodes, one, command, memory, distance)
