@@ -28,6 +28,8 @@ RINGS = ("centre line", "inner border", "outer border")
 
 _BLOCK = 512
 """Segments that are compared with all others at once."""
+_TOLD = 1000
+"""Crossings of each block among which the one that is told is looked for."""
 
 
 class BadTrack(UserError):
@@ -108,7 +110,7 @@ def inside(ring: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | None:
-    """Where rings touch or cross themselves or one another: ring, row, other ring, other row; None where they nowhere do.
+    """Where rings touch or cross: ring, row, other ring, other row; None where they nowhere do. First where one crosses itself.
 
     A row stands for the segment from it to the next. Neighbours in a ring meet where they should; points of a border that stand
     there several times (a hairpin turns about one point) count once.
@@ -120,6 +122,7 @@ def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | Non
     place = np.concatenate([np.arange(len(rows)) for rows in kept])
     size = np.array([len(rows) for rows in kept])[which]
     low, high = np.minimum(start, end), np.maximum(start, end)
+    found: list[tuple[bool, int, int, int, int]] = []
     for begin in range(0, len(start), _BLOCK):
         rows = slice(begin, begin + _BLOCK)
         near = (low[rows, None, 0] <= high[:, 0]) & (low[:, 0] <= high[rows, None, 0])
@@ -130,11 +133,10 @@ def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | Non
         other = (i < j) & ((which[i] != which[j]) | ((apart > 1) & (apart < size[i] - 1)))
         i, j = i[other], j[other]
         meet = _straddles(start[i], end[i], start[j], end[j]) & _straddles(start[j], end[j], start[i], end[i])
-        if meet.any():
-            k, m = int(i[meet.argmax()]), int(j[meet.argmax()])
+        for k, m in zip(i[meet][:_TOLD], j[meet][:_TOLD], strict=True):
             a, b = int(which[k]), int(which[m])
-            return a, int(kept[a][place[k]]), b, int(kept[b][place[m]])
-    return None
+            found.append((a != b, a, int(kept[a][place[k]]), b, int(kept[b][place[m]])))
+    return min(found)[1:] if found else None
 
 
 def _straddles(start: Floats, end: Floats, first: Floats, second: Floats) -> NDArray[np.bool_]:
