@@ -43,14 +43,16 @@ class StoredTrack:
     def facts(self) -> dict[str, Any]:
         """Its measures and origin, as they were kept. Raises TrackError where the description is damaged."""
         try:
+            refuse_links(self.path, 2)
             found: dict[str, Any] = bundles.read_manifest(self.path)["track"]
-        except (DamagedBundle, KeyError) as error:
+        except (DamagedBundle, DamagedFile, KeyError) as error:
             raise self._damaged(error) from None
         return found
 
     def read(self) -> bytes:
         """The content of ``track.npy``, as it was kept. Raises TrackError where anything of the track is altered or missing."""
         try:
+            refuse_links(self.path, 2)
             bundles.verify(self.path)
             with open_regular(self.path / FILE) as file:
                 return file.read(LARGEST)

@@ -84,14 +84,14 @@ def make(
         str | None, typer.Option(help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Draw a closed curve from this number.")] = None,
-    length: Annotated[float | None, typer.Option(help="Of the centre line [m]; the preset's own, or 30.")] = None,
-    width: Annotated[float | None, typer.Option(help="Of the road [m]; 1 by default.")] = None,
-    spacing: Annotated[float | None, typer.Option(help="Between waypoints [m]; 0.15 by default.")] = None,
+    length: Annotated[float | None, typer.Option(help="Of the centre line, in metres; the preset's own, or 30.")] = None,
+    width: Annotated[float | None, typer.Option(help="Of the road, in metres; 1 by default.")] = None,
+    spacing: Annotated[float | None, typer.Option(help="Between waypoints, in metres; 0.15 by default.")] = None,
     roughness: Annotated[
         float | None, typer.Option(help="Of a drawn curve: 0 makes a circle, 1 is wild; 0.7 by default.")
     ] = None,
     least_radius: Annotated[
-        float | None, typer.Option(help="Of a drawn curve [m]; 0.75 by default.", show_default=False)
+        float | None, typer.Option(help="Of a drawn curve, in metres; 0.75 by default.", show_default=False)
     ] = None,
     direction: Annotated[
         str | None, typer.Option(help="counter-clockwise (the default) or clockwise.", show_default=False)
@@ -116,7 +116,7 @@ def make(
 
 def import_file(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An .npy file of the shape (N, 6): centre, inner and outer x, y [m].")
+        Path, typer.Argument(metavar="FILE", help="An .npy file of the shape (N, 6): centre, inner and outer x and y, in metres.")
     ],
     name: NewName,
     output: OutOption = None,
@@ -165,8 +165,10 @@ def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
     if created := track.get("created"):
         echo(f"  kept:       {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(created))}")
     echo(f"  digest:     {track['digest']}")
-    for path in filter(None, (track.get("path"), output)):
-        echo(f"written: {path}")
+    if path := track.get("path"):
+        echo(f"  lies in:    {path}")
+    if output is not None:
+        echo(f"written: {output}")
 
 
 def _width(track: Mapping[str, Any]) -> str:
@@ -175,5 +177,6 @@ def _width(track: Mapping[str, Any]) -> str:
 
 
 def _origin(origin: Mapping[str, Any]) -> str:
-    """Where a track comes from, with what was asked for besides."""
-    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in origin.items() if key != "notes")
+    """Where a track comes from, then what was asked for besides."""
+    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
+    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)

@@ -27,7 +27,7 @@ def list_tracks(order: Order) -> list[Order]:
     store = Store(order["store"])
     for name in stored.names(store):
         try:
-            found.append(stored.find(store, name).facts())
+            found.append(stored.StoredTrack(store.tracks / name).facts())
         except stored.TrackError as error:
             found.append({"name": name, "problem": str(error)})
     return found
@@ -37,9 +37,11 @@ def show(order: Order) -> Order:
     """A track's measures; writes it to ``output`` where one is named. ``name``, ``store``."""
     store = Store(order["store"])
     track = resolve(order["name"], store)
-    is_kept = track.name in stored.names(store)
     _write(order, _content(order, track))
-    return stored.find(store, track.name).facts() if is_kept else track.facts()
+    if track.name not in stored.names(store):
+        return track.facts()
+    kept = stored.find(store, track.name)
+    return {**kept.facts(), "path": str(kept.path)}
 
 
 def make(order: Order) -> Order:

@@ -10,7 +10,7 @@ from worker.racer.geometry import place_at
 from worker.racer.track import Track
 
 _ASPHALT, _BORDER, _CENTER, _START = "#d9dce1", "#30343b", "#e08a1e", "#c0202a"
-_SIDE = 7.0
+_SIDE = 6.0
 """Of the longer side of the road's surroundings in the picture [inch]."""
 _NUMBERS = 12
 """Waypoints whose numbers are written, about."""
@@ -49,7 +49,7 @@ def picture_of(track: Track) -> bytes:
     figure.suptitle(track.name, fontsize=13, fontweight="bold")
     axes.set_title(_measures(track), fontsize=9, color="#555555")
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", pil_kwargs={"optimize": True})
     return buffer.getvalue()
 
 

@@ -130,10 +130,10 @@ def check_wanted(length: float, width: float, spacing: float, direction: str) ->
 
 def check_room(what: str, radius: float, length: float, width: float) -> None:
     """Raise BadTrack where the inner border would have no room in the tightest curve."""
-    if radius < width / 2 + _INSIDE:
+    if radius - _INSIDE < width / 2:
         raise BadTrack(
             f"{what} of {length:g} m: its tightest curve has a radius of {radius:.2f} m, too little for a road of {width:g} m; "
-            f"make it longer, or the road at most {max(0.0, 2 * (radius - _INSIDE)):.2f} m wide"
+            f"make it longer, or the road at most {math.floor(200 * (radius - _INSIDE)) / 100:.2f} m wide"
         )
 
 

@@ -107,7 +107,7 @@ def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(asked: dict[str, o
 
 
 def test_a_preset_that_is_too_short_for_its_width_says_how_wide_it_may_be() -> None:
-    with pytest.raises(BadTrack, match=r"oval of 8 m: .* radius of 0.78 m, too little for a road of 1.5 m; .* at most 1.36 m wide"):
+    with pytest.raises(BadTrack, match=r"oval of 8 m: .* radius of 0.78 m, too little for a road of 1.5 m; .* at most 1.35 m wide"):
         make_preset("oval", length=8.0, width=1.5)
     assert make_preset("oval", length=8.0, width=1.35).name == "oval"
     with pytest.raises(BadTrack, match="preset ovel: there is no such preset; did you mean oval?"):
