@@ -79,7 +79,9 @@ def find(store: Store, name: str) -> StoredTrack:
     """The track of that name. Raises TrackError with the nearest one where there is none."""
     known = names(store)
     if name not in known:
-        raise TrackError(f"track {name[:130]} does not exist; {nearest(name, known, '' if known else 'none is kept yet')}")
+        raise TrackError(
+            f"track {name[:130]} does not exist; {nearest(name, known, '' if known else 'none is kept yet')}"
+        )
     return StoredTrack(store.tracks / name)
 
 

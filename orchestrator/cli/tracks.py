@@ -44,7 +44,9 @@ def register(app: typer.Typer) -> None:
     )
     group.command("list", epilog="Example:  muster tracks list --json")(list_tracks)
     group.command("show", epilog="Example:  muster tracks show chicane -o chicane.png")(show)
-    group.command("make", epilog="Example:  muster tracks make hills --seed 7 --length 45 --width 1.2 -o hills.png")(make)
+    group.command("make", epilog="Example:  muster tracks make hills --seed 7 --length 45 --width 1.2 -o hills.png")(
+        make
+    )
     group.command("import", epilog="Example:  muster tracks import reinvent_base.npy --name reinvent")(import_file)
     app.add_typer(group, name="tracks")
 
@@ -84,7 +86,9 @@ def make(
         str | None, typer.Option(help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Draw a closed curve from this number.")] = None,
-    length: Annotated[float | None, typer.Option(help="Of the centre line, in metres; the preset's own, or 30.")] = None,
+    length: Annotated[
+        float | None, typer.Option(help="Of the centre line, in metres; the preset's own, or 30.")
+    ] = None,
     width: Annotated[float | None, typer.Option(help="Of the road, in metres; 1 by default.")] = None,
     spacing: Annotated[float | None, typer.Option(help="Between waypoints, in metres; 0.15 by default.")] = None,
     roughness: Annotated[
@@ -108,7 +112,9 @@ def make(
     drawn = {"roughness": roughness, "least_radius": least_radius}
     for option, value in drawn.items():
         if preset is not None and value is not None:
-            raise UsageError(f"--{option.replace('_', '-')} belongs to --seed; a preset's curves follow from its length")
+            raise UsageError(
+                f"--{option.replace('_', '-')} belongs to --seed; a preset's curves follow from its length"
+            )
     measures = {key: value for key, value in {**given, **drawn}.items() if value is not None}
     order = {"action": "make", "name": name, "preset": preset, "seed": seed, "measures": measures}
     _tell(_ask(order, store, output, overwrite), output, as_json)
@@ -116,7 +122,10 @@ def make(
 
 def import_file(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An .npy file of the shape (N, 6): centre, inner and outer x and y, in metres.")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="An .npy file of the shape (N, 6): centre, inner and outer x and y, in metres."
+        ),
     ],
     name: NewName,
     output: OutOption = None,

@@ -23,7 +23,9 @@ Order = dict[str, Any]
 
 def list_tracks(order: Order) -> list[Order]:
     """All tracks, the presets first; one that is damaged has a ``problem`` instead of measures. ``store``: where they lie."""
-    found = [{**make_preset(name).facts(), "origin": {"preset": name}, "about": PRESETS[name].about} for name in PRESETS]
+    found = [
+        {**make_preset(name).facts(), "origin": {"preset": name}, "about": PRESETS[name].about} for name in PRESETS
+    ]
     store = Store(order["store"])
     for name in stored.names(store):
         try:

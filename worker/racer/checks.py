@@ -106,7 +106,8 @@ def area_of(ring: Floats) -> float:
 
 def inside(ring: Floats, points: Floats) -> NDArray[np.bool_]:
     """Which of ``points`` (P, 2) lie inside a ring (N, 2), as (P,)."""
-    return meetings(ring, np.roll(ring, -1, axis=0), points) % 2 == 1
+    found: NDArray[np.bool_] = meetings(ring, np.roll(ring, -1, axis=0), points) % 2 == 1
+    return found
 
 
 def first_crossing(rings: tuple[Floats, ...]) -> tuple[int, int, int, int] | None:

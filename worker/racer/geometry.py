@@ -90,7 +90,8 @@ def on_road(track: Track, points: Any) -> NDArray[np.bool_]:
     points = np.asarray(points, np.float64).reshape(-1, 2)
     start = np.concatenate((track.inner, track.outer))
     end = np.concatenate((np.roll(track.inner, -1, axis=0), np.roll(track.outer, -1, axis=0)))
-    return meetings(start, end, points) % 2 == 1
+    found: NDArray[np.bool_] = meetings(start, end, points) % 2 == 1
+    return found
 
 
 def place_at(track: Track, along: Any, backwards: Any = False) -> tuple[Floats, Floats]:
@@ -102,6 +103,7 @@ def place_at(track: Track, along: Any, backwards: Any = False) -> tuple[Floats, 
         backwards: Whether the waypoints are driven against their order: (S,) bool, or one for all.
     """
     along = np.mod(np.atleast_1d(np.asarray(along, np.float64)), track.length)
+    along = np.where(along >= track.length, 0.0, along)  # what is a hair behind the start line is rounded up to it
     backwards = np.broadcast_to(np.asarray(backwards, bool), len(along))
     forth = np.where(backwards, track.length - along, along)
     entered = np.where(backwards, *(np.searchsorted(track.along, forth, side=side) for side in ("left", "right")))

@@ -30,17 +30,23 @@ def resolve(name: str, store: Store | None) -> Track:
         return make_preset(name)
     if name.startswith(RANDOM):
         seed = name.removeprefix(RANDOM)
-        if not (seed.isascii() and seed.isdecimal() and int(seed) <= LARGEST_SEED):
-            raise BadTrack(f"track {shown(name)}: after {RANDOM} stands a whole number from 0 to {LARGEST_SEED}, such as {RANDOM}7")
+        if not (seed.isascii() and seed.isdecimal() and len(seed) < 20 and int(seed) <= LARGEST_SEED):
+            raise BadTrack(
+                f"track {shown(name)}: after {RANDOM} stands a whole number from 0 to {LARGEST_SEED}, such as {RANDOM}7"
+            )
         return make_random(int(seed))
     try:
         known = stored.names(store) if store is not None else []
         if store is None or name not in known:
             hint = nearest(name, [*PRESETS, *known, f"{RANDOM}7"])
             raise BadTrack(f"track {shown(name)}: there is no such track; {hint}")
-        return from_bytes(stored.find(store, name).read(), name).track
+        data = stored.find(store, name).read()
     except stored.TrackError as error:
         raise BadTrack(str(error)) from None
+    try:
+        return from_bytes(data, name).track
+    except BadTrack as error:  # what another version kept
+        raise BadTrack(f"track {name}: {error}") from None
 
 
 def keep(store: Store, track: Track, origin: dict[str, Any]) -> stored.StoredTrack:

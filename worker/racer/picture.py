@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ def picture_of(track: Track) -> bytes:
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
+    from PIL import Image
 
     low, high = np.minimum(track.inner, track.outer).min(axis=0), np.maximum(track.inner, track.outer).max(axis=0)
     span = high - low
@@ -49,8 +51,10 @@ def picture_of(track: Track) -> bytes:
     figure.suptitle(track.name, fontsize=13, fontweight="bold")
     axes.set_title(_measures(track), fontsize=9, color="#555555")
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", pil_kwargs={"optimize": True})
-    return buffer.getvalue()
+    figure.savefig(buffer, format="png")
+    small = io.BytesIO()  # few colours: a third of the size
+    Image.open(buffer).convert("RGB").quantize(128).save(small, "PNG", optimize=True)
+    return small.getvalue()
 
 
 def _measures(track: Track) -> str:
@@ -62,7 +66,7 @@ def _measures(track: Track) -> str:
     )
 
 
-def _number(axes, track: Track) -> None:  # type: ignore[no-untyped-def]  # matplotlib's axes
+def _number(axes: Any, track: Track) -> None:
     """Write the numbers of some waypoints on the inner half of the road; that of the start line is 0."""
     count = len(track.center)
     every = next(step for step in (5, 10, 20, 25, 50, 100, 250, 500) if count / step <= 1.5 * _NUMBERS)
@@ -71,7 +75,7 @@ def _number(axes, track: Track) -> None:  # type: ignore[no-untyped-def]  # matp
         axes.text(*place, str(row), fontsize=7, color="#555555", ha="center", va="center")
 
 
-def _start(axes, track: Track) -> None:  # type: ignore[no-untyped-def]  # matplotlib's axes
+def _start(axes: Any, track: Track) -> None:
     """Draw the start line across the road, and an arrow in driving direction."""
     axes.plot(*np.vstack((track.inner[0], track.outer[0])).T, color=_START, linewidth=3, solid_capstyle="butt")
     width = float(track.width[0])

@@ -67,7 +67,15 @@ PRESETS = {
         "four quarter circles of radius r, straights of 5 r and 2 r; the length is (2 π + 14) r",
     ),
     "chicane": Preset(
-        (Part(1), *_S, Part(1), *(Part(part.length, -part.turn) for part in _S), Part(2), Part.arc(2.5, math.pi), Part(1)),
+        (
+            Part(1),
+            *_S,
+            Part(1),
+            *(Part(part.length, -part.turn) for part in _S),
+            Part(2),
+            Part.arc(2.5, math.pi),
+            Part(1),
+        ),
         40.0,
         "each long side leads inwards and out again in arcs of radius r by 60°, the ends are half circles of 2.5 r; "
         "the length is (23 π / 3 + 10) r",

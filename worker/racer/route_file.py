@@ -108,7 +108,9 @@ def _array(data: bytes) -> Floats:
 def _track(rows: Floats, name: str) -> Imported:
     """Raises BadTrack."""
     if len(rows) < WAYPOINTS[0] + 1:
-        raise BadTrack(f"{counted(len(rows), 'row')} are too few; a track has {WAYPOINTS[0] + 1} or more, the last one is the first")
+        raise BadTrack(
+            f"{counted(len(rows), 'row')} are too few; a track has {WAYPOINTS[0] + 1} or more, the last one is the first"
+        )
     for column, ring in enumerate(RINGS):
         check_numbers(rows[:, 2 * column : 2 * column + 2], ring)
     for column, ring in enumerate(RINGS):
@@ -122,7 +124,9 @@ def _track(rows: Floats, name: str) -> Imported:
     rows = rows[:-1]
     kept = _different(rows[:, :2])
     if left_out := len(rows) - len(kept):
-        notes.append(f"left out {counted(left_out, 'row')} whose waypoint stands there twice, the first one row {_first_missing(kept)}")
+        notes.append(
+            f"left out {counted(left_out, 'row')} whose waypoint stands there twice, the first one row {_first_missing(kept)}"
+        )
         rows = rows[kept]
     center, inner, outer = rows[:, 0:2], rows[:, 2:4], rows[:, 4:6]
     if not inside(center, inner).any() and inside(center, outer).all():

@@ -17,7 +17,9 @@ def square(side: float = 4.0, width: float = 1.0) -> Track:
     """A square with its start line at the origin: along the x axis, up, back and down, a waypoint every 0.5 m, counter-clockwise."""
     edge = np.arange(0, side, 0.5)
     none, whole = np.zeros_like(edge), np.full_like(edge, side)
-    center = np.vstack([np.stack(each, -1) for each in ((edge, none), (whole, edge), (side - edge, whole), (none, side - edge))])
+    center = np.vstack(
+        [np.stack(each, -1) for each in ((edge, none), (whole, edge), (side - edge, whole), (none, side - edge))]
+    )
     middle = np.array([side / 2, side / 2])
     share = width / side
     return Track("square", center, middle + (center - middle) * (1 - share), middle + (center - middle) * (1 + share))
@@ -112,9 +114,9 @@ def test_progress_round_a_circle_is_the_angle() -> None:
 
 
 def test_the_road_lies_between_the_borders() -> None:
-    assert list(on_road(square(), [[2, 0], [2, 0.49], [2, 0.51], [2, -0.49], [2, -0.51], [2, 2], [4.4, 4.4], [9, 2]])) == [
-        *(True, True, False, True, False, False, True, False)
-    ]
+    assert list(
+        on_road(square(), [[2, 0], [2, 0.49], [2, 0.51], [2, -0.49], [2, -0.51], [2, 2], [4.4, 4.4], [9, 2]])
+    ) == [*(True, True, False, True, False, False, True, False)]
 
 
 def test_a_place_along_the_track_projects_to_itself_in_both_directions() -> None:
@@ -125,6 +127,7 @@ def test_a_place_along_the_track_projects_to_itself_in_both_directions() -> None
         found = project(track, points, backwards)
         np.testing.assert_allclose(found.along, along, atol=1e-9)
         np.testing.assert_allclose(np.cos(found.heading - headings), 1)
+        np.testing.assert_allclose(place_at(track, [-1e-20], backwards)[0], track.center[:1])
     behind, _ = place_at(track, [-1.0])
     np.testing.assert_allclose(behind, place_at(track, [track.length - 1.0])[0])
 
