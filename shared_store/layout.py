@@ -183,6 +183,10 @@ class Store:
     def models(self) -> Path:
         return self.path / "models"
 
+    @property
+    def tracks(self) -> Path:
+        return self.path / "tracks"
+
     def runs(self, after: str = "", most: int | None = None) -> list[Run]:
         """The runs that exist, by name: those behind ``after``, at most so many."""
         try:

@@ -95,6 +95,7 @@ ENTRIES = (
         _HERE,
         "List the tasks that are installed here; of one, all its terms and numbers.",
     ),
+    Entry("tracks", "tracks", _SHARED, "Tracks of the racer: list, show, make, import. A track is never changed."),
     Entry(
         "schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors; or that of the policy contract."
     ),

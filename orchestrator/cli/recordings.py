@@ -70,7 +70,7 @@ def record(
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
     if output is None:
         raise UsageError(f"-o is missing: muster record {source} -o FILE.mcap")
-    _check_output(output, overwrite, ".mcap")
+    check_output(output, overwrite, ".mcap")
     with controller(store, cpus) as connect:
         client = connect()
         run, live = source_of(client, source)
@@ -100,7 +100,7 @@ def render(
     """
     if source is None or output is None:
         raise UsageError("give a run, and -o FILE.gif (or .mp4, .png)")
-    _check_output(output, overwrite, ".gif", ".mp4", ".png")
+    check_output(output, overwrite, ".gif", ".mp4", ".png")
     found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     if not found:
         raise UsageError(f"--size {size}: expected WIDTHxHEIGHT, such as 640x360")
@@ -122,7 +122,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise UsageError(f"-o {path}: it exists; --overwrite replaces it")
 
 
-def _check_output(path: Path, overwrite: bool, *endings: str) -> None:
+def check_output(path: Path, overwrite: bool, *endings: str) -> None:
     """Refuse what can't be written before anything runs. Raises UsageError."""
     if path.is_dir():
         raise UsageError(f"-o {path}: it is a directory; name a file in it, such as {path / ('policy' + endings[0])}")

@@ -1,0 +1,191 @@
+"""Made tracks: measures by hand, fifty seeds, the same bytes everywhere; and what is refused as a track."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+
+from worker.racer.checks import BadTrack, area_of, inside
+from worker.racer.generator import make_random
+from worker.racer.geometry import on_road
+from worker.racer.presets import PRESETS, make_preset
+from worker.racer.route_file import to_bytes
+from worker.racer.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
+
+
+def ring(radius: float, count: int = 100) -> np.ndarray:
+    """Points of a circle about the origin, counter-clockwise."""
+    angles = 2 * math.pi * np.arange(count) / count
+    return radius * np.stack((np.cos(angles), np.sin(angles)), -1)
+
+
+def parts(center: float = 3.0) -> dict[str, np.ndarray]:
+    """A circular track."""
+    return {"center": ring(center), "inner": ring(center - 0.5), "outer": ring(center + 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("preset", "length", "units"),
+    [
+        ("oval", 30.0, 2 * math.pi + 4),
+        ("rounded-rectangle", 40.0, 2 * math.pi + 14),
+        ("chicane", 60.0, 23 * math.pi / 3 + 10),
+    ],
+)
+def test_a_preset_has_the_length_and_the_radius_that_its_arcs_and_straights_have(
+    preset: str, length: float, units: float
+) -> None:
+    track = make_preset(preset, length=length, width=1.2, spacing=0.1)
+    radius = length / units
+    # a chord of 0.1 m is shorter than its arc by 0.1³ / 24 r², in at most all of the segments
+    assert length - length * 0.1**2 / (24 * radius**2) - 1e-3 <= track.length <= length
+    assert track.least_radius == pytest.approx(radius, rel=1e-6)
+    np.testing.assert_allclose(track.width, 1.2)
+    assert len(track.center) == round(length / 0.1) and track.direction == COUNTER_CLOCKWISE
+    np.testing.assert_allclose(track.center.mean(axis=0), 0, atol=0.01)
+
+
+def test_the_points_of_an_oval_lie_on_its_straights_and_half_circles() -> None:
+    track = make_preset("oval", length=(2 * math.pi + 4) * 2, width=1.0)
+    radius = 2.0  # straights of 4 m, from x = -2 to 2
+    x, y = track.center.T
+    np.testing.assert_allclose(track.center[0], [0, -2], atol=1e-12)
+    straight = np.abs(x) <= 2
+    np.testing.assert_allclose(np.abs(y[straight]), radius, atol=1e-12)
+    np.testing.assert_allclose(np.hypot(np.abs(x[~straight]) - 2, y[~straight]), radius, atol=1e-12)
+    np.testing.assert_allclose(track.inner[0], [0, -1.5], atol=1e-12)
+    np.testing.assert_allclose(track.outer[0], [0, -2.5], atol=1e-12)
+
+
+def test_fifty_seeds_make_fifty_tracks() -> None:
+    digests = set()
+    for seed in range(50):
+        track = make_random(seed)
+        digests.add(track.digest)
+        assert track.length == pytest.approx(30.0, rel=1e-12) and len(track.center) == 200
+        assert track.steps.std() < 0.01 * track.steps.mean(), "the waypoints are evenly spaced"
+        assert track.least_radius >= 0.75
+        np.testing.assert_allclose(track.width, 1.0, rtol=1e-12)
+        assert on_road(track, track.center).all()
+        assert inside(track.outer, track.inner).all() and not inside(track.inner, track.outer).any()
+        assert 0 < area_of(track.inner) < area_of(track.center) < area_of(track.outer)
+    assert len(digests) == 50
+
+
+def test_a_seed_means_the_same_bytes_for_ever() -> None:
+    assert to_bytes(make_random(7)) == to_bytes(make_random(7))
+    digest = hashlib.sha256(to_bytes(make_random(7))).hexdigest()
+    assert digest == "c1ec17bb48cd2b2c052b00c6ecadade90bd83e027650e5affe5e8d4b3661faf0", (
+        "every job that names random:7 would get another track"
+    )
+    assert make_preset("chicane").digest == "9cc12ee1408c11ec774e63f705727f224aaec5b525cb8bc758478b7dcbaac5f3"
+
+
+def test_what_is_asked_of_a_drawn_track_is_kept() -> None:
+    track = make_random(3, length=60.0, width=0.8, spacing=0.2, roughness=1.0, least_radius=1.5, direction=CLOCKWISE)
+    assert track.length == pytest.approx(60.0) and len(track.center) == 300
+    assert track.least_radius >= 1.5 and track.direction == CLOCKWISE
+    np.testing.assert_allclose(track.width, 0.8)
+    circle = make_random(3, roughness=0.0)
+    assert circle.least_radius == pytest.approx(30 / (2 * math.pi), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"length": 3.0}, "length 3 m: expected 4 to 1000 m"),
+        ({"length": math.nan}, "length nan m: expected 4"),
+        ({"width": 0.1}, "width 0.1 m: expected 0.3 to 5 m"),
+        ({"spacing": 0.7}, "spacing 0.7 m: expected 0.02 to 0.5 m"),
+        ({"length": 400.0, "spacing": 0.05}, "that makes 8000 of them, expected 20 to 5000; change the spacing"),
+        ({"direction": "clockwize"}, "direction clockwize: did you mean clockwise?"),
+        ({"roughness": 2.0}, "roughness 2: expected 0 to 1"),
+        ({"width": 1.6}, "a radius of 0.75 m, too little for a road of 1.6 m"),
+        ({"length": 8.0, "least_radius": 2.0}, "a radius of 2 m is not possible on 8 m"),
+        ({"length": 8.0, "roughness": 1.0}, "seed 1: none of 200 curves fits"),
+    ],
+)
+def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(asked: dict[str, object], words: str) -> None:
+    with pytest.raises(BadTrack) as told:
+        make_random(1, **asked)  # type: ignore[arg-type]
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_a_preset_that_is_too_short_for_its_width_says_how_wide_it_may_be() -> None:
+    with pytest.raises(
+        BadTrack, match=r"oval of 8 m: .* radius of 0.78 m, too little for a road of 1.5 m; .* at most 1.35 m wide"
+    ):
+        make_preset("oval", length=8.0, width=1.5)
+    assert make_preset("oval", length=8.0, width=1.35).name == "oval"
+    with pytest.raises(BadTrack, match=r"preset ovel: there is no such preset; did you mean oval\?"):
+        make_preset("ovel")
+
+
+def bowtie() -> dict[str, np.ndarray]:
+    """A figure eight whose centre line meets itself exactly at a waypoint."""
+    t = 2 * math.pi * np.arange(80) / 80
+    center = np.stack((5 * np.cos(t), 5 * np.sin(t) * np.cos(t)), -1)
+    return {"center": center, "inner": center - 0.3, "outer": center + 0.3}
+
+
+def bumpy() -> dict[str, np.ndarray]:
+    """A circle with one waypoint 0.2 m outside of it: with its neighbours, 0.2 m away, it makes a curve of 0.2 m."""
+    rings = {"center": ring(3.0, 92), "inner": ring(2.5, 92), "outer": ring(3.5, 92)}
+    rings["center"][0] = 3.2, 0.0
+    return rings
+
+
+def changed(name: str, row: int, x: float, y: float) -> dict[str, np.ndarray]:
+    track = parts()
+    track[name][row] = x, y
+    return track
+
+
+@pytest.mark.parametrize(
+    ("rings", "words"),
+    [
+        ({name: points[::10] for name, points in parts().items()}, "10 different waypoints are too few"),
+        (changed("inner", 7, math.nan, 0.0), "inner border: row 7 (x nan, y 0.000) is not finite"),
+        (changed("outer", 3, 2e7, 0.0), "outer border: row 3 (x 20000000.000, y 0.000) is farther than 10000 m"),
+        (changed("center", 5, 9.0, 9.0), "the centre line has a gap of"),
+        (changed("center", 5, *parts()["center"][4]), "the waypoint of row 4"),
+        (changed("outer", 9, *parts()["inner"][9]), "the road is 0.000 m wide at row 9"),
+        ({**parts(), "outer": ring(9.0)}, "the road is 6.500 m wide at row"),
+        (bumpy(), "the curve at row 0 (x 3.200, y 0.000) has a radius of 0.20 m, which no car can drive"),
+        (bowtie(), "the centre line crosses or touches itself: row"),
+        (changed("inner", 20, 1.1, 2.9), "the centre line and the inner border cross or touch: row"),
+        (changed("outer", 50, *parts()["outer"][53]), "the outer border crosses or touches itself: row"),
+        ({**parts(), "inner": ring(3.5), "outer": ring(2.5)}, "the inner border lies outside the centre line: row 0 (x 3.500, y 0.000) (the borders seem"),
+        ({**parts(), "outer": ring(2.1)}, "the outer border does not enclose the centre line: row 0"),
+    ],
+)  # fmt: skip
+def test_rings_that_are_no_track_are_refused_with_row_and_place(rings: dict[str, np.ndarray], words: str) -> None:
+    with pytest.raises(BadTrack) as told:
+        Track("bad", **rings)
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_a_hairpin_may_turn_about_one_point_of_its_inner_border() -> None:
+    rings = parts()
+    rings["inner"][10:14] = rings["inner"][12]
+    assert Track("hairpin", **rings).length > 18
+
+
+def test_the_arrays_of_a_track_are_its_own_and_can_not_be_written() -> None:
+    rings = parts()
+    track = Track("circle", **rings)
+    rings["center"][0] = 0
+    assert track.center[0, 0] == 3.0
+    with pytest.raises(ValueError, match="read-only"):
+        track.center[0, 0] = 1.0
+
+
+def test_every_preset_can_be_driven_both_ways() -> None:
+    for preset in PRESETS:
+        there, back = make_preset(preset), make_preset(preset, direction=CLOCKWISE)
+        assert (there.direction, back.direction) == (COUNTER_CLOCKWISE, CLOCKWISE)
+        np.testing.assert_array_equal(there.center[0], back.center[0])
+        np.testing.assert_array_equal(there.inner[1:], back.inner[:0:-1])

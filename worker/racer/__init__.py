@@ -1,0 +1,1 @@
+"""The racer: tracks, and what a car on one is told about it."""

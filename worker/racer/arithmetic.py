@@ -1,0 +1,70 @@
+"""Sines, cosines and lengths that have the same bits on every machine.
+
+Libraries that compute sines differ in their last digits from processor to processor. Sums, products, quotients and square roots do not:
+IEEE 754 rounds them in one way. Made tracks use nothing else, so a seed means the same bytes everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_TURN = 2 * math.pi
+BLOCK = 1 << 20
+"""Pairs of a point and a segment that are looked at together."""
+_TERMS = 15
+"""Of the Taylor series; at half a turn the next one is below 1e-17."""
+
+
+def sine_cosine(angle: Any) -> tuple[Floats, Floats]:
+    """Sine and cosine, to about 1e-15.
+
+    Args:
+        angle: Any shape, float64 [rad], a few turns at most.
+    """
+    angle = np.asarray(angle, np.float64)
+    rest = angle - _TURN * np.rint(angle / _TURN)
+    square = rest * rest
+    sine, cosine = np.ones_like(rest), np.ones_like(rest)
+    for term in range(_TERMS, 0, -1):
+        sine = 1 - square / (2 * term * (2 * term + 1)) * sine
+        cosine = 1 - square / (2 * term * (2 * term - 1)) * cosine
+    return rest * sine, cosine
+
+
+def norm(vectors: Floats) -> Floats:
+    """Lengths of vectors (…, 2)."""
+    lengths: Floats = np.sqrt(vectors[..., 0] * vectors[..., 0] + vectors[..., 1] * vectors[..., 1])
+    return lengths
+
+
+def left_of(vectors: Floats) -> Floats:
+    """Vectors (…, 2), turned left by a right angle."""
+    return np.stack((-vectors[..., 1], vectors[..., 0]), -1)
+
+
+def cross(first: Floats, second: Floats) -> Floats:
+    """The cross product of vectors (…, 2): greater than 0 where ``second`` points left of ``first``."""
+    product: Floats = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return product
+
+
+def meetings(start: Floats, end: Floats, points: Floats) -> NDArray[np.int64]:
+    """How many of the segments from ``start`` (N, 2) to ``end`` a ray to the right meets, from each of ``points`` (P, 2), as (P,).
+
+    Of a closed ring it is odd for a point inside.
+    """
+    rise = end[:, 1] - start[:, 1]
+    slope = (end[:, 0] - start[:, 0]) / np.where(rise == 0, 1.0, rise)
+    found = np.empty(len(points), np.int64)
+    size = max(1, BLOCK // len(start))
+    for begin in range(0, len(points), size):
+        x, y = points[begin : begin + size, None, 0], points[begin : begin + size, None, 1]
+        rises = (start[:, 1] > y) != (end[:, 1] > y)
+        found[begin : begin + size] = (rises & (x < start[:, 0] + (y - start[:, 1]) * slope)).sum(axis=1)
+    return found

@@ -1,0 +1,107 @@
+"""A track: a closed road with a centre line and two borders.
+
+In memory the rings are N different points; the segment from the last one to the first closes each of them. In files the first row
+stands at the end once more (N + 1 rows), as the community's tools expect.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from worker.racer.arithmetic import Floats, norm
+from worker.racer.checks import area_of, check, radii_of, steps_of
+
+Direction = Literal["counter-clockwise", "clockwise"]
+COUNTER_CLOCKWISE: Direction = "counter-clockwise"
+CLOCKWISE: Direction = "clockwise"
+DIRECTIONS: tuple[Direction, ...] = (COUNTER_CLOCKWISE, CLOCKWISE)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A track that was checked (:mod:`worker.racer.checks`); its arrays can't be written.
+
+    Args:
+        name: What people call it.
+        center: Waypoints of the centre line in driving order, (N, 2) float64 [m]; the start line is at row 0.
+        inner: The border inside the loop beside each waypoint, (N, 2) float64 [m]: on the left of a track that goes round
+            counter-clockwise, on the right of a clockwise one.
+        outer: The border outside, (N, 2) float64 [m].
+
+    Raises:
+        BadTrack: It is none.
+    """
+
+    name: str
+    center: Floats
+    inner: Floats
+    outer: Floats
+
+    def __post_init__(self) -> None:
+        for field in ("center", "inner", "outer"):
+            ring = np.array(getattr(self, field), np.float64, order="C")
+            ring.flags.writeable = False
+            object.__setattr__(self, field, ring)
+        check(self.center, self.inner, self.outer)
+
+    @cached_property
+    def width(self) -> Floats:
+        """Of the road at each waypoint, (N,) [m]: from the one border to the other."""
+        return norm(self.outer - self.inner)
+
+    @cached_property
+    def steps(self) -> Floats:
+        """From each waypoint to the next, (N,) [m]."""
+        return steps_of(self.center)
+
+    @cached_property
+    def along(self) -> Floats:
+        """From the start line to each waypoint along the centre line, (N,) [m]; the first is 0."""
+        return np.concatenate(([0.0], np.cumsum(self.steps)[:-1]))
+
+    @cached_property
+    def length(self) -> float:
+        """Of the centre line, straight from waypoint to waypoint [m]."""
+        return float(np.cumsum(self.steps)[-1])
+
+    @cached_property
+    def direction(self) -> Direction:
+        """In which it is driven."""
+        return COUNTER_CLOCKWISE if area_of(self.center) > 0 else CLOCKWISE
+
+    @cached_property
+    def least_radius(self) -> float:
+        """Of the tightest curve of the centre line [m]."""
+        return float(radii_of(self.center).min())
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of :meth:`rows` as little-endian float64, in hexadecimal digits: two tracks with one digest are the same road."""
+        return hashlib.sha256(self.rows().astype("<f8").tobytes()).hexdigest()
+
+    def rows(self) -> Floats:
+        """The track as it stands in files, (N + 1, 6): centre x and y, inner x and y, outer x and y [m]; the last row is the first."""
+        rows = np.hstack((self.center, self.inner, self.outer))
+        return np.vstack((rows, rows[:1]))
+
+    def turned_round(self) -> Track:
+        """The same road with the same start line, driven the other way."""
+        order = np.concatenate(([0], np.arange(len(self.center) - 1, 0, -1)))
+        return Track(self.name, self.center[order], self.inner[order], self.outer[order])
+
+    def facts(self) -> dict[str, Any]:
+        """What people want to know of it, as JSON values; lengths in metres."""
+        return {
+            "name": self.name,
+            "length": self.length,
+            "width": [float(self.width.min()), float(self.width.max())],
+            "least_radius": self.least_radius,
+            "direction": self.direction,
+            "waypoints": len(self.center),
+            "digest": self.digest,
+        }
