@@ -347,6 +347,7 @@ def _show(given: argparse.Namespace, start: Callable[[Path | None], Page], stop:
     source: Any
     if given.training:
         source = Training(Run(given.training), given.job, given.worlds, stop, activity)
+        os.nice(10)  # where processors are short, frames are fewer, and the training goes on
     else:
         activity.say(loading(Run(given.policy), given.worlds))
         source = Policy(Run(given.policy), given.checkpoint, given.worlds, given.episodes, stop)
