@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
 
@@ -38,7 +39,7 @@ def main() -> int:
     target = run.recordings / f"{rollout.checkpoint.name}-{(job.id or 'job')[:8]}.mcap"
     recording = Recording(target, stage, rollout.facts(), rollout.attachments())
     recording.say(
-        f"checkpoint {rollout.checkpoint.name} of run {run.name}: {worlds} worlds, {episodes} episodes of each"
+        f"checkpoint {rollout.checkpoint.name} of run {run.name}: {counted(worlds, 'world')}, {counted(episodes, 'episode')} of each"
     )
     most = episodes * rollout.task.max_episode_length
     for rows in rollout.steps(most):
@@ -48,7 +49,7 @@ def main() -> int:
             break
     path = recording.finish()
     print(
-        f"recorded: {recording.steps} steps, {recording.episodes} episodes, {path.stat().st_size / 1e6:.1f} MB",
+        f"recorded: {counted(recording.steps, 'step')}, {counted(recording.episodes, 'episode')}, {path.stat().st_size / 1e6:.1f} MB",
         flush=True,
     )
     print(f"written: {path}", flush=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import time
 
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.learning.job import Job, end_startup, run_command
 
@@ -57,7 +58,7 @@ def main() -> int:
     data = picture.encode(taken, ending, frames)
     picture.write(target, data)
     print(
-        f"rendered: {seconds:g} s of {worlds} worlds, {len(data) / 1e6:.2f} MB, {spent:.1f} s for the camera",
+        f"rendered: {seconds:g} s of {counted(worlds, 'world')}, {len(data) / 1e6:.2f} MB, {spent:.1f} s for the camera",
         flush=True,
     )
     print(f"written: {target}", flush=True)

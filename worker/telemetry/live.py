@@ -17,6 +17,7 @@ from shared_store.files import read_json
 from shared_store.layout import Run
 from shared_store.logs import LogFollower
 from shared_store.metrics import history_of
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading
@@ -57,7 +58,7 @@ def record(run: Run, job: str, worlds: int, episodes: int, output: Path, patienc
         activity.say(loading(run, there))
         recording = _open(run, there, output, {"job": job})
         if there < worlds:
-            print(f"note: the training has {there} worlds on its main rank", flush=True)
+            print(f"note: the training has {counted(there, 'world')} on its main rank", flush=True)
         if asking.note:
             print(f"note: {asking.note}", flush=True)
         log = LogFollower(run, job)
@@ -141,11 +142,14 @@ def main() -> int:
                 print(f"{given.recover}: it is whole already; nothing had to be recovered", flush=True)
                 return 0
             path, count = made
-            print(f"recovered: {count} messages; written: {path}", flush=True)
+            print(f"recovered: {counted(count, 'message')}; written: {path}", flush=True)
             return 0
         done = record(Run(given.run), given.job, given.worlds, given.episodes, given.output)
-        lost = f", {done.lost} steps were lost" if done.lost else ""
-        print(f"recorded: {done.steps} steps, {done.episodes} episodes{lost}\nwritten: {done.path}", flush=True)
+        lost = f", {counted(done.lost, 'step')} lost" if done.lost else ""
+        print(
+            f"recorded: {counted(done.steps, 'step')}, {counted(done.episodes, 'episode')}{lost}\nwritten: {done.path}",
+            flush=True,
+        )
         return 0
     except UserError as error:
         print(f"muster: {error}", file=sys.stderr, flush=True)

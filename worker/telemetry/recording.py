@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.rows import Rows
@@ -230,7 +231,7 @@ class Recording:
         }
         self._writer.add_metadata("episode", known)
         self.say(
-            f"world {world}: episode {fields['episode']} ended by {cause} after {int(steps)} steps, return {total:.4g}"
+            f"world {world}: episode {fields['episode']} ended by {cause} after {counted(int(steps), 'step')}, return {total:.4g}"
         )
 
     def _add(self, topic: str, kind: str, now: int, data: bytes) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from shared_store.layout import Run
 from shared_store.logs import LogFollower, LogLine
 from shared_store.metrics import history_of
+from shared_store.wording import counted
 from worker.errors import UserError
 from worker.telemetry.page import Page, need_rerun
 from worker.telemetry.progress import Activity, loading
@@ -64,7 +65,7 @@ class Training:
         try:
             activity.say(loading(run, self._asking.worlds))
             if self._asking.worlds < worlds:
-                print(f"note: the training has {self._asking.worlds} worlds on its main rank", flush=True)
+                print(f"note: the training has {counted(self._asking.worlds, 'world')} on its main rank", flush=True)
             if self._asking.note:
                 print(f"note: {self._asking.note}", flush=True)
             self._stage, _ = stage_of(run, self._asking.worlds)
@@ -216,7 +217,7 @@ class Policy:
         screen = Screen(
             page.server, title, look_of(self._stage, rows), self._stage.pose(rows.coordinates[-1]), live=True
         )
-        text = f"checkpoint {checkpoint.name} of run {run.name}: {self._stage.worlds} worlds, seed {self._rollout.seed}"
+        text = f"checkpoint {checkpoint.name} of run {run.name}: {counted(self._stage.worlds, 'world')}, seed {self._rollout.seed}"
         screen.say([(time.time_ns(), "muster", text)])
         known = [each for each in history_of(run).after() if each.get("reward") is not None]
         # days ago, perhaps: on the timeline of iterations alone
@@ -230,7 +231,7 @@ class Policy:
         for world in np.flatnonzero(rows.mark("done")[-1]):
             total, steps = self._sums[world]
             cause = "time_out" if rows.mark("time_out")[-1, world] else "termination"
-            text = f"world {world}: episode {self._ended[world]} ended by {cause} after {int(steps)} steps, return {total:.4g}"
+            text = f"world {world}: episode {self._ended[world]} ended by {cause} after {counted(int(steps), 'step')}, return {total:.4g}"
             screen.say([(now, "muster", text)])
             screen.curve("episodes", [total], np.array([now]), [])
             self._sums[world], self._ended[world] = 0.0, self._ended[world] + 1
@@ -264,7 +265,8 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int],
         if replay.cut:
             print(f"note: {path.name} was cut short; it is shown up to control step {replay.count}", flush=True)
         print(
-            f"shown: {replay.count} control steps of {len(replay.look.places)} worlds; Ctrl-C ends the view", flush=True
+            f"shown: {counted(replay.count, 'control step')} of {counted(len(replay.look.places), 'world')}; Ctrl-C ends the view",
+            flush=True,
         )
         _wait(page, stop)
 
@@ -352,7 +354,7 @@ def _show(given: argparse.Namespace, start: Callable[[Path | None], Page], stop:
         activity.say(loading(Run(given.policy), given.worlds))
         source = Policy(Run(given.policy), given.checkpoint, given.worlds, given.episodes, stop)
     source.show(lambda: start(None))
-    print(f"viewed: {source.frames} frames", flush=True)
+    print(f"viewed: {counted(source.frames, 'frame')}", flush=True)
     return 0
 
 

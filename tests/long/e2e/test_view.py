@@ -220,7 +220,7 @@ def test_a_checkpoint_s_policy_acts_until_its_episodes_are_over(server: Serving,
     finally:
         view.close()
     lines = [each[0] for each in tables["/log"]["TextLog:text"].to_pylist()]
-    assert any(f"of run {run.name}: 1 worlds" in line for line in lines)
+    assert any(f"of run {run.name}: 1 world," in line for line in lines)
     assert any("world 0: episode 0 ended by" in line for line in lines)
 
 
