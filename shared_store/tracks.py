@@ -23,7 +23,7 @@ from shared_store.wording import nearest
 
 FILE = "track.npy"
 LARGEST = 1 << 20
-"""Bytes of a track."""
+"""Bytes of a track's file, here and where one is imported."""
 
 
 class TrackError(Exception):

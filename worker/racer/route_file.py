@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_store.files import DamagedFile, open_regular
+from shared_store.tracks import LARGEST
 from shared_store.wording import counted
 from worker.racer.arithmetic import Floats, norm
 from worker.racer.checks import RINGS, SHORTEST_STEP, WAYPOINTS, BadTrack, at, check_numbers, inside
 from worker.racer.track import Track
 
-LARGEST = 1 << 20
-"""Bytes of a file."""
 _MAGIC = b"\x93NUMPY"
 _CLOSED = 1e-3
 """How far the last row may be from the first one [m]."""

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shared_store.tracks import LARGEST
 from worker.racer.checks import BadTrack
 from worker.racer.generator import make_random
 from worker.racer.presets import make_preset
-from worker.racer.route_file import LARGEST, from_bytes, read_file, to_bytes
+from worker.racer.route_file import from_bytes, read_file, to_bytes
 
 OVAL = make_preset("oval")
 
