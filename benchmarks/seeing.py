@@ -20,6 +20,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -37,7 +38,6 @@ from worker.evaluation.episodes import play
 from worker.export import export
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policy
-from worker.telemetry.asking import answer_of
 from worker.telemetry.recording import Recording
 from worker.telemetry.rollout import Rollout
 
@@ -53,7 +53,7 @@ JUDGED = 256
 
 def watched(loop: Loop) -> list[int]:
     """Train with a recording, then without a reader, then with a live view; returns the iterations at which each stretch begins and ends."""
-    run, marks = loop.job.run, list[int]()
+    run, marks, failed = loop.job.run, list[int](), list[str]()
 
     def done() -> int:
         return int(loop.state.progress.iteration)
@@ -68,25 +68,37 @@ def watched(loop: Loop) -> list[int]:
         wait(iterations)
         marks.append(done())
 
-    def attended(*command: str) -> None:
-        reader = subprocess.Popen([sys.executable, "-m", *command], stdout=subprocess.DEVNULL)
-        while not answer_of(run).exists() and reader.poll() is None:
+    def attended(is_ready: Callable[[], bool], said: Path, *command: str) -> None:
+        with said.open("w") as output:
+            reader = subprocess.Popen([sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT)
+        while not is_ready():  # it imports and builds for seconds, and takes processor time for that
+            if reader.poll() is not None:
+                raise RuntimeError(f"{command[0]} ended at once:\n{said.read_text()}")
             time.sleep(0.05)
-        wait(WARM)  # the rollout is captured anew, the reader builds what it shows
+        wait(WARM)  # the rollout was captured anew
         mark(STRETCH)
         reader.send_signal(signal.SIGINT)
         reader.wait()
         wait(WARM)
 
     def look_on(folder: Path) -> None:
+        try:
+            look(folder)
+        except RuntimeError as error:
+            failed.append(str(error))
+        loop.stop.requested = True
+
+    def look(folder: Path) -> None:
         wait(WARM)
         worlds = ("--worlds", str(TAPPED))
-        output = ("--episodes", "1000000", "--output", str(folder / "live.mcap"))
-        attended("worker.telemetry.live", str(run.path), *worlds, *output)
+        made, said = folder / "live.mcap", folder / "said.txt"
+        output = ("--episodes", "1000000", "--output", str(made))
+        recorded = ("worker.telemetry.live", str(run.path), *worlds, *output)
+        attended((folder / "live.mcap.partial").exists, said, *recorded)
         mark(STRETCH)
         if find_spec("rerun"):
-            attended("worker.telemetry.view", "--training", str(run.path), "--job", "bench", *worlds)
-        loop.stop.requested = True
+            viewed = ("worker.telemetry.view", "--training", str(run.path), "--job", "bench", *worlds)
+            attended(lambda: "http://" in said.read_text(), said, *viewed)
 
     with tempfile.TemporaryDirectory() as folder:
         watcher = threading.Thread(target=look_on, args=(Path(folder),))
@@ -94,6 +106,8 @@ def watched(loop: Loop) -> list[int]:
         with contextlib.redirect_stdout(io.StringIO()):
             loop.train()
         watcher.join()
+    if failed:
+        raise SystemExit(failed[0])
     return marks
 
 
