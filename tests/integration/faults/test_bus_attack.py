@@ -119,7 +119,9 @@ def test_a_node_commands_no_other_not_even_with_its_own_proof(bus: Bus, victim: 
     proof = own(bus).prove("command", f"{KEY}/command/stop", "1")
     payload = json.dumps({"id": "1", "proof": proof})
     for key in (f"{KEY}/command/stop", "muster/*/*/*/command/stop", "muster/**"):
-        assert list(mallory.get(key, payload=payload, target=zenoh.QueryTarget.ALL, timeout=0.5)) == []
+        replies = list(mallory.get(key, payload=payload, target=zenoh.QueryTarget.ALL, timeout=0.5))
+        # where the machine is busy, its own session says that the time is over: nobody's answer
+        assert [each for each in replies if each.err is None or bytes(each.err.payload) != b"Timeout"] == []
     assert bus.command("victim", 1, 0, "stacks", 10) == "stacks done"
     assert victim.done == ["stacks"]
 

@@ -129,7 +129,7 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
     (checkpoint.path / "manifest.json").write_text(json.dumps(manifest))
     monkeypatch.setattr("shared_store.checkpoints.Checkpoint.verify", lambda _: None)
     code, said = say(store, "one", "twin", capsys)
-    assert code == 0 and "generators are not compared: 1 ranks saved them in one run, 2 in the other" in said, said
+    assert code == 0 and "generators are not compared: 1 rank saved them in one run, 2 in the other" in said, said
     some = Shards(list_checkpoints(run(store, "twin"))[-1]).worlds(2, 4)
     assert all(torch.equal(tensor, content["worlds"]["state"][name][2:6]) for name, tensor in some.items())
 
