@@ -22,7 +22,7 @@ run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
 
 # two files at a time, in the order of the tiers in tests/conftest.py
-PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
+PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=40
 
 test: lint kernels
 	$(PYTEST) -m "not cluster and not robots and not long"
@@ -49,7 +49,7 @@ services: $(READY) kernels
 
 # one after the other: a cluster has this machine for itself
 engines: $(READY) kernels
-	$(BIN)/pytest -q --durations=10 tests/cluster
+	$(BIN)/pytest -q --durations=40 tests/cluster
 
 kernels: $(READY)
 	$(BIN)/python -m tests.support.kernels
