@@ -1,0 +1,1 @@
+"""The racer: cars that learn to drive round a track."""
