@@ -67,10 +67,10 @@ def warp_function(snippet: str) -> Any:
     A car whose reward has no value gets NaN, and a row of ``race.errors`` that says why.
     """
     name = f"reward_{hashlib.sha256(snippet.encode()).hexdigest()[:12]}"
-    scope: dict[str, Any] = {"wp": wp, "RaceArrays": RaceArrays, "__name__": f"muster.{name}"}
-    text = f"def {name}(world: int, race: RaceArrays) -> float: ...\n"
-    _run(text, name, scope)
-    return wp.func_native(snippet)(scope[name])
+    scope: dict[str, Any] = {"wp": wp, "RaceArrays": RaceArrays, "snippet": snippet, "__name__": f"muster.{name}"}
+    # Warp reads the type of the result only where it sees this decorator
+    _run(f"@wp.func_native(snippet)\ndef {name}(world: int, race: RaceArrays) -> float:\n    ...\n", name, scope)
+    return scope[name]
 
 
 def kernels(functions: Sequence[Any], name: str) -> list[Any]:

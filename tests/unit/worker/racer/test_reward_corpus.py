@@ -18,10 +18,10 @@ from worker.racer.rewards.translation import Outside, translate
 
 CORPUS = {path.stem: path.read_text() for path in sorted((Path(__file__).parent / "corpus").glob("*.py"))}
 OUTSIDE = {
-    "classic_racing_line": "line 13: a list that grows: such functions run in Python workers",
+    "classic_racing_line": "line 16: a list that grows: such functions run in Python workers",
     "global_state": "line 7: the global variable last_progress, which keeps its value: such functions run in Python workers",
-    "numpy_arrays": "line 7: numpy.array (there is nothing like it): such functions run in Python workers",
-    "stateful_class": "line 14: an object of the class Reward: such functions run in Python workers",
+    "numpy_arrays": "line 7: numpy.array(): such functions run in Python workers",
+    "stateful_class": "line 18: an object of the class Reward: such functions run in Python workers",
 }
 DRAWN = 250
 

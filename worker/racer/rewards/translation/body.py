@@ -19,6 +19,7 @@ from worker.racer.rewards.translation.values import (
     described,
     flat,
     joined,
+    parenthesised,
     rebuilt,
     shape_of,
 )
@@ -264,7 +265,7 @@ class Body(Calls):
             test = self.hold(test)  # type: ignore[assignment]
             self.check()
         before = set(self.assigned)
-        self.emit(f"if ({test.code}) {{")
+        self.emit(f"if {parenthesised(test.code)} {{")
         first = self.block(node.body)
         left, self.assigned = self.assigned, set(before)
         self.emit("} else {")

@@ -6,7 +6,6 @@ import ast
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from shared_store.wording import nearest
 from worker.racer.rewards.parameters import BY_NAME
 from worker.racer.rewards.translation.expressions import Expressions, Iterated
 from worker.racer.rewards.translation.mathematics import FUNCTIONS, QUIET
@@ -27,6 +26,7 @@ from worker.racer.rewards.translation.values import (
     flat,
     joined,
     number,
+    parenthesised,
     rebuilt,
     shape_of,
 )
@@ -111,8 +111,6 @@ class Calls(Expressions):
         if name in ("math.dist", "math.hypot", "numpy.hypot", "numpy.linalg.norm"):
             return self._distance(name, arguments, node)
         if function not in table:
-            if module in ("math", "numpy"):
-                raise Outside(node, f"{name} ({nearest(function, table, 'there is nothing like it')})")
             raise Outside(node, f"{name}()")
         found = table[function]
         if len(arguments) not in found.counts:
@@ -338,7 +336,7 @@ class Calls(Expressions):
             if name in ("any", "all"):
                 sign = "" if name == "any" else "!"
                 decided = "true" if name == "any" else "false"
-                self.emit(f"if ({sign}{self.truth(item, node).code}) {{ {result} = {decided}; break; }}")
+                self.emit(f"if {parenthesised(sign + self.truth(item, node).code)} {{ {result} = {decided}; break; }}")
             elif name == "len":
                 self.emit(f"{result} += 1;")
             elif name == "sum":

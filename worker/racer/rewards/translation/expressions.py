@@ -28,6 +28,7 @@ from worker.racer.rewards.translation.values import (
     flat,
     joined,
     number,
+    parenthesised,
     rebuilt,
     shape_of,
 )
@@ -339,7 +340,7 @@ class Expressions:
             return Number(shape, f"({test.code} ? {cast(one, shape)} : {cast(other, shape)})")
         names = [self.fresh() for _ in flat(shape)]
         self.lines += [f"{C_TYPES[kind]} {name} = 0;" for kind, name in zip(flat(shape), names, strict=True)]
-        for opening, lines, value in ((f"if ({test.code}) {{", before, one), ("} else {", otherwise, other)):
+        for opening, lines, value in ((f"if {parenthesised(test.code)} {{", before, one), ("} else {", otherwise, other)):
             self.lines += [opening, *lines]
             self.lines += [f"{name} = {code};" for name, code in zip(names, codes(value, shape), strict=True)]
         self.emit("}")
@@ -402,7 +403,7 @@ class Expressions:
         self.each(
             other,
             node,
-            lambda item: self.emit(f"if ({self.compared(ast.Eq(), held, item, node).code}) {{ {found} = true; break; }}"),
+            lambda item: self.emit(f"if {parenthesised(self.compared(ast.Eq(), held, item, node).code)} {{ {found} = true; break; }}"),
         )
         return Number("bool", found)
 
@@ -460,7 +461,8 @@ class Expressions:
         held, place = self.hold(index), self.fresh()
         self.emit(f"long long {place} = -1;")
         for count, key in enumerate(entries):
-            self.emit(f"if ({self.compared(ast.Eq(), held, self.program.wrap(key, node), node).code}) {place} = {count};")
+            same = self.compared(ast.Eq(), held, self.program.wrap(key, node), node)
+            self.emit(f"if {parenthesised(same.code)} {place} = {count};")
         self.emit(f"if ({place} < 0) py_fail({self.at(node)} + {KEY});")
         return self.chosen(tuple(self.program.wrap(value, node) for value in entries.values()), place, node)
 

@@ -140,6 +140,16 @@ def cast(value: Number, kind: str) -> str:
     return value.code if value.kind == kind else f"({C_TYPES[kind]})({value.code})"
 
 
+def parenthesised(code: str) -> str:
+    """A condition in one pair of parentheses: compilers warn about two."""
+    depth = 0
+    for place, letter in enumerate(code):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0:
+            return code if code[0] == "(" and place == len(code) - 1 else f"({code})"
+    return f"({code})"
+
+
 def shape_of(value: Value) -> Any:
     """The type of a variable that holds a value: a kind, a tuple of such, or the value itself where nothing has to be held."""
     if isinstance(value, Number):
