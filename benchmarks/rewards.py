@@ -104,7 +104,9 @@ def table(rows: list[dict[str, object]]) -> str:
     ]
     for row in rows:
         ratio = row["compiled"] / row["workers"]  # type: ignore[operator]
-        lines.append(f"| {row['name']} | {row['cars']:,} | {row['compiled']:,.0f} | {row['workers']:,.0f} | {ratio:,.0f} |")
+        lines.append(
+            f"| {row['name']} | {row['cars']:,} | {row['compiled']:,.0f} | {row['workers']:,.0f} | {ratio:,.0f} |"
+        )
     return "\n".join(lines) + "\n"
 
 

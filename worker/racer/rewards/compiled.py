@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
+from worker.racer.rewards.problems import Failure
 from worker.racer.rewards.translation.translate import told
 
 wp.set_module_options({"enable_backward": False})
@@ -98,9 +99,10 @@ def _run(text: str, name: str, scope: dict[str, Any]) -> None:
     exec(compile(text, file, "exec"), scope)
 
 
-def told_errors(errors: np.ndarray) -> dict[str, int]:
-    """What ``race.errors`` says: how many errors each message stands for, of which cars had it last; the most frequent first."""
-    found: dict[str, int] = {}
-    for code, count in errors[errors[:, 1] > 0].tolist():
-        found[told(code)] = found.get(told(code), 0) + count
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+def told_errors(errors: np.ndarray) -> dict[str, Failure]:
+    """What ``race.errors`` says: the calls that gave no reward, by their message."""
+    found: dict[str, Failure] = {}
+    for car in np.flatnonzero(errors[:, 1]).tolist():
+        code, count = errors[car].tolist()
+        found.setdefault(told(code), Failure(0, car)).count += count
+    return found

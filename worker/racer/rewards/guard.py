@@ -30,16 +30,79 @@ SECONDS = 5.0
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
 NAMES = frozenset(
-    "open exec eval compile input breakpoint exit quit help globals locals vars dir getattr setattr delattr".split()
+    [
+        "open",
+        "exec",
+        "eval",
+        "compile",
+        "input",
+        "breakpoint",
+        "exit",
+        "quit",
+        "help",
+        "globals",
+        "locals",
+        "vars",
+        "dir",
+        "getattr",
+        "setattr",
+        "delattr",
+    ]
 )
 """Built-in functions that may not be named."""
-_SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())
+_SYSTEM = frozenset(
+    [
+        "os",
+        "sys",
+        "subprocess",
+        "builtins",
+        "importlib",
+        "ctypes",
+        "socket",
+        "shutil",
+        "pathlib",
+        "pickle",
+        "io",
+        "posix",
+    ]
+)
 _FILES = frozenset(
-    "load save savez savez_compressed savetxt loadtxt fromfile tofile genfromtxt fromregex memmap open_memmap DataSource "
-    "dump dumps ctypeslib f2py distutils testing lib datasets system popen".split()
+    [
+        "load",
+        "save",
+        "savez",
+        "savez_compressed",
+        "savetxt",
+        "loadtxt",
+        "fromfile",
+        "tofile",
+        "genfromtxt",
+        "fromregex",
+        "memmap",
+        "open_memmap",
+        "DataSource",
+        "dump",
+        "dumps",
+        "ctypeslib",
+        "f2py",
+        "distutils",
+        "testing",
+        "lib",
+        "datasets",
+        "system",
+        "popen",
+    ]
 )
 """Attributes of modules, and methods of arrays, that read or write files or start programs."""
-_SUBMODULES = {"scipy.io", "scipy.datasets", "scipy.weave", "numpy.ctypeslib", "numpy.f2py", "numpy.lib", "numpy.testing"}
+_SUBMODULES = {
+    "scipy.io",
+    "scipy.datasets",
+    "scipy.weave",
+    "numpy.ctypeslib",
+    "numpy.f2py",
+    "numpy.lib",
+    "numpy.testing",
+}
 _OWN = {"self", "cls"}
 
 
@@ -131,7 +194,11 @@ def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
         return
     for name in names:
         if name.partition(".")[0] not in MODULES:
-            yield "IMPORT_ERROR", f"{name} can't be imported; a reward function may import {', '.join(MODULES)}", node.lineno
+            yield (
+                "IMPORT_ERROR",
+                f"{name} can't be imported; a reward function may import {', '.join(MODULES)}",
+                node.lineno,
+            )
         elif any(name == each or name.startswith(f"{each}.") for each in _SUBMODULES) or "._" in name:
             yield "FORBIDDEN", f"{name} can't be used in a reward function", node.lineno
         for alias in node.names if isinstance(node, ast.ImportFrom) else ():  # type: ignore[attr-defined]
@@ -162,11 +229,19 @@ def _function(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "reward_function"]
     if not found:
         other = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-        near = nearest("reward_function", other, "define it at the top level of the file") if other else "the file defines none"
+        near = (
+            nearest("reward_function", other, "define it at the top level of the file")
+            if other
+            else "the file defines none"
+        )
         yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
         return
     if len(found) > 1:
-        yield "TEST_FAILURE", f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}", found[1].lineno
+        yield (
+            "TEST_FAILURE",
+            f"reward_function is defined {len(found)} times; the first is in line {found[0].lineno}",
+            found[1].lineno,
+        )
     arguments = found[0].args
     given = [*arguments.posonlyargs, *arguments.args]
     if len(given) != 1 or arguments.vararg or arguments.kwarg or arguments.kwonlyargs:

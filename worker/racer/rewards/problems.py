@@ -46,6 +46,19 @@ class RewardFailed(UserError):
     """A reward function that can't go on: it does not return, floods its output, or its process died. One line, with the car."""
 
 
+@dataclass
+class Failure:
+    """Calls that gave no reward.
+
+    Attributes:
+        count: How many.
+        car: The first car that had one.
+    """
+
+    count: int
+    car: int
+
+
 def one_line(error: BaseException, most: int = 200) -> str:
     """An exception in one line."""
     text = " ".join(str(error).split())

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
-from worker.racer.rewards.problems import RewardRefused
+from worker.racer.rewards.problems import Failure, RewardRefused
 from worker.racer.rewards.translation import Outside, translate
 from worker.racer.rewards.workers import Workers
 
@@ -101,14 +100,17 @@ class RewardFunction:
             self._rewards.assign(self._workers.rewards())
         return self._rewards
 
-    def failures(self) -> dict[str, int]:
-        """How often each error was the answer so far, the most frequent first. Waits for the device.
+    def failures(self) -> dict[str, Failure]:
+        """The calls that gave no reward so far, by their message, the most frequent first. Waits for the device.
 
         A compiled function keeps of each car its last error and the number of all: they count under the last one.
         """
         if self._workers is not None:
-            return dict(sorted(self._workers.failures.items(), key=lambda item: -item[1]))
-        return {f"{self.file}: {told}": count for told, count in told_errors(np.array(self.race.errors.numpy())).items()}
+            found = self._workers.failures
+        else:
+            errors = told_errors(self.race.errors.numpy())
+            found = {f"{self.file}: {told}": failure for told, failure in errors.items()}
+        return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
     def close(self) -> None:
         """End the Python workers."""

@@ -85,7 +85,9 @@ def _degrees(angle: float) -> float:
     return (math.degrees(angle) + 180.0) % 360.0 - 180.0
 
 
-def sample(line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any) -> dict[str, Any]:
+def sample(
+    line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any
+) -> dict[str, Any]:
     """What a car's reward function is given.
 
     Args:
@@ -133,7 +135,9 @@ def sample(line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_revers
             for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
         ],
         "objects_distance": [each.way % line.length for each in objects],
-        "objects_heading": [_degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)],
+        "objects_heading": [
+            _degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)
+        ],
         "objects_left_of_center": [each.offset > 0.0 for each in objects],
         "objects_speed": [each.speed for each in objects],
         "objects_distance_from_center": [abs(each.offset) for each in objects],

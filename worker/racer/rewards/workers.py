@@ -22,7 +22,7 @@ import numpy as np
 from worker.racer.rewards.confined import MEMORY
 from worker.racer.rewards.guard import environment
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
-from worker.racer.rewards.problems import RewardFailed
+from worker.racer.rewards.problems import Failure, RewardFailed
 
 SECONDS = 2.0
 """For one call [s]."""
@@ -45,7 +45,7 @@ class Workers:
     Attributes:
         numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
         objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
-        failures: How often each message was the answer of a call, most recent step included.
+        failures: The calls that gave no reward so far, by their message.
 
     Raises:
         RewardFailed: The file can't be loaded.
@@ -71,7 +71,7 @@ class Workers:
         self.objects, self._rewards = np.split(rest, [worlds * MOST_OBJECTS * OBJECT_NUMBERS])
         self.numbers = self.numbers.reshape(worlds, NUMBERS)
         self.objects = self.objects.reshape(worlds, MOST_OBJECTS, OBJECT_NUMBERS)
-        self.failures: dict[str, int] = {}
+        self.failures: dict[str, Failure] = {}
         asked = {
             "source": source,
             "file": file,
@@ -139,10 +139,7 @@ class Workers:
                 raise RewardFailed(f"{place}: {car}{said['message']}")
             for told, at, car, count in said:
                 place = f"{self.file}:{at}" if at else self.file
-                message = f"{place}: {told}"
-                if message not in self.failures:
-                    self.failures[message] = 0
-                self.failures[message] += count
+                self.failures.setdefault(f"{place}: {told}", Failure(0, car)).count += count
 
     def _line(self, process: subprocess.Popen[bytes], number: int, until: float) -> bytes:
         """An answer, whole."""

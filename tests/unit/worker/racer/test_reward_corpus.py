@@ -13,6 +13,7 @@ import warp as wp
 
 from worker.racer.rewards import parameters
 from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.problems import Failure
 from worker.racer.rewards.samples import Line, oval, random_sample, samples
 from worker.racer.rewards.translation import Outside, translate
 
@@ -51,7 +52,7 @@ def filled(drawn: list[dict[str, Any]]) -> Any:
 
 
 @pytest.fixture(scope="module")
-def rewarded() -> tuple[list[dict[str, Any]], dict[str, tuple[np.ndarray, dict[str, int]]]]:
+def rewarded() -> tuple[list[dict[str, Any]], dict[str, tuple[np.ndarray, dict[str, Failure]]]]:
     """What was tried, and the rewards and errors of every function that compiles; all in one module of Warp."""
     drawn = tried()
     names = [name for name in CORPUS if name not in OUTSIDE]
@@ -83,7 +84,7 @@ def test_a_compiled_reward_function_gives_what_python_gives(name: str, rewarded:
             expected.append(math.nan)
             raised += 1
     assert rewards == pytest.approx(np.float32(expected), rel=2e-6, abs=1e-6, nan_ok=True)
-    assert sum(errors.values()) == raised
+    assert sum(failure.count for failure in errors.values()) == raised
     assert len({round(value, 9) for value in expected}) > 1, "all rewards are the same: the test shows nothing"
 
 
@@ -96,3 +97,10 @@ def test_a_function_outside_the_subset_is_told_with_its_line_and_the_reason(name
 
 def test_nine_of_ten_functions_compile() -> None:
     assert len(CORPUS) >= 30 and len(OUTSIDE) / len(CORPUS) <= 0.1
+
+
+def test_the_corpus_compiles_for_a_gpu(tmp_path: Path) -> None:
+    functions = [warp_function(translate(CORPUS[name]).snippet) for name in CORPUS if name not in OUTSIDE]
+    kernels(functions, "corpus_for_a_gpu")
+    wp.compile_aot_module(wp.get_module("muster.corpus_for_a_gpu"), arch=90, module_dir=tmp_path)
+    assert list(tmp_path.glob("*.sm90.*"))

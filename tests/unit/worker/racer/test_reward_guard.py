@@ -139,7 +139,8 @@ def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_li
 
 
 @pytest.mark.parametrize(
-    "body", ["while True:\n        pass", "while True:\n        try:\n            while True: pass\n        except: pass"]
+    "body",
+    ["while True:\n        pass", "while True:\n        try:\n            while True: pass\n        except: pass"],
 )
 def test_a_function_that_loops_for_ever_is_refused_with_its_line(body: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard, "SECONDS", 0.5)

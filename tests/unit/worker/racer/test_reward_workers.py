@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.waiting import wait_for
 from worker.racer.rewards import parameters
-from worker.racer.rewards.problems import RewardFailed
+from worker.racer.rewards.problems import Failure, RewardFailed
 from worker.racer.rewards.samples import oval, samples
 from worker.racer.rewards.workers import Workers
 
@@ -79,7 +79,7 @@ def test_a_call_that_gives_no_number_is_nan_and_counted_and_the_others_go_on(bod
         for steps in (1, 2):
             rewards = workers.rewards()
             assert np.isnan(rewards).tolist() == [car == 3 for car in range(WORLDS)]
-            assert workers.failures == {message: steps}
+            assert workers.failures == {message: Failure(steps, car=3)}
 
 
 @pytest.mark.parametrize(

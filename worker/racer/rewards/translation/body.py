@@ -218,7 +218,10 @@ class Body(Calls):
         self.slots[name] = new
         places, values = self.variables(name, new), codes(value, new)
         if len(places) > 1:  # an item may be worked out from another one
-            values = [code if code.startswith("t") else self._kept(kind, code) for kind, code in zip(flat(new), values, strict=True)]
+            values = [
+                code if code.startswith("t") else self._kept(kind, code)
+                for kind, code in zip(flat(new), values, strict=True)
+            ]
         self.lines += [f"{place} = {code};" for place, code in zip(places, values, strict=True)]
         if name in self.flagged:
             self.emit(f"{self.flag(name)} = true;")

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from worker.racer.rewards.parameters import BY_NAME
-from worker.racer.rewards.translation.expressions import Expressions, Iterated
+from worker.racer.rewards.translation.expressions import Expressions
+from worker.racer.rewards.translation.items import Iterated
 from worker.racer.rewards.translation.mathematics import FUNCTIONS, QUIET
 from worker.racer.rewards.translation.prelude import EMPTY
 from worker.racer.rewards.translation.values import (
@@ -99,9 +100,7 @@ class Calls(Expressions):
             return method(node, *arguments)
         return self._mathematical(function.name, arguments, node)
 
-    def apply(
-        self, function: Thing, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST
-    ) -> Value:
+    def apply(self, function: Thing, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
         """The result of a function of the file. Each file's translation defines it."""
         raise NotImplementedError
 
@@ -207,7 +206,9 @@ class Calls(Expressions):
         known = None
         if first.constant is not None and last.constant is not None and step.constant:
             known = len(range(first.constant, last.constant, step.constant))
-        length = str(known) if known is not None else f"py_steps({first.code}, {last.code}, {step.code}, {self.at(node)})"
+        length = (
+            str(known) if known is not None else f"py_steps({first.code}, {last.code}, {step.code}, {self.at(node)})"
+        )
         scope = Iterated(length, lambda index: Number("int", f"({first.code} + {index} * {step.code})"), known)
         return Thing("iterated", "a range", node, scope)
 
@@ -374,7 +375,11 @@ class Calls(Expressions):
             return self._fold(name, node, loop, self.expression(options["default"]))
         if "default" in options:
             raise Outside(node, f"{name}() with key= and default=")
-        key = self.expression(options["key"]) if not isinstance(options["key"], ast.Lambda) else self._Lambda(options["key"])
+        key = (
+            self.expression(options["key"])
+            if not isinstance(options["key"], ast.Lambda)
+            else self._Lambda(options["key"])
+        )
         shapes: list[Any] = []
 
         def keyed(item: Value) -> Number:
@@ -417,7 +422,11 @@ class Calls(Expressions):
         items = []
         for index in range(found.known):
             known: dict[str, Value] = {}
-            self.unpack(generator.target, self.hold(found.item(str(index))), lambda name, value, _, known=known: known.__setitem__(name, value))  # type: ignore[misc]
+            self.unpack(
+                generator.target,
+                self.hold(found.item(str(index))),
+                lambda name, value, _, known=known: known.__setitem__(name, value),
+            )  # type: ignore[misc]
             self.overlay.append(known)
             items.append(self.hold(self.expression(node.elt)))
             self.overlay.pop()

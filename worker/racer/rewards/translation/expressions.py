@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-from shared_store.wording import nearest
 from worker.racer.rewards.parameters import BY_NAME
-from worker.racer.rewards.translation.prelude import KEY, LOOP, UNBOUND
-from worker.racer.rewards.translation.program import CONSTANTS, MODULES, Program, folded
+from worker.racer.rewards.translation.items import Items
+from worker.racer.rewards.translation.prelude import KEY
+from worker.racer.rewards.translation.program import CONSTANTS, MODULES, folded
 from worker.racer.rewards.translation.values import (
     C_TYPES,
     LONGEST_GROUP,
@@ -33,108 +31,13 @@ from worker.racer.rewards.translation.values import (
     shape_of,
 )
 
-BUILTINS = (
-    "abs all any bool divmod enumerate float int len list max min pow print range reversed round sum tuple zip str".split()
-)
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _WHOLE = {ast.Add: "py_iadd", ast.Sub: "py_isub", ast.Mult: "py_imul", ast.FloorDiv: "py_idiv", ast.Mod: "py_imod"}
 _BITS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
 
 
-@dataclass(frozen=True)
-class Iterated:
-    """Something to go through.
-
-    Attributes:
-        length: C++ expression of how many items it has.
-        item: From an index that is valid to the item.
-        known: How many, where that is known.
-    """
-
-    length: str
-    item: Callable[[str], Value]
-    known: int | None = None
-
-
-class Expressions:
-    """Translates expressions into C++ expressions, and into lines before them where one does not do.
-
-    Attributes:
-        program: What all functions share.
-        lines: Where lines go.
-        slots: Types of the local variables.
-        assigned: Local variables that have a value here, whatever way led here.
-        flagged: Local variables that may be read before they have a value.
-        local: Names of all local variables.
-        overlay: Values of the variables of comprehensions.
-        may_fail: Whether something may have failed since the last check.
-    """
-
-    program: Program
-    lines: list[str]
-    slots: dict[str, Any]
-    assigned: set[str]
-    flagged: set[str]
-    local: set[str]
-    overlay: list[dict[str, Value]]
-    may_fail: bool
-    parent: Any
-    label: int
-
-    # lines
-
-    def emit(self, line: str) -> None:
-        """Add a line."""
-        self.lines.append(line)
-
-    def at(self, node: ast.AST) -> str:
-        """What helpers are told of the line, with a note that they may fail."""
-        self.may_fail = True
-        return str(16 * getattr(node, "lineno", 0))
-
-    def check(self) -> None:
-        """Leave the function where something failed."""
-        if self.may_fail:
-            self.emit("if (error) return {};")
-            self.may_fail = False
-
-    def captured(self, make: Callable[[], Any]) -> tuple[Any, list[str]]:
-        """What ``make`` gives, and the lines that it added, which are taken away again."""
-        before, self.lines = self.lines, []
-        try:
-            return make(), self.lines
-        finally:
-            self.lines = before
-
-    def fresh(self) -> str:
-        """A name of a temporary."""
-        return f"t{self.program.number()}"
-
-    def hold(self, value: Value) -> Value:
-        """The same value, kept in temporaries that nothing changes."""
-        shape = shape_of(value)
-        names = []
-        for kind, code in zip(flat(shape), codes(value, shape), strict=True):
-            names.append(self.fresh())
-            self.emit(f"const {C_TYPES[kind]} {names[-1]} = {code};")
-        return value if isinstance(value, Number) and value.constant is not None else rebuilt(shape, names)
-
-    def numeric(self, value: Value, node: ast.AST) -> Number:
-        """A value that has to be a number."""
-        if not isinstance(value, Number) or value.kind == "text":
-            raise Outside(node, f"arithmetic with {described(shape_of(value))}")
-        return value
-
-    # expressions
-
-    def expression(self, node: ast.expr) -> Value:
-        """The value of an expression."""
-        self.program.work(node)
-        method = getattr(self, f"_{type(node).__name__}", None)
-        if method is None:
-            raise Outside(node, _TOLD.get(type(node).__name__, f"a {type(node).__name__}"))
-        value: Value = method(node)
-        return value
+class Expressions(Items):
+    """Translates expressions into C++ expressions, and into lines before them where one does not do."""
 
     def _Constant(self, node: ast.Constant) -> Value:
         return self.program.wrap(node.value, node)
@@ -144,39 +47,6 @@ class Expressions:
 
     def _Name(self, node: ast.Name) -> Value:
         return self.lookup(node.id, node)
-
-    def lookup(self, name: str, node: ast.AST) -> Value:
-        """What a name stands for."""
-        for known in reversed(self.overlay):
-            if name in known:
-                return known[name]
-        if name in self.local:
-            shape = self.slots.get(name, "bool")
-            if name not in self.assigned and flat(shape):
-                self.flagged.add(name)
-                self.emit(f"if (!{self.flag(name)}) py_fail({self.at(node)} + {UNBOUND});")
-            return rebuilt(shape, self.variables(name, shape))
-        if self.parent is not None:
-            found: Value = self.parent.lookup(name, node)
-            return found
-        if name in self.program.names:
-            known_value = self.program.names[name]
-            if isinstance(known_value, Thing) and known_value.kind == "refused":
-                raise Outside(node, known_value.name)
-            return known_value
-        if name in BUILTINS:
-            return Thing("builtin", name)
-        raise Outside(node, f"the name {name}")
-
-    def variables(self, name: str, shape: Any) -> list[str]:
-        """C++ names of a local variable's numbers."""
-        stem = f"v{self.label}_{name if name.isascii() else name.encode('unicode_escape').hex()}"
-        kinds = flat(shape)
-        return [stem] if isinstance(shape, str) else [f"{stem}_{place}" for place in range(len(kinds))]
-
-    def flag(self, name: str) -> str:
-        """C++ name of whether a local variable has a value."""
-        return f"has_{self.variables(name, 'bool')[0]}"
 
     def _Tuple(self, node: ast.Tuple | ast.List) -> Value:
         try:
@@ -340,7 +210,10 @@ class Expressions:
             return Number(shape, f"({test.code} ? {cast(one, shape)} : {cast(other, shape)})")
         names = [self.fresh() for _ in flat(shape)]
         self.lines += [f"{C_TYPES[kind]} {name} = 0;" for kind, name in zip(flat(shape), names, strict=True)]
-        for opening, lines, value in ((f"if {parenthesised(test.code)} {{", before, one), ("} else {", otherwise, other)):
+        for opening, lines, value in (
+            (f"if {parenthesised(test.code)} {{", before, one),
+            ("} else {", otherwise, other),
+        ):
             self.lines += [opening, *lines]
             self.lines += [f"{name} = {code};" for name, code in zip(names, codes(value, shape), strict=True)]
         self.emit("}")
@@ -403,52 +276,11 @@ class Expressions:
         self.each(
             other,
             node,
-            lambda item: self.emit(f"if {parenthesised(self.compared(ast.Eq(), held, item, node).code)} {{ {found} = true; break; }}"),
+            lambda item: self.emit(
+                f"if {parenthesised(self.compared(ast.Eq(), held, item, node).code)} {{ {found} = true; break; }}"
+            ),
         )
         return Number("bool", found)
-
-    # items
-
-    def _Subscript(self, node: ast.Subscript) -> Value:
-        base = self.expression(node.value)
-        if isinstance(node.slice, ast.Slice):
-            return self._slice(base, node)
-        return self.item(base, self.expression(node.slice), node)
-
-    def item(self, base: Value, index: Value, node: ast.AST) -> Value:
-        """``base[index]``."""
-        if isinstance(base, Thing) and base.kind == "params":
-            return self.key(index, node)
-        known = index.constant if isinstance(index, Number) else None
-        if isinstance(base, Constant) and isinstance(base.value, dict):
-            return self._entry(base.value, index, node)
-        index = self.numeric(index, node)
-        if index.kind == "float":
-            raise Outside(node, "an index that is a float")
-        if isinstance(base, Constant) and isinstance(base.value, list | tuple):
-            if known is not None and -len(base.value) <= known < len(base.value):
-                return self.program.wrap(base.value[known], node)
-            return self._cells(base, f"py_index({cast(index, 'int')}, {len(base.value)}, {self.at(node)})", node)
-        if isinstance(base, Group):
-            if known is not None and -len(base.items) <= known < len(base.items):
-                return base.items[known]
-            place = self.fresh()
-            self.emit(f"const long long {place} = py_index({cast(index, 'int')}, {len(base.items)}, {self.at(node)});")
-            return self.chosen(base.items, place, node)
-        if isinstance(base, Rows):
-            place = self.fresh()
-            self.emit(f"const long long {place} = py_index({cast(index, 'int')}, {base.length}, {self.at(node)});")
-            return base.row(place)
-        raise Outside(node, f"an item of {described(shape_of(base))}")
-
-    def key(self, index: Value, node: ast.AST) -> Value:
-        """``params[index]``."""
-        name = index.constant if isinstance(index, Number) else None
-        if not isinstance(name, str):
-            raise Outside(node, "a key of params that is not known")
-        if name not in BY_NAME:
-            raise Outside(node, f"params has no key {name!r} ({nearest(name, BY_NAME)})")
-        return self.program.parameter(name)
 
     def _entry(self, entries: dict[Any, Any], index: Value, node: ast.AST) -> Value:
         """An entry of a constant dictionary."""
@@ -466,100 +298,7 @@ class Expressions:
         self.emit(f"if ({place} < 0) py_fail({self.at(node)} + {KEY});")
         return self.chosen(tuple(self.program.wrap(value, node) for value in entries.values()), place, node)
 
-    def chosen(self, items: tuple[Value, ...], place: str, node: ast.AST) -> Value:
-        """One of several values, by a number that is known when it runs."""
-        if not items:
-            return number(0)
-        shape = shape_of(items[0])
-        for item in items[1:]:
-            shape = joined(shape, shape_of(item))
-        if shape is None or not flat(shape):
-            raise Outside(node, "an item of a list whose items have several types")
-        rows = [codes(item, shape) for item in items]
-        names = []
-        for kind, column in zip(flat(shape), zip(*rows, strict=True), strict=True):
-            names.append(self.fresh())
-            chain = "".join(f"{place} == {count} ? {code} : " for count, code in enumerate(column[:-1])) + column[-1]
-            self.emit(f"const {C_TYPES[kind]} {names[-1]} = {chain};")
-        return rebuilt(shape, names)
-
-    def _cells(self, base: Constant, index: str, node: ast.AST) -> Value:
-        """A row of a constant list, by a number that is known when it runs."""
-        name, kinds = self.program.table(base, node)
-        place = self.fresh()
-        self.emit(f"const long long {place} = {index};")
-        cells = tuple(
-            Number(kind, f"({C_TYPES[kind]}){name}[{len(kinds)} * {place} + {column}]")
-            for column, kind in enumerate(kinds)
-        )
-        return Group(cells) if isinstance(base.value[0], list | tuple) else cells[0]
-
-    def _slice(self, base: Value, node: ast.Subscript) -> Value:
-        assert isinstance(node.slice, ast.Slice)
-        bounds: list[int | None] = []
-        for each in (node.slice.lower, node.slice.upper, node.slice.step):
-            value = self.expression(each) if each is not None else None
-            if value is not None and (not isinstance(value, Number) or not isinstance(value.constant, int)):
-                raise Outside(node, "a slice whose bounds are not known")
-            bounds.append(None if value is None else value.constant)
-        if isinstance(base, Group):
-            return Group(base.items[slice(*bounds)])
-        if isinstance(base, Constant) and isinstance(base.value, list | tuple) and bounds[2] != 0:
-            return self.program.wrap(base.value[slice(*bounds)], node)
-        raise Outside(node, f"a slice of {described(shape_of(base))}")
-
-    # loops
-
-    def iterated(self, value: Value, node: ast.AST) -> Iterated:
-        """What a loop goes through."""
-        if isinstance(value, Constant) and isinstance(value.value, dict):
-            value = Group(tuple(self.program.wrap(key, node) for key in value.value))
-        if isinstance(value, Group):
-            held = self.hold(value)
-            assert isinstance(held, Group)
-            return Iterated(str(len(held.items)), lambda index: self.chosen(held.items, index, node), len(held.items))
-        if isinstance(value, Constant) and isinstance(value.value, list | tuple):
-            constant = value
-            return Iterated(
-                str(len(value.value)), lambda index: self._cells(constant, index, node), len(value.value)
-            )
-        if isinstance(value, Rows):
-            return Iterated(value.length, value.row)
-        if isinstance(value, Thing) and isinstance(value.scope, Iterated):
-            return value.scope
-        raise Outside(node, f"a loop over {described(shape_of(value))}")
-
-    def each(self, value: Value, node: ast.AST, body: Callable[[Value], None]) -> None:
-        """A loop: ``body`` adds the lines that use an item."""
-        found = self.iterated(value, node)
-        count, index = self.fresh(), self.fresh()
-        self.emit(f"const long long {count} = {found.length};")
-        self.check()
-        self.emit(f"for (long long {index} = 0; {index} < {count}; ++{index}) {{")
-        self.emit(self.round(node))
-        body(found.item(index))
-        self.check()
-        self.emit("}")
-
-    def round(self, node: ast.AST) -> str:
-        """A line that counts how often loops go round."""
-        return f"if (--rounds < 0) {{ py_fail({16 * getattr(node, 'lineno', 0)} + {LOOP}); return {{}}; }}"
-
 
 def _wrapped(kind: str, code: str, lines: list[str]) -> str:
     """An expression that works out lines before."""
     return f"[&]() -> {C_TYPES[kind]} {{ {' '.join(lines)} return {code}; }}()" if lines else code
-
-
-_TOLD = {
-    "DictComp": "a dictionary that is made when it runs",
-    "SetComp": "a set",
-    "Set": "a set",
-    "Await": "await",
-    "Yield": "yield",
-    "NamedExpr": "an assignment inside an expression (:=)",
-    "Starred": "a starred item",
-    "Lambda": "a lambda in this place",
-    "ListComp": "a list that grows",
-    "GeneratorExp": "a generator in this place",
-}

@@ -99,7 +99,10 @@ FUNCTIONS: Mapping[str, Function] = {
 }
 """Of ``math``."""
 QUIET: Mapping[str, Function] = {
-    **{name: _plain(name) for name in ("sqrt", "sin", "cos", "tan", "tanh", "exp", "log", "log2", "log10", "floor", "ceil", "rint")},
+    **{
+        name: _plain(name)
+        for name in ("sqrt", "sin", "cos", "tan", "tanh", "exp", "log", "log2", "log10", "floor", "ceil", "rint")
+    },
     "arcsin": _plain("asin"),
     "arccos": _plain("acos"),
     "arctan": _plain("atan"),
