@@ -30,68 +30,17 @@ SECONDS = 5.0
 _PATIENCE = 60.0
 """For the whole process, which a loaded machine may start late [s]."""
 NAMES = frozenset(
-    [
-        "open",
-        "exec",
-        "eval",
-        "compile",
-        "input",
-        "breakpoint",
-        "exit",
-        "quit",
-        "help",
-        "globals",
-        "locals",
-        "vars",
-        "dir",
-        "getattr",
-        "setattr",
-        "delattr",
-    ]
+    (  # noqa: SIM905
+        "open exec eval compile input breakpoint exit quit help globals locals vars dir getattr setattr delattr"
+    ).split()
 )
 """Built-in functions that may not be named."""
-_SYSTEM = frozenset(
-    [
-        "os",
-        "sys",
-        "subprocess",
-        "builtins",
-        "importlib",
-        "ctypes",
-        "socket",
-        "shutil",
-        "pathlib",
-        "pickle",
-        "io",
-        "posix",
-    ]
-)
+_SYSTEM = frozenset("os sys subprocess builtins importlib ctypes socket shutil pathlib pickle io posix".split())  # noqa: SIM905
 _FILES = frozenset(
-    [
-        "load",
-        "save",
-        "savez",
-        "savez_compressed",
-        "savetxt",
-        "loadtxt",
-        "fromfile",
-        "tofile",
-        "genfromtxt",
-        "fromregex",
-        "memmap",
-        "open_memmap",
-        "DataSource",
-        "dump",
-        "dumps",
-        "ctypeslib",
-        "f2py",
-        "distutils",
-        "testing",
-        "lib",
-        "datasets",
-        "system",
-        "popen",
-    ]
+    (  # noqa: SIM905
+        "load save savez savez_compressed savetxt loadtxt fromfile tofile genfromtxt fromregex memmap "
+        "open_memmap DataSource dump dumps ctypeslib f2py distutils testing lib datasets system popen"
+    ).split()
 )
 """Attributes of modules, and methods of arrays, that read or write files or start programs."""
 _SUBMODULES = {

@@ -21,29 +21,9 @@ from worker.racer.rewards.translation.values import (
     shape_of,
 )
 
-BUILTINS = [
-    "abs",
-    "all",
-    "any",
-    "bool",
-    "divmod",
-    "enumerate",
-    "float",
-    "int",
-    "len",
-    "list",
-    "max",
-    "min",
-    "pow",
-    "print",
-    "range",
-    "reversed",
-    "round",
-    "sum",
-    "tuple",
-    "zip",
-    "str",
-]
+BUILTINS = (  # noqa: SIM905
+    "abs all any bool divmod enumerate float int len list max min pow print range reversed round sum tuple zip str"
+).split()
 
 
 class Emitting:

@@ -10,7 +10,9 @@ def dist_2_points(x1, x2, y1, y2):
 def closest_2_racing_points_index(racing_coords, car_coords):
     distances = []
     for i in range(len(racing_coords)):
-        distance = dist_2_points(x1=racing_coords[i][0], x2=car_coords[0], y1=racing_coords[i][1], y2=car_coords[1])
+        distance = dist_2_points(
+            x1=racing_coords[i][0], x2=car_coords[0], y1=racing_coords[i][1], y2=car_coords[1]
+        )
         distances.append(distance)
     closest_index = distances.index(min(distances))
     distances_no_closest = distances.copy()

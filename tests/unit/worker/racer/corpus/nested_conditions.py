@@ -18,6 +18,6 @@ def reward_function(params):
         return 0.001
     else:
         reward = 0.5
-    bonus = (centred and 0.5) or 0.25
+    bonus = centred and 0.5 or 0.25
     count = centred + (s > 1) + (a < 5)
     return reward + bonus + 0.1 * count

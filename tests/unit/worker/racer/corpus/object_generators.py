@@ -10,7 +10,7 @@ def reward_function(params):
     ahead = [d for d in (1, 2, 3)]
     blocked = any(
         abs(way - params["projection_distance"]) < 1.5 and left == params["is_left_of_center"]
-        for way, left in zip(params["objects_distance"], params["objects_left_of_center"], strict=False)
+        for way, left in zip(params["objects_distance"], params["objects_left_of_center"])
     )
     slow = all(speed < 3.5 for speed in params["objects_speed"])
     reward = 2.0 - 0.5 * near + 0.1 * len(ahead) + 0.01 * min(gaps) - 0.01 * max(gaps)

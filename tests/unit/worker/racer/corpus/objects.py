@@ -15,7 +15,10 @@ def reward_function(params):
     is_left_of_center = params["is_left_of_center"]
 
     reward = 1e-3
-    reward_lane = 1.0 if all_wheels_on_track and 0.5 * track_width - distance_from_center >= 0.05 else 0.001
+    if all_wheels_on_track and (0.5 * track_width - distance_from_center) >= 0.05:
+        reward_lane = 1.0
+    else:
+        reward_lane = 1e-3
     reward_avoid = 1.0
     if len(objects_location) > 0:
         next_object_loc = objects_location[next_object_index]

@@ -44,7 +44,10 @@ def reward_function(params):
     optimal_speed = RACING_LINE[best_index][2]
     distance_reward = max(1e-3, 1 - best / (params["track_width"] * 0.5))
     speed_diff = abs(optimal_speed - params["speed"])
-    speed_reward = (1 - speed_diff**2) ** 2 if speed_diff <= 1 else 0
+    if speed_diff <= 1:
+        speed_reward = (1 - speed_diff**2) ** 2
+    else:
+        speed_reward = 0
     reward = 1.0 + 2.0 * distance_reward + 3.0 * speed_reward
     if not params["all_wheels_on_track"]:
         reward = 1e-3

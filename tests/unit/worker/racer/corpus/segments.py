@@ -11,13 +11,9 @@ def project(px, py, ax, ay, bx, by):
 
 
 def reward_function(params):
-    a, b = (
-        (params["waypoints"][i] for i in params["closest_waypoints"])
-        if False
-        else (
-            params["waypoints"][params["closest_waypoints"][0]],
-            params["waypoints"][params["closest_waypoints"][1]],
-        )
+    a, b = (params["waypoints"][i] for i in params["closest_waypoints"]) if False else (
+        params["waypoints"][params["closest_waypoints"][0]],
+        params["waypoints"][params["closest_waypoints"][1]],
     )
     qx, qy, t = project(params["x"], params["y"], a[0], a[1], b[0], b[1])
     gap = ((params["x"] - qx) ** 2 + (params["y"] - qy) ** 2) ** 0.5
