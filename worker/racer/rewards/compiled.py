@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import linecache
 from collections.abc import Sequence
@@ -59,6 +60,7 @@ def race_arrays(worlds: int, tracks: Sequence[Sequence[Point]], device: str) -> 
     return race
 
 
+@functools.cache
 def warp_function(snippet: str) -> Any:
     """A Warp function of ``(world: int, race: RaceArrays) -> float``, which terms and kernels may call.
 

@@ -42,6 +42,8 @@ class Workers:
         seconds: For one call [s].
         memory: Bytes of address space of each process.
 
+    The thread that makes the pool has to live as long as it: the kernel ends the processes with that thread.
+
     Attributes:
         numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
         objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
@@ -146,10 +148,10 @@ class Workers:
         assert process.stdout is not None
         first = number * self._share
         cars = f"cars {first} to {min(first + self._share, len(self._rewards)) - 1}"
-        said = b""
+        said, poll = b"", select.poll()
+        poll.register(process.stdout, select.POLLIN)
         while not said.endswith(b"\n"):
-            ready, _, _ = select.select([process.stdout], [], [], max(0.0, until - time.monotonic()))
-            if not ready:
+            if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
                 raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
             part = os.read(process.stdout.fileno(), 1 << 16)
             if not part:

@@ -144,6 +144,8 @@ class Body(Calls):
         found = function.node.args
         if found.vararg or found.kwarg:
             raise Outside(function.node, "a function with * or **")
+        if getattr(function.node, "decorator_list", None):
+            raise Outside(function.node, "a decorated function")
         names = [each.arg for each in (*found.posonlyargs, *found.args)]
         given = dict(zip(names, arguments, strict=False))
         every = [*names, *(each.arg for each in found.kwonlyargs)]
@@ -154,7 +156,7 @@ class Body(Calls):
         defaults |= {each.arg: value for each, value in zip(found.kwonlyargs, found.kw_defaults, strict=True) if value}
         for name, default in defaults.items():
             if name not in given:
-                given[name] = self.program.wrap(self.program.constant(default), default)
+                given[name] = self.program.wrap(self.constant(default), default)
         if missing := [name for name in every if name not in given]:
             raise Outside(node, f"a call of {function.name}() without {missing[0]}")
         return {name: given[name] for name in every}

@@ -129,11 +129,27 @@ class Emitting:
             return Thing("builtin", name)
         raise Outside(node, f"the name {name}")
 
+    def is_own(self, name: str) -> bool:
+        """Whether a name is a variable of this function, or of one around it."""
+        own = name in self.local or any(name in known for known in self.overlay)
+        return own or (self.parent is not None and bool(self.parent.is_own(name)))
+
+    def constant(self, node: ast.expr) -> Any:
+        """The value of a constant expression.
+
+        Raises:
+            Outside: It is none.
+        """
+        if any(isinstance(each, ast.Name) and self.is_own(each.id) for each in ast.walk(node)):
+            raise Outside(node, "a value that is no constant")
+        return self.program.constant(node)
+
     def variables(self, name: str, shape: Any) -> list[str]:
         """C++ names of a local variable's numbers."""
-        stem = f"v{self.label}_{name if name.isascii() else name.encode('unicode_escape').hex()}"
-        kinds = flat(shape)
-        return [stem] if isinstance(shape, str) else [f"{stem}_{place}" for place in range(len(kinds))]
+        end = name if name.isascii() else f"u{name.encode('unicode_escape').hex()}"
+        if isinstance(shape, str):
+            return [f"v{self.label}_{end}"]
+        return [f"v{self.label}i{place}_{end}" for place in range(len(flat(shape)))]
 
     def flag(self, name: str) -> str:
         """C++ name of whether a local variable has a value."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 from typing import Any
 
 from worker.racer.rewards.parameters import BY_NAME
@@ -34,6 +35,7 @@ from worker.racer.rewards.translation.values import (
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _WHOLE = {ast.Add: "py_iadd", ast.Sub: "py_isub", ast.Mult: "py_imul", ast.FloorDiv: "py_idiv", ast.Mod: "py_imod"}
 _BITS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
+_MOST_POWER = 64
 
 
 class Expressions(Items):
@@ -49,13 +51,8 @@ class Expressions(Items):
         return self.lookup(node.id, node)
 
     def _Tuple(self, node: ast.Tuple | ast.List) -> Value:
-        try:
-            constant = self.program.constant(node)
-        except Outside:
-            pass
-        else:
-            if not any(isinstance(each, ast.Name) and each.id in self.local for each in ast.walk(node)):
-                return self.program.wrap(constant, node)
+        with contextlib.suppress(Outside):
+            return self.program.wrap(self.constant(node), node)
         if any(isinstance(each, ast.Starred) for each in node.elts):
             raise Outside(node, "a list with a starred item")
         if len(node.elts) > LONGEST_GROUP:
@@ -65,7 +62,7 @@ class Expressions(Items):
     _List = _Tuple
 
     def _Dict(self, node: ast.Dict) -> Value:
-        return self.program.wrap(self.program.constant(node), node)
+        return self.program.wrap(self.constant(node), node)
 
     def _Attribute(self, node: ast.Attribute) -> Value:
         base = self.expression(node.value)
@@ -134,6 +131,8 @@ class Expressions(Items):
         whole = "float" not in (base.kind, exponent.kind)
         if whole and exponent.constant is None:
             raise Outside(node, "an int to the power of an int that is not known")
+        if whole and exponent.constant > _MOST_POWER:
+            raise Outside(node, f"an int to a power of more than {_MOST_POWER}")
         if whole and exponent.constant >= 0:
             return Number("int", f"py_ipow({cast(base, 'int')}, {cast(exponent, 'int')}, {self.at(node)})")
         return Number("float", f"py_pow({cast(base, 'float')}, {cast(exponent, 'float')}, {self.at(node)})")

@@ -40,7 +40,7 @@ _BINARY: Mapping[type[ast.operator], Any] = {
     ast.Mod: operator.mod,
     ast.Pow: operator.pow,
 }
-_MOST_WORK = 300_000
+_MOST_WORK = 50_000
 """Expressions that are translated at most, counted as often as they are visited."""
 
 
@@ -88,6 +88,7 @@ class Program:
         self._constants: dict[str, str] = {}
         self._count = self._work = 0
         for statement in tree.body:
+            _check_harmless(statement)
             self._define(statement)
         for node in ast.walk(tree):
             if isinstance(node, ast.Global):
@@ -183,7 +184,7 @@ class Program:
         if constant.name not in self.tables:
             cells = ", ".join(number(float(item)).code for row in rows for item in row)
             name = f"table_{constant.name}"
-            self.tables[constant.name] = (name, f"const double {name}[] = {{{cells}}};")
+            self.tables[constant.name] = (name, f"static const double {name}[] = {{{cells}}};")
         return self.tables[constant.name][0], kinds
 
     # names of the file
@@ -293,6 +294,18 @@ class Program:
         if not isinstance(key, str | bool | int | float | tuple):
             raise Outside(node or 0, "a dictionary whose keys are no constants")
         return key
+
+
+def _check_harmless(statement: ast.stmt) -> None:
+    """Refuse a statement of the module that may change a value: what is constant could not be told."""
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
+        return
+    for node in ast.walk(statement):
+        called = node.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) else None
+        prints = called is not None and isinstance(called.func, ast.Name) and called.func.id == "print"
+        stores = isinstance(node, ast.Subscript | ast.Attribute) and not isinstance(node.ctx, ast.Load)
+        if stores or (called is not None and not prints):
+            raise Outside(node, "a statement of the module that changes something")
 
 
 def _plain(group: Group) -> list[Any]:

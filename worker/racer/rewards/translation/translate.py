@@ -58,7 +58,7 @@ def _translate(tree: ast.Module) -> Translated:
         f"struct {name} {{ {' '.join(f'{C_TYPES[kind]} a{place};' for place, kind in enumerate(kinds))} }};"
         for kinds, name in program.structs.items()
     ]
-    reads_track = "waypoint" in text
+    reads_track = "waypoint" in text  # py_waypoint, count_waypoints
     track = [
         f"const int track = (int)wp::index(race.numbers, world, {TRACK});",
         "const long long count_waypoints = (long long)wp::index(race.counts, track);",
