@@ -172,7 +172,7 @@ class Alarm:
 def printing(printed: Printed) -> Any:
     """What is printed meanwhile goes to ``printed``."""
     kept = sys.stdout, sys.stderr
-    sys.stdout = sys.stderr = printed  # type: ignore[assignment]
+    sys.stdout = sys.stderr = printed
     try:
         yield
     finally:

@@ -150,7 +150,7 @@ def _import(node: ast.AST) -> Iterator[tuple[str, str, int]]:
             )
         elif any(name == each or name.startswith(f"{each}.") for each in _SUBMODULES) or "._" in name:
             yield "FORBIDDEN", f"{name} can't be used in a reward function", node.lineno
-        for alias in node.names if isinstance(node, ast.ImportFrom) else ():  # type: ignore[attr-defined]
+        for alias in node.names if isinstance(node, ast.ImportFrom) else ():
             if alias.name in _FILES | _SYSTEM or alias.name.startswith("_"):
                 yield "FORBIDDEN", f"{name}.{alias.name} can't be used in a reward function", node.lineno
             if alias.name == "*":

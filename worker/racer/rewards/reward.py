@@ -11,7 +11,7 @@ import warp as wp
 from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
-from worker.racer.rewards.problems import Failure, RewardRefused
+from worker.racer.rewards.problems import Failure, RewardRefused, one_line
 from worker.racer.rewards.translation import Outside, translate
 from worker.racer.rewards.workers import Workers
 
@@ -64,13 +64,19 @@ class RewardFunction:
                 self.reason = f"{file}: {outside}"
             else:
                 self.function, self.notes = warp_function(translated.snippet), translated.notes
+        if self.function is not None:
+            (self._kernel,) = kernels([self.function], self.function.key.replace(".", "_"))
+            try:
+                self._kernel.module.load(device)
+            except Exception as error:  # what a compiler says is no one type
+                self.function, self.notes = None, ()
+                told = one_line(error)
+                self.reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"
         self.race = race_arrays(worlds, tracks, device)
         self._rewards = wp.zeros(worlds, dtype=wp.float32, device=device)
         self._workers: Workers | None = None
         if self.function is None:
             self._workers = Workers(source, file, tracks, worlds, processes)
-        else:
-            (self._kernel,) = kernels([self.function], self.function.key.replace(".", "_"))
 
     @classmethod
     def of_file(cls, path: Path, tracks: Sequence[Sequence[Point]], worlds: int, **options: Any) -> RewardFunction:

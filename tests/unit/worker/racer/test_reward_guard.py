@@ -14,6 +14,7 @@ from worker.racer.rewards.guard import check, check_source
 from worker.racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
 from worker.racer.rewards.problems import KINDS
 from worker.racer.rewards.samples import Line, oval, samples
+from worker.racer.rewards.translation import translate
 
 HEAD = "def reward_function(params):\n    "
 
@@ -226,6 +227,21 @@ def test_a_row_of_the_arrays_holds_all_that_a_dictionary_does() -> None:
 
 def test_the_page_has_the_table_of_the_contract() -> None:
     assert table() in (REPOSITORY / "docs" / "racer" / "rewards.md").read_text()
+
+
+def test_the_example_of_the_page_is_valid_and_compiles() -> None:
+    page = (REPOSITORY / "docs" / "racer" / "rewards.md").read_text()
+    source = page.split("```python\n")[1].split("```")[0]
+    assert told(source) == ""
+    assert translate(source).notes == ()
+
+
+def test_a_check_and_a_translation_import_neither_torch_nor_warp() -> None:
+    code = "import sys, worker.racer.rewards.__main__; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout.split()
+    assert "worker.racer.rewards.translation.body" in loaded
+    assert not {"torch", "warp", "numpy", "newton"} & set(loaded)
 
 
 def test_a_change_is_named_and_nan_is_none() -> None:

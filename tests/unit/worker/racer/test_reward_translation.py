@@ -13,11 +13,12 @@ import torch
 import warp as wp
 
 from worker.racer.rewards import parameters
+from worker.racer.rewards import reward as reward_module
 from worker.racer.rewards.compiled import RaceArrays, kernels, race_arrays, told_errors, warp_function
 from worker.racer.rewards.problems import Failure, RewardRefused
 from worker.racer.rewards.reward import RewardFunction
 from worker.racer.rewards.samples import oval, samples
-from worker.racer.rewards.translation import Outside, translate
+from worker.racer.rewards.translation import Outside, Translated, translate
 from worker.simulation.sensors.sensor import SensorContext
 from worker.tasks import Declaration, DeclaredTask, Reward, Robot, TaskConfig, reward_weights, terms
 
@@ -73,6 +74,7 @@ HEAD = """import math
 TABLE = [(1, 2.5), (2, 0.5), (3, 9.0)]
 LONG = [0.5, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19]
 k = e = 7
+def double(v): return v * 2
 NAMED = {"b": 2.0, 0: 1, 1: 4, 7: 0.25, -2: 3}
 def reward_function(params):
     x = params["x"]
@@ -95,6 +97,8 @@ BODIES = {
     "a text": "side = 'left' if x > 0 else 'right'\n    return 1.0 if side in ('left', 'ahead') else -1",
     "a function that gives a list": "def both(a):\n        return [a, a * 2]\n    low, high = both(x)\n    return both(low)[1] - high",
     "None as a default": "def plus(a, b=None):\n        return a if b is None else a + b\n    return plus(x) + plus(x, y)",
+    "a function that is given a function": "def twice(f, a):\n        return f(f(a))\n    return twice(lambda v: v + y, x) + twice(double, x)",
+    "a dictionary's items": "return sum(a * b for a, b in {1: 2.5, 2: 4}.items()) + x",
     "names that look alike": "z = (x, y)\n    z_0 = 5.0\n    z_1, z__0, zé = 6.0, 7.0, 8.0\n    return z[0] + z_0 * z_1 + z__0 * zé",
     "names of the module that a comprehension and a function hide": "return sum(sum((k, 1)) for k in (x, y)) + (lambda e: [e, 2][0])(x) + k",
     "a large int": "return float(int(x) * 10**12 * int(y) * 10**6)",
@@ -149,33 +153,35 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
     for _ in range(3):
         wp.launch(compiled["x / y"], dim=len(VALUES), inputs=[race, rewards], device="cpu")
     assert told_errors(race.errors.numpy()) == {
-        "line 9: ZeroDivisionError: division by zero": Failure(3, car=VALUES[::-1].index(0.0))
+        "line 10: ZeroDivisionError: division by zero": Failure(3, car=VALUES[::-1].index(0.0))
     }
 
 
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        ("try:\n        return 1 / x\n    except ZeroDivisionError:\n        return 0", "line 9: try and except"),
-        ("seen = []\n    for i in range(3):\n        seen.append({})\n    return 1", "line 11: a list that grows"),
-        ("import random\n    return random.random()", "line 10: random.random()"),
-        ("z = 1\n    z = 'one'\n    return z", "line 10: z, which is an int and then a text"),
-        ("z = {k: 1 for k in (1, 2)}\n    return 1", "line 9: a dictionary that is made when it runs"),
-        ("return f(x)", "line 9: the name f"),
-        ("def f(a):\n        return f(a - 1)\n    return f(x)", "line 10: f(), which calls itself"),
-        ("with x:\n        pass\n    return 1", "line 9: with"),
-        ("return x > 0", "line 6: a reward_function that returns a truth value"),
-        ("return [x, y]", "line 6: a reward_function that returns a list of 2"),
-        ("LONG[0] = x\n    return 1", "line 9: a list whose items are changed"),
-        ("return params['sped']", "line 9: params has no key 'sped' (did you mean speed?)"),
-        ("return params['waypoints'][x]", "line 9: an index that is a float"),
-        ("return len(str(x))", "line 9: a text that is made when it runs"),
-        ("return sorted([x, y])[0]", "line 9: the name sorted"),
-        ("@abs\n    def f():\n        return 1\n    return f()", "line 10: a decorated function"),
-        ("return int(x) ** 1000", "line 9: an int to a power of more than 64"),
-        ("return 1\nLONG.append(x)", "line 10: a statement of the module that changes something"),
-        ("return 1\nTABLE[0] = (9, 9)", "line 10: a statement of the module that changes something"),
-        ("return 2 ** int(x)", "line 9: an int to the power of an int that is not known"),
+        ("try:\n        return 1 / x\n    except ZeroDivisionError:\n        return 0", "line 10: try and except"),
+        ("seen = []\n    for i in range(3):\n        seen.append({})\n    return 1", "line 12: a list that grows"),
+        ("import random\n    return random.random()", "line 11: random.random()"),
+        ("z = 1\n    z = 'one'\n    return z", "line 11: z, which is an int and then a text"),
+        ("z = {k: 1 for k in (1, 2)}\n    return 1", "line 10: a dictionary that is made when it runs"),
+        ("return f(x)", "line 10: the name f"),
+        ("def f(a):\n        return f(a - 1)\n    return f(x)", "line 11: f(), which calls itself"),
+        ("with x:\n        pass\n    return 1", "line 10: with"),
+        ("return x > 0", "line 7: a reward_function that returns a truth value"),
+        ("return [x, y]", "line 7: a reward_function that returns a list of 2"),
+        ("LONG[0] = x\n    return 1", "line 10: a list whose items are changed"),
+        ("return params['sped']", "line 10: params has no key 'sped' (did you mean speed?)"),
+        ("return params['waypoints'][x]", "line 10: an index that is a float"),
+        ("return len(str(x))", "line 10: a text that is made when it runs"),
+        ("return sorted([x, y])[0]", "line 10: the name sorted"),
+        ("@abs\n    def f():\n        return 1\n    return f()", "line 11: a decorated function"),
+        ("return int(x) ** 1000", "line 10: an int to a power of more than 64"),
+        ("return 1\nLONG.append(x)", "line 11: a statement of the module that changes something"),
+        ("return 1\nTABLE[0] = (9, 9)", "line 11: a statement of the module that changes something"),
+        ("r = range(3)\n    return sum(r)", "line 10: a range that is kept for later"),
+        ("def f():\n        return lambda: x\n    return f()()", "line 11: a function that returns a function"),
+        ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
     ],
 )
 def test_what_is_outside_the_subset_is_told_with_line_and_reason(body: str, reason: str) -> None:
@@ -190,6 +196,14 @@ def test_a_function_that_would_be_enormous_is_outside() -> None:
     )
     with pytest.raises(Outside):
         translate(f"def f0(a):\n    return 1\n{calls}def reward_function(params):\n    return f8(1)\n")
+
+
+def test_a_translation_that_does_not_compile_runs_in_python_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reward_module, "translate", lambda source: Translated("this is not C++;"))
+    reward = filled(RewardFunction(SOURCE, TRACKS, len(samples()), file="r.py", processes=1))
+    assert reward.function is None and reward.reason.startswith("r.py: the compiler refused its translation, ")
+    assert np.isfinite(reward.rewards().numpy()).all()
+    reward.close()
 
 
 def filled(reward: RewardFunction) -> RewardFunction:

@@ -12,6 +12,7 @@ from worker.racer.rewards.translation.program import Program
 from worker.racer.rewards.translation.values import (
     C_TYPES,
     Constant,
+    Group,
     Outside,
     Thing,
     Value,
@@ -108,6 +109,8 @@ class Body(Calls):
         given = self._matched(function, arguments, named, node)
         if function.node in self.program.running or len(self.program.running) > _DEEPEST:
             raise Outside(node, f"{function.name}(), which calls itself")
+        for value in given.values():
+            _check_kept(value, node)
         shapes = {name: shape_of(value) for name, value in given.items()}
         values = ", ".join(code for name, value in given.items() for code in codes(value, shapes[name]))
         key = (function.node, tuple(shapes.items()))
@@ -119,7 +122,7 @@ class Body(Calls):
             self.program.running.pop()
             result, returns = body.result, body.returns
             text = f"[&]({body.parameters}) -> {returns} {{ {' '.join(body.text)} }}"
-            if function.scope is None:
+            if function.scope is None and not any(map(_sees, given.values())):
                 called = f"f{body.label}"
                 self.program.functions.append(f"auto {called} = {text};")
                 self.program.known[key] = (called, result, returns)
@@ -212,6 +215,7 @@ class Body(Calls):
 
     def store(self, name: str, value: Value, node: ast.AST) -> None:
         """Assign a value to a local variable."""
+        _check_kept(value, node)
         shape = shape_of(value)
         old = self.slots.get(name)
         new = shape if old is None else joined(old, shape)
@@ -251,6 +255,9 @@ class Body(Calls):
         self.emit("return {};")
 
     def _give(self, value: Value, node: ast.AST) -> None:
+        _check_kept(value, node)
+        if _sees(value):
+            raise Outside(node, "a function that returns a function")
         shape = shape_of(value)
         result = shape if self.result is None else joined(self.result, shape)
         if result is None:
@@ -317,6 +324,21 @@ class Body(Calls):
     def _on_Continue(self, node: ast.Continue) -> bool:
         self.emit("continue;")
         return True
+
+
+def _check_kept(value: Value, node: ast.AST) -> None:
+    """Refuse what holds good only where it is written."""
+    if isinstance(value, Thing) and value.kind == "iterated":
+        raise Outside(node, f"{value.name} that is kept for later")
+    for item in value.items if isinstance(value, Group) else ():
+        _check_kept(item, node)
+
+
+def _sees(value: Value) -> bool:
+    """Whether a value is, or holds, a function that sees the variables of the function around it."""
+    if isinstance(value, Group):
+        return any(map(_sees, value.items))
+    return isinstance(value, Thing) and value.scope is not None
 
 
 def _breaks(node: ast.AST) -> bool:

@@ -57,9 +57,10 @@ class Calls(Expressions):
         if function.attr in ("format", "join"):
             raise Outside(node, "a text that is made when it runs")
         if isinstance(base, Constant) and isinstance(base.value, dict) and not node.args:
-            parts = {"keys": base.value.keys(), "values": base.value.values(), "items": base.value.items()}
+            entries = base.value
+            parts = {"keys": list(entries), "values": list(entries.values()), "items": list(entries.items())}
             if function.attr in parts:
-                return self.program.wrap(list(parts[function.attr]), node)
+                return self.program.wrap(parts[function.attr], node)
         raise Outside(node, f"the method {function.attr} of {described(shape_of(base))}")
 
     def _get(self, base: Value, node: ast.Call) -> Value:

@@ -110,11 +110,11 @@ class Expressions(Items):
         if isinstance(operation, ast.Div) or not whole:
             a, b = cast(one, "float"), cast(other, "float")
             if isinstance(operation, ast.Add | ast.Sub | ast.Mult):
-                sign = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*"}[type(operation)]  # type: ignore[index]
+                sign = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*"}[type(operation)]
                 return Number("float", f"({a} {sign} {b})")
             if isinstance(operation, ast.Div) and other.constant:
                 return Number("float", f"({a} / {b})")
-            name = {ast.Div: "py_div", ast.FloorDiv: "py_floordiv", ast.Mod: "py_mod"}[type(operation)]  # type: ignore[index]
+            name = {ast.Div: "py_div", ast.FloorDiv: "py_floordiv", ast.Mod: "py_mod"}[type(operation)]
             return Number("float", f"{name}({a}, {b}, {self.at(node)})")
         return Number("int", f"{_WHOLE[type(operation)]}({cast(one, 'int')}, {cast(other, 'int')}, {self.at(node)})")
 

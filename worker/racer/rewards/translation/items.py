@@ -47,6 +47,8 @@ class Iterated:
 class Items(Emitting):
     """Translates indices, slices and loops."""
 
+    _entry: Callable[..., Value]
+
     def _Subscript(self, node: ast.Subscript) -> Value:
         base = self.expression(node.value)
         if isinstance(node.slice, ast.Slice):

@@ -70,7 +70,7 @@ class Program:
         tables: C++ declarations of constant lists, by the constant's name.
         structs: Names of the C++ structs that functions return, by the kinds of their numbers.
         functions: C++ text of the functions that are called, in order.
-        known: C++ name and type of the result of each function that was translated, by its node and the types of its arguments.
+        known: C++ name, type of the result and its C++ type of each function that was translated, by its node and the types of its arguments.
         running: The functions that are being translated, innermost last.
         notes: What is left out, a line each.
     """
@@ -81,7 +81,7 @@ class Program:
         self.tables: dict[str, tuple[str, str]] = {}
         self.structs: dict[tuple[str, ...], str] = {}
         self.functions: list[str] = []
-        self.known: dict[Any, tuple[str, Any]] = {}
+        self.known: dict[Any, tuple[str, Any, str]] = {}
         self.running: list[ast.AST] = []
         self.notes: list[str] = []
         self._texts: dict[str, int] = {}
