@@ -26,10 +26,6 @@ from worker.racer.rewards.reward import RewardFunction
 from worker.racer.rewards.samples import Line, oval, random_sample
 
 FUNCTIONS = {
-    "centre line": """def reward_function(params):
-    share = params["distance_from_center"] / params["track_width"]
-    return 1.0 if share <= 0.1 else 0.5 if share <= 0.25 else 0.1 if share <= 0.5 else 1e-3
-""",
     "heading and speed": """import math
 def reward_function(params):
     points = params["waypoints"]
@@ -62,17 +58,13 @@ def filled(reward: RewardFunction, cars: int) -> None:
 
 def rate(reward: RewardFunction, cars: int) -> float:
     """Calls a second, the median of some rounds."""
-
-    def step() -> None:
-        reward.rewards()
-
-    step()
+    reward.rewards()
     found = []
     for _ in range(ROUNDS):
         count, started = 0, time.perf_counter()
         while time.perf_counter() - started < SECONDS / ROUNDS or not count:
             for _ in range(10 if reward.function is not None else 1):
-                step()
+                reward.rewards()
                 count += 1
             wp.synchronize()
         found.append(cars * count / (time.perf_counter() - started))

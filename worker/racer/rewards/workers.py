@@ -81,7 +81,7 @@ class Workers:
             "memory": memory,
             "root": str(Path(__file__).parents[3]),
             "worlds": worlds,
-            "tracks": [np.float32(track).tolist() for track in tracks],
+            "tracks": [np.asarray(track, dtype=np.float32).tolist() for track in tracks],
             "shared": self._descriptor,
         }
         firsts = range(0, worlds, self._share)

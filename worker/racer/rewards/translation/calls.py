@@ -226,7 +226,7 @@ class Calls(Expressions):
         if not found:
             raise Outside(node, "zip() of nothing")
         known = [each.known for each in found]
-        least = min(each for each in known if each is not None) if None not in known else None  # type: ignore[type-var]
+        least = min(each for each in known if each is not None) if None not in known else None
         length = found[0].length
         for each in found[1:]:
             name = self.fresh()
@@ -290,15 +290,19 @@ class Calls(Expressions):
         generator = node.generators[place]
 
         def one(item: Value) -> None:
-            known: dict[str, Value] = {}
-            self.unpack(generator.target, self.hold(item), lambda name, value, _: known.__setitem__(name, value))
-            self.overlay.append(known)
+            held = self.hold(item)
+            self.overlay.append({})
+            self.unpack(generator.target, held, self._keep)
             for test in generator.ifs:
                 self.emit(f"if (!{self.condition(test).code}) continue;")
             self.over(node, use, place + 1)
             self.overlay.pop()
 
         self.each(self.expression(generator.iter), node, one)
+
+    def _keep(self, name: str, value: Value, node: ast.AST) -> None:
+        """Give a variable of the innermost comprehension its value."""
+        self.overlay[-1][name] = value
 
     def unpack(self, target: ast.expr, value: Value, store: Callable[[str, Value, ast.AST], None]) -> None:
         """Give the names of a target their values."""
@@ -422,13 +426,8 @@ class Calls(Expressions):
             raise Outside(node, "a list that grows")
         items = []
         for index in range(found.known):
-            known: dict[str, Value] = {}
-            self.unpack(
-                generator.target,
-                self.hold(found.item(str(index))),
-                lambda name, value, _, known=known: known.__setitem__(name, value),
-            )  # type: ignore[misc]
-            self.overlay.append(known)
+            self.overlay.append({})
+            self.unpack(generator.target, self.hold(found.item(str(index))), self._keep)
             items.append(self.hold(self.expression(node.elt)))
             self.overlay.pop()
         return Group(tuple(items))
