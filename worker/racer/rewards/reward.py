@@ -65,10 +65,13 @@ class RewardFunction:
             else:
                 self.function, self.notes = warp_function(translated.snippet), translated.notes
         if self.function is not None:
+            wp.init()  # a module's load does not do it
             (self._kernel,) = kernels([self.function], self.function.key.replace(".", "_"))
             try:
                 self._kernel.module.load(device)
-            except Exception as error:  # what a compiler says is no one type
+            except Exception as error:  # Warp has no type for what a compiler refuses
+                if "build failed" not in str(error):
+                    raise
                 self.function, self.notes = None, ()
                 told = one_line(error)
                 self.reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +14,7 @@ import pytest
 import torch
 import warp as wp
 
+from tests.conftest import REPOSITORY
 from worker.racer.rewards import parameters
 from worker.racer.rewards import reward as reward_module
 from worker.racer.rewards.compiled import RaceArrays, kernels, race_arrays, told_errors, warp_function
@@ -235,6 +238,15 @@ def test_both_ways_of_running_a_function_give_the_same_rewards_and_failures() ->
     assert told == ("r.py: line 3: ZeroDivisionError: division by zero", Failure(1, car=4))
     assert named == ("r.py:3: ZeroDivisionError: float division by zero", Failure(1, car=4))
     assert ours[0] == pytest.approx(len(TRACKS[0]) + TRACKS[0][1][0] + 1.0 / (0.6 - 99.0))
+
+
+def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
+    code = (
+        "from worker.racer.rewards.reward import RewardFunction as F; from worker.racer.rewards.samples import oval\n"
+        f"made = F({SOURCE!r}, [oval()], 1); print('reason', made.reason, made.function is not None)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    assert said.stdout.splitlines()[-1:] == ["reason  True"], said.stderr
 
 
 def test_what_the_guard_refuses_is_not_run() -> None:
