@@ -2,8 +2,7 @@
 
     python -m benchmarks.rewards [--cars 256 4096] [--out DIRECTORY]
 
-A car's call is one evaluation of ``reward_function(params)``. The Python workers' time includes the copies from and to the device.
-Writes ``rewards.md``.
+The Python workers' time includes the copies from and to the device. Writes ``rewards.md``.
 """
 
 from __future__ import annotations
@@ -78,6 +77,7 @@ def measure(name: str, cars: int) -> dict[str, object]:
     for form, compiled in (("compiled", True), ("workers", False)):
         device = f"cuda:{torch.cuda.current_device()}" if CUDA else "cpu"
         reward = RewardFunction(FUNCTIONS[name], [oval()], cars, device, compiled=compiled)
+        assert (reward.function is not None) == compiled, reward.reason
         filled(reward, cars)
         row[form] = rate(reward, cars)
         reward.close()
