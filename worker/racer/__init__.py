@@ -1,1 +1,1 @@
-"""The racer: tracks, and what a car on one is told about it."""
+"""The racer: tracks, what a car on one is told about it, and reward functions."""

@@ -11,6 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import worker.simulation  # noqa: F401 - before Newton, which it keeps from importing Rerun
+
+# isort: split
 import newton
 import numpy as np
 import warp as wp

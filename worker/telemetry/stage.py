@@ -8,6 +8,9 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import worker.simulation  # noqa: F401 - before Newton, which it keeps from importing Rerun
+
+# isort: split
 import newton
 import numpy as np
 import warp as wp

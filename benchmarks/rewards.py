@@ -1,0 +1,120 @@
+"""Reward functions of the racer: calls a second, compiled to this device and in Python workers.
+
+    python -m benchmarks.rewards [--cars 256 4096] [--out DIRECTORY]
+
+The Python workers' time includes the copies from and to the device. Writes ``rewards.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from benchmarks.load import Watch, add_option, told
+from benchmarks.training import CUDA, device_name
+from worker.racer.rewards.parameters import row_of
+from worker.racer.rewards.reward import RewardFunction
+from worker.racer.rewards.samples import Line, oval, random_sample
+
+FUNCTIONS = {
+    "heading and speed": """import math
+def reward_function(params):
+    points = params["waypoints"]
+    before, after = params["closest_waypoints"]
+    track = math.degrees(math.atan2(points[after][1] - points[before][1], points[after][0] - points[before][0]))
+    miss = abs((track - params["heading"] + 180.0) % 360.0 - 180.0)
+    return math.exp(-miss / 30.0) * params["speed"] + params["progress"] / max(params["steps"], 1)
+""",
+    "closest of all waypoints": """import math
+def reward_function(params):
+    best = 1e9
+    for x, y in params["waypoints"]:
+        best = min(best, math.hypot(x - params["x"], y - params["y"]))
+    return 1.0 / (0.1 + best)
+""",
+}
+ROUNDS, SECONDS = 5, 1.0
+
+
+def filled(reward: RewardFunction, cars: int) -> None:
+    """Cars anywhere on the oval."""
+    chance, line = random.Random(1), Line(oval())
+    numbers, objects = reward.race.numbers.numpy().copy(), reward.race.objects.numpy().copy()
+    for car in range(cars):
+        numbers[car], rows = row_of(random_sample(line, chance))
+        objects[car, : len(rows)] = rows if rows else 0.0
+    reward.race.numbers.assign(numbers)
+    reward.race.objects.assign(objects)
+
+
+def rate(reward: RewardFunction, cars: int) -> float:
+    """Calls a second, the median of some rounds."""
+    reward.rewards()
+    found = []
+    for _ in range(ROUNDS):
+        count, started = 0, time.perf_counter()
+        while time.perf_counter() - started < SECONDS / ROUNDS or not count:
+            for _ in range(10 if reward.function is not None else 1):
+                reward.rewards()
+                count += 1
+            wp.synchronize()
+        found.append(cars * count / (time.perf_counter() - started))
+    assert np.isfinite(reward.rewards().numpy()).all()
+    return statistics.median(found)
+
+
+def measure(name: str, cars: int) -> dict[str, object]:
+    """Both forms of a function."""
+    row: dict[str, object] = {"name": name, "cars": cars}
+    for form, compiled in (("compiled", True), ("workers", False)):
+        device = f"cuda:{torch.cuda.current_device()}" if CUDA else "cpu"
+        reward = RewardFunction(FUNCTIONS[name], [oval()], cars, device, compiled=compiled)
+        assert (reward.function is not None) == compiled, reward.reason
+        filled(reward, cars)
+        row[form] = rate(reward, cars)
+        reward.close()
+    return row
+
+
+def table(rows: list[dict[str, object]]) -> str:
+    """Markdown."""
+    lines = [
+        f"# Reward functions on {device_name()}",
+        "",
+        f"`python -m benchmarks.rewards`; medians of {ROUNDS} rounds; Python workers on {len(os.sched_getaffinity(0))} processors. {told(rows)}",
+        "",
+        "| function | cars | compiled [calls/s] | Python workers [calls/s] | ratio |",
+        "|---|--:|--:|--:|--:|",
+    ]
+    for row in rows:
+        ratio = row["compiled"] / row["workers"]  # type: ignore[operator]
+        lines.append(
+            f"| {row['name']} | {row['cars']:,} | {row['compiled']:,.0f} | {row['workers']:,.0f} | {ratio:,.0f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cars", nargs="+", type=int, default=[256, 4096])
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
+    add_option(parser)
+    options = parser.parse_args()
+    watch, rows = Watch(options.loaded_anyway), list[dict[str, object]]()
+    for name in FUNCTIONS:
+        for cars in options.cars:
+            rows.append(measure(name, cars) | watch.check(f"while {name} was measured"))
+            (options.out / "rewards.md").write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

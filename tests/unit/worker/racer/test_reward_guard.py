@@ -1,0 +1,252 @@
+"""The guard: what it refuses, with kind, file and line, before any job starts."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY
+from worker.racer.rewards import confined, guard
+from worker.racer.rewards.guard import check, check_source
+from worker.racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
+from worker.racer.rewards.problems import KINDS
+from worker.racer.rewards.samples import Line, oval, samples
+from worker.racer.rewards.translation import translate
+
+HEAD = "def reward_function(params):\n    "
+
+
+def told(source: str) -> str:
+    """The problem in one line; empty: there is none."""
+    problem = check_source(source, "r.py")
+    assert problem is None or (problem.kind in KINDS and "\n" not in str(problem))
+    return str(problem or "")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("def reward_function(params:\n    return 1\n", "r.py:1: SYNTAX_ERROR: '(' was never closed"),
+        (f"{HEAD}return 1\x00", "r.py: SYNTAX_ERROR: source code string cannot contain null bytes"),
+        ("x = " + "(" * 5000 + ")" * 5000, "r.py:1: SYNTAX_ERROR: too many nested parentheses"),
+        (f"{HEAD}return {'1+' * 60_000}1", "r.py: SYNTAX_ERROR: it is nested too deeply"),
+        (
+            f"{HEAD}return 1.0\n#{'x' * 140_000}",
+            "r.py: SYNTAX_ERROR: 140,045 characters; a reward function has at most 140,000",
+        ),
+        (
+            f"import os\n{HEAD}return 1",
+            "r.py:1: IMPORT_ERROR: os can't be imported; a reward function may import math, random, numpy, scipy, shapely",
+        ),
+        (
+            f"{HEAD}from subprocess import run\n    return 1",
+            "r.py:2: IMPORT_ERROR: subprocess can't be imported; a reward function may import math, random, numpy, scipy, shapely",
+        ),
+        (
+            f"from . import other\n{HEAD}return 1",
+            "r.py:1: IMPORT_ERROR: a reward function is one file: it can't import from beside it",
+        ),
+        (
+            f"import numpy.lib.format\n{HEAD}return 1",
+            "r.py:1: FORBIDDEN: numpy.lib.format can't be used in a reward function",
+        ),
+        (
+            f"from numpy import load\n{HEAD}return 1",
+            "r.py:1: FORBIDDEN: numpy.load can't be used in a reward function",
+        ),
+        (
+            f"import numpy as np\n{HEAD}return np.load('a')",
+            "r.py:3: FORBIDDEN: the attribute load can't be used in a reward function",
+        ),
+        (
+            f"import random\n{HEAD}return random._os.getpid()",
+            "r.py:3: FORBIDDEN: the attribute _os can't be used in a reward function",
+        ),
+        (f"{HEAD}return eval('1')", "r.py:2: FORBIDDEN: eval can't be used in a reward function"),
+        (f"{HEAD}f = open\n    return 1", "r.py:2: FORBIDDEN: open can't be used in a reward function"),
+        (f"{HEAD}return __import__('os')", "r.py:2: FORBIDDEN: __import__ can't be used in a reward function"),
+        (
+            f"{HEAD}return ().__class__.__bases__",
+            "r.py:2: FORBIDDEN: the attribute __bases__ can't be used in a reward function",
+        ),
+        (
+            "def reward(params):\n    return 1.0",
+            "r.py: TEST_FAILURE: there is no def reward_function(params); did you mean reward?",
+        ),
+        (
+            "def reward_function(params, other):\n    return 1.0",
+            "r.py:1: TEST_FAILURE: reward_function takes one argument: def reward_function(params)",
+        ),
+        (
+            f"{HEAD}return 1.0\n{HEAD}return 2.0",
+            "r.py:3: TEST_FAILURE: reward_function is defined 2 times; the first is in line 1",
+        ),
+    ],
+)
+def test_a_text_that_cannot_be_used_is_refused_without_running_it(
+    source: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guard, "try_out", lambda *_: pytest.fail("it was run"))
+    assert told(source) == message
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (f"{HEAD}return 1 / 0", "r.py:2: TEST_FAILURE: the sample 'start': ZeroDivisionError: division by zero"),
+        (f"{HEAD}return params['sped']", "r.py:2: TEST_FAILURE: the sample 'start': KeyError: 'sped'"),
+        (
+            f"{HEAD}if params['is_offtrack']:\n        return None\n    return 1",
+            "r.py:1: TEST_FAILURE: the sample 'off-track': it returned None; return a number on every way through the function",
+        ),
+        (
+            f"{HEAD}return params['is_crashed'] or 0.5 > 1",
+            "r.py:1: TEST_FAILURE: the sample 'start': it returned False, a truth value; return a number such as float(False)",
+        ),
+        (
+            f"{HEAD}return float('inf') if params['progress'] == 100 else 1",
+            "r.py:1: TEST_FAILURE: the sample 'finish': it returned inf; return a finite number",
+        ),
+        (f"{HEAD}return '1'", "r.py:1: TEST_FAILURE: the sample 'start': it returned a str; return a number"),
+        (f"{HEAD}yield 1", "r.py:1: TEST_FAILURE: the sample 'start': it returned a generator; return a number"),
+        (
+            f"{HEAD}params['objects_location'][0:] = []\n    return 1",
+            "r.py:1: TEST_FAILURE: the sample 'objects': it changed params['objects_location']; copy what you change",
+        ),
+        (
+            f"{HEAD}return len('x' * 10**10)",
+            "r.py:2: TEST_FAILURE: the sample 'start': it used more than 2 GiB of memory",
+        ),
+        (
+            f"{HEAD}for i in range(10**6):\n        print(i)\n    return 1",
+            "r.py:3: TEST_FAILURE: the sample 'start' printed more than 64 KiB of text",
+        ),
+        (
+            f"{HEAD}return reward_function(params)",
+            "r.py:2: TEST_FAILURE: the sample 'start': it calls itself too often (RecursionError)",
+        ),
+        (f"A = [][0]\n{HEAD}return 1", "r.py:1: TEST_FAILURE: the module: IndexError: list index out of range"),
+        (
+            f"{HEAD}break\n    return 1",
+            "r.py:2: TEST_FAILURE: the module: SyntaxError: 'break' outside loop (r.py, line 2)",
+        ),
+    ],
+)
+def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_line(source: str, message: str) -> None:
+    assert told(source) == message
+
+
+@pytest.mark.parametrize(
+    "body",
+    ["while True:\n        pass", "while True:\n        try:\n            while True: pass\n        except: pass"],
+)
+def test_a_function_that_loops_for_ever_is_refused_with_its_line(body: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "SECONDS", 0.5)
+    problem = check_source(f"{HEAD}{body}", "r.py")
+    assert problem is not None and problem.kind == "TIMEOUT" and problem.line in (2, 3, 4)
+    assert problem.message == "the sample 'start' did not end within 0.5 s"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        f"{HEAD}return 1",
+        f"import numpy as np\n{HEAD}return np.float32(params['speed'])",
+        f"import math, random\n{HEAD}print('load', 'save', '__import__')\n    return random.random() + math.pi",
+        "class A:\n    def __init__(self):\n        self._load = 1.0\nA1 = A()\ndef reward_function(params):\n    return A1._load\n",
+        f"{HEAD}waypoints = list(params['waypoints'])\n    waypoints.append((0, 0))\n    return float(len(waypoints))",
+    ],
+)
+def test_a_valid_function_is_accepted_whatever_its_words(source: str) -> None:
+    if "_load" in source:
+        source = source.replace("A1._load", "A1.load").replace("self._load", "self.load")
+    assert told(source) == ""
+
+
+def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUSTER_TOKEN", "secret")
+    kept = tmp_path / "kept.npy"
+    monkeypatch.setattr(guard, "read", lambda *_: None)  # as one who gets round it would
+    source = f"import os\n{HEAD}assert 'MUSTER_TOKEN' not in os.environ\n    open({str(kept)!r}, 'w').write('x' * 9999)\n    return 1"
+    assert told(source) == "r.py:4: TEST_FAILURE: the sample 'start': OSError: [Errno 27] File too large"
+    assert not kept.exists() or kept.stat().st_size == 0
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.py"
+    assert str(check(path)) == f"{path}: TEST_FAILURE: the file can't be read: No such file or directory"
+    path.write_bytes(b"\xff\xfe\x00")
+    assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is no text: ")
+
+
+def test_the_command_says_what_is_wrong_or_how_it_runs(tmp_path: Path) -> None:
+    good, slow, bad = tmp_path / "good.py", tmp_path / "slow.py", tmp_path / "bad.py"
+    good.write_text(f"{HEAD}print(1)\n    return params['speed']\n")
+    slow.write_text(f"{HEAD}seen = []\n    seen.append({{}})\n    return 1.0\n")
+    bad.write_text(f"{HEAD}return None\n")
+    command = [sys.executable, "-m", "worker.racer.rewards", str(good), str(slow), str(bad)]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
+    assert ended.returncode == 1
+    assert ended.stdout.splitlines() == [
+        f"{good}: valid, compiled to the device",
+        "  line 2: print() is left out",
+        f"{slow}: valid; line 3: a list that grows: such functions run in Python workers",
+    ]
+    assert ended.stderr.strip().endswith("it returned None; return a number on every way through the function")
+
+
+def test_the_samples_are_what_a_car_on_the_oval_sees() -> None:
+    line, found = Line(oval()), samples()
+    assert line.points[0] == line.points[-1] and abs(line.length - (8.0 + 3.2 * 3.14159)) < 0.02
+    straight = found["straight"]
+    # 1.5 m along the lower straight, which begins at (-2, -1.6); 0.21 m to the left of it; turned by 8 degrees to the right
+    assert (round(straight["x"], 2), round(straight["y"], 2), round(straight["heading"], 2)) == (-0.5, -1.39, -8.0)
+    assert straight["is_left_of_center"] and straight["all_wheels_on_track"] and not straight["objects_location"]
+    assert found["off-track"]["is_offtrack"] and not found["off-track"]["all_wheels_on_track"]
+    assert abs(found["reversed"]["heading"] - -175.0) < 0.01 and found["reversed"]["is_reversed"]
+    # the boxes are at 7, 11 and 15.5 m; the car at 6.4 m
+    assert found["objects"]["closest_objects"] == [2, 0]
+    for params in found.values():
+        assert list(params) == [each.name for each in PARAMETERS]
+        for name, value in params.items():
+            least, most = BY_NAME[name].limits
+            for each in value if isinstance(value, list) and not BY_NAME[name].points else [value]:
+                if not isinstance(each, list):
+                    assert least is None or least <= each
+                    assert most is None or each <= most
+
+
+def test_a_row_of_the_arrays_holds_all_that_a_dictionary_does() -> None:
+    for params in samples().values():
+        numbers, objects = row_of(params)
+        assert parameters_of(numbers, objects, params["waypoints"]) == params
+
+
+def test_the_page_has_the_table_of_the_contract() -> None:
+    assert table() in (REPOSITORY / "docs" / "racer" / "rewards.md").read_text()
+
+
+def test_the_example_of_the_page_is_valid_and_compiles() -> None:
+    page = (REPOSITORY / "docs" / "racer" / "rewards.md").read_text()
+    source = page.split("```python\n")[1].split("```")[0]
+    assert told(source) == ""
+    assert translate(source).notes == ()
+
+
+def test_a_check_and_a_translation_import_neither_torch_nor_warp() -> None:
+    code = "import sys, worker.racer.rewards.__main__; print(*sys.modules)"
+    command = [sys.executable, "-c", code]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout.split()
+    assert "worker.racer.rewards.translation.body" in loaded
+    assert not {"torch", "warp", "numpy", "newton"} & set(loaded)
+
+
+def test_a_change_is_named_and_nan_is_none() -> None:
+    nan = float("nan")
+    assert confined.changed({"a": [nan, (1, 2)]}, {"a": [nan, (1, 2)]}) == ""
+    assert confined.changed({"a": [1, (1, 2)]}, {"a": [1, (1, 3)]}) == "params['a'][1][1]"
+    assert confined.changed({"a": 1}, {"a": 1, "b": 2}) == "params"
+    assert confined.changed({"a": 1}, {"a": True}) == "params['a']"

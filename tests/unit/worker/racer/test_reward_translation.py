@@ -1,0 +1,314 @@
+"""The translated subset, case by case: the numbers and errors of the compiled function are Python's."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from tests.conftest import REPOSITORY
+from worker.racer.rewards import parameters
+from worker.racer.rewards import reward as reward_module
+from worker.racer.rewards.compiled import RaceArrays, kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.problems import Failure, RewardRefused
+from worker.racer.rewards.reward import RewardFunction
+from worker.racer.rewards.samples import oval, samples
+from worker.racer.rewards.translation import Outside, Translated, translate
+from worker.simulation.sensors.sensor import SensorContext
+from worker.tasks import Declaration, DeclaredTask, Reward, Robot, TaskConfig, reward_weights, terms
+
+VALUES = (-2.5, -2.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.5, 7.0, 1e6)
+"""Of x; y is the same list backwards."""
+EXPRESSIONS = (
+    "x // y",
+    "x % y",
+    "x / y",
+    "x ** 2 - y ** 3",
+    "x ** y",
+    "abs(x) ** 0.5",
+    "int(x) // int(y)",
+    "int(x) % int(y)",
+    "int(x) / 3",
+    "2 ** -1 + int(x) ** 2",
+    "divmod(x, 3)[0] + divmod(-int(y), 4)[1]",
+    "round(x) + round(y, 1) + round(x / 7, 3)",
+    "math.floor(x) + math.ceil(y) + math.trunc(x * 1.5)",
+    "math.sqrt(x)",
+    "math.log(y)",
+    "math.log(8, 2) + math.log10(100)",
+    "math.acos(x)",
+    "math.exp(x)",
+    "math.pow(x, y)",
+    "math.fmod(x, y)",
+    "math.copysign(3, x) + math.atan2(x, y) + math.hypot(x, y)",
+    "math.degrees(x) - math.radians(y)",
+    "float(x > 0) + (y > 0) + (True and 2)",
+    "min(x, y, 1) + max([x, 3])",
+    "(x or 5) + (y and 6)",
+    "1 if x < y < 3 else 2",
+    "[x, y, 4][int(x)]",
+    "(1, 2, 3)[-1] + [10, 20, 30][::-1][0]",
+    "sum([x, y, True]) + sum(i * i for i in range(5) if i % 2)",
+    "sum(range(10, 0, -3)) + len(range(0, 10, 4))",
+    "min(abs(x - k) for k in (1, 2, 3))",
+    "any(k > x for k in (1, 5)) + all(k > x for k in (1, 5))",
+    "max(TABLE, key=lambda row: row[1])[0]",
+    "TABLE[int(y) % 3][1] + LONG[int(x)]",
+    "NAMED['b'] + NAMED[int(x)]",
+    "x not in (0.5, 7) and 3 or 4",
+    "not x",
+    "x is None or -x",
+    "~int(x) ^ 5",
+    "(lambda a, b=2: a * b)(x)",
+    "sum(a * b for a, b in zip((x, y), (2, 3))) + sum(i * v for i, v in enumerate([x, y], 1))",
+    "int(x) ** 12",
+    "sum(row[0] for row in reversed(TABLE))",
+    "[a + 1 for a in (x, y)][1]",
+)
+HEAD = """import math
+TABLE = [(1, 2.5), (2, 0.5), (3, 9.0)]
+LONG = [0.5, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19]
+k = e = 7
+def double(v): return v * 2
+NAMED = {"b": 2.0, 0: 1, 1: 4, 7: 0.25, -2: 3}
+def reward_function(params):
+    x = params["x"]
+    y = params["y"]
+"""
+BODIES = {
+    "a variable that only some branches set": "if x > 0:\n        z = 1.5\n    return z",
+    "a function that only sometimes returns": "if x > 0:\n        return 2.0",
+    "an int that becomes a float": "z = 0\n    for i in range(4):\n        z += i * 0.5 if i else 1\n    return z",
+    "a loop that is left and skipped": "z = 0\n    for i in range(10):\n        if i == 3: continue\n        if i > x + 5: break\n        z += i\n    return z + i",
+    "a while with a bound of its own": "z = 1.0\n    while z < abs(x) + 3:\n        z *= 1.5\n    return z",
+    "a swap and a nested target": "a, (b, c) = x, (y, 2)\n    a, b, c = c, a, b\n    return a + 10 * b + 100 * c",
+    "an error in a part that is not reached": "return 1.0 if y == 0 or x / y > 1 else 2",
+    "an error in a function": "def half(a, b):\n        return a / b\n    return half(x, y) + half(b=2.0, a=y)",
+    "an index that is too large": "return params['waypoints'][int(abs(x)) * 100][0]",
+    "an index from the end": "return params['waypoints'][-int(abs(y)) - 1][1]",
+    "no objects": "return min(params['objects_distance'])",
+    "a result that is not finite": "return x * float('inf')",
+    "a step of zero": "return sum(range(0, 10, int(y)))",
+    "a text": "side = 'left' if x > 0 else 'right'\n    return 1.0 if side in ('left', 'ahead') else -1",
+    "a function that gives a list": "def both(a):\n        return [a, a * 2]\n    low, high = both(x)\n    return both(low)[1] - high",
+    "None as a default": "def plus(a, b=None):\n        return a if b is None else a + b\n    return plus(x) + plus(x, y)",
+    "a function that is given a function": "def twice(f, a):\n        return f(f(a))\n    return twice(lambda v: v + y, x) + twice(double, x)",
+    "a dictionary's items": "return sum(a * b for a, b in {1: 2.5, 2: 4}.items()) + x",
+    "names that look alike": "z = (x, y)\n    z_0 = 5.0\n    z_1, z__0, zé = 6.0, 7.0, 8.0\n    return z[0] + z_0 * z_1 + z__0 * zé",
+    "names of the module that a comprehension and a function hide": "return sum(sum((k, 1)) for k in (x, y)) + (lambda e: [e, 2][0])(x) + k",
+    "a large int": "return float(int(x) * 10**12 * int(y) * 10**6)",
+}
+CASES = {
+    **{text: f"{HEAD}    return 0.0 + ({text})\n" for text in EXPRESSIONS},
+    **{name: f"{HEAD}    {body}\n" for name, body in BODIES.items()},
+}
+
+
+@pytest.fixture(scope="module")
+def compiled() -> dict[str, Any]:
+    """A kernel for each case, all in one module of Warp."""
+    functions = [warp_function(translate(source).snippet) for source in CASES.values()]
+    return dict(zip(CASES, kernels(functions, "translation"), strict=True))
+
+
+def arrays() -> tuple[Any, list[dict[str, Any]]]:
+    """Cars at the values, without objects."""
+    race = race_arrays(len(VALUES), [oval()], "cpu")
+    numbers, points = race.numbers.numpy(), [tuple(point) for point in np.float32(oval()).tolist()]
+    for world, (x, y) in enumerate(zip(VALUES, reversed(VALUES), strict=True)):
+        numbers[world], _ = parameters.row_of({**samples()["start"], "x": x, "y": y})
+    return race, [parameters.parameters_of(row.tolist(), [], points) for row in numbers]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_translated_function_gives_pythons_number_or_an_error_where_python_raises(
+    name: str, compiled: dict[str, Any]
+) -> None:
+    race, given = arrays()
+    rewards = wp.empty(len(VALUES), dtype=wp.float32, device="cpu")
+    wp.launch(compiled[name], dim=len(VALUES), inputs=[race, rewards], device="cpu")
+    scope: dict[str, Any] = {}
+    exec(compile(CASES[name], "<reward>", "exec"), scope)
+    for params, reward, (code, count) in zip(given, rewards.numpy().tolist(), race.errors.numpy(), strict=True):
+        try:
+            expected = scope["reward_function"](params)
+            expected = float(expected) if isinstance(expected, int | float) else math.nan
+        except (ArithmeticError, ValueError, LookupError, NameError):
+            expected = math.nan
+        if math.isfinite(expected) and abs(expected) < 1e18:
+            assert reward == pytest.approx(float(np.float32(expected)), rel=1e-6, abs=1e-9), params["x"]
+            assert count == 0
+        elif not math.isfinite(expected):
+            assert math.isnan(reward) and count == 1 and code % 16, (params["x"], expected)
+
+
+def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dict[str, Any]) -> None:
+    race, _ = arrays()
+    rewards = wp.empty(len(VALUES), dtype=wp.float32, device="cpu")
+    for _ in range(3):
+        wp.launch(compiled["x / y"], dim=len(VALUES), inputs=[race, rewards], device="cpu")
+    assert told_errors(race.errors.numpy()) == {
+        "line 10: ZeroDivisionError: division by zero": Failure(3, car=VALUES[::-1].index(0.0))
+    }
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("try:\n        return 1 / x\n    except ZeroDivisionError:\n        return 0", "line 10: try and except"),
+        ("seen = []\n    for i in range(3):\n        seen.append({})\n    return 1", "line 12: a list that grows"),
+        ("import random\n    return random.random()", "line 11: random.random()"),
+        ("z = 1\n    z = 'one'\n    return z", "line 11: z, which is an int and then a text"),
+        ("z = {k: 1 for k in (1, 2)}\n    return 1", "line 10: a dictionary that is made when it runs"),
+        ("return f(x)", "line 10: the name f"),
+        ("def f(a):\n        return f(a - 1)\n    return f(x)", "line 11: f(), which calls itself"),
+        ("with x:\n        pass\n    return 1", "line 10: with"),
+        ("return x > 0", "line 7: a reward_function that returns a truth value"),
+        ("return [x, y]", "line 7: a reward_function that returns a list of 2"),
+        ("LONG[0] = x\n    return 1", "line 10: a list whose items are changed"),
+        ("return params['sped']", "line 10: params has no key 'sped' (did you mean speed?)"),
+        ("return params['waypoints'][x]", "line 10: an index that is a float"),
+        ("return len(str(x))", "line 10: a text that is made when it runs"),
+        ("return sorted([x, y])[0]", "line 10: the name sorted"),
+        ("@abs\n    def f():\n        return 1\n    return f()", "line 11: a decorated function"),
+        ("return int(x) ** 1000", "line 10: an int to a power of more than 64"),
+        ("return 1\nLONG.append(x)", "line 11: a statement of the module that changes something"),
+        ("return 1\nTABLE[0] = (9, 9)", "line 11: a statement of the module that changes something"),
+        ("r = range(3)\n    return sum(r)", "line 10: a range that is kept for later"),
+        ("def f():\n        return lambda: x\n    return f()()", "line 11: a function that returns a function"),
+        ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
+    ],
+)
+def test_what_is_outside_the_subset_is_told_with_line_and_reason(body: str, reason: str) -> None:
+    with pytest.raises(Outside) as outside:
+        translate(f"{HEAD}    {body}\n")
+    assert str(outside.value) == f"{reason}: such functions run in Python workers"
+
+
+def test_a_function_that_would_be_enormous_is_outside() -> None:
+    calls = "".join(
+        f"def f{n}(a):\n    return {' + '.join(f'f{n - 1}(lambda: {k})' for k in range(9))}\n" for n in range(1, 9)
+    )
+    with pytest.raises(Outside):
+        translate(f"def f0(a):\n    return 1\n{calls}def reward_function(params):\n    return f8(1)\n")
+
+
+def test_a_translation_that_does_not_compile_runs_in_python_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reward_module, "translate", lambda source: Translated("this is not C++;"))
+    reward = filled(RewardFunction(SOURCE, TRACKS, len(samples()), file="r.py", processes=1))
+    assert reward.function is None and reward.reason.startswith("r.py: the compiler refused its translation, ")
+    assert np.isfinite(reward.rewards().numpy()).all()
+    reward.close()
+
+
+def filled(reward: RewardFunction) -> RewardFunction:
+    """Cars of the samples, on the oval and on a track of twice its size."""
+    numbers, objects = reward.race.numbers.numpy(), reward.race.objects.numpy()
+    for world, params in enumerate(samples().values()):
+        numbers[world], rows = parameters.row_of(params, track=world % 2)
+        objects[world, : len(rows)] = rows if rows else 0.0
+    return reward
+
+
+TRACKS = [oval(), [(2.0 * x, 2.0 * y) for x, y in oval()][::2]]
+SOURCE = """def reward_function(params):
+    first = params["waypoints"][1]
+    return len(params["waypoints"]) + first[0] + 1 / (params["speed"] - 99) + len(params["objects_speed"])
+"""
+
+
+def test_both_ways_of_running_a_function_give_the_same_rewards_and_failures() -> None:
+    count, found = len(samples()), list[Any]()
+    for compiled in (True, False):
+        reward = filled(RewardFunction(SOURCE, TRACKS, count, file="r.py", compiled=compiled, processes=2))
+        assert (reward.function is not None) == compiled and bool(reward.reason) != compiled
+        reward.race.numbers.numpy()[4, parameters.NUMBER_COLUMNS["speed"]] = 99.0
+        found.append((reward.rewards().numpy().copy(), *reward.failures().items()))
+        reward.close()
+    (ours, told), (theirs, named) = found
+    assert ours == pytest.approx(theirs, rel=1e-6, nan_ok=True) and np.flatnonzero(np.isnan(ours)).tolist() == [4]
+    assert told == ("r.py: line 3: ZeroDivisionError: division by zero", Failure(1, car=4))
+    assert named == ("r.py:3: ZeroDivisionError: float division by zero", Failure(1, car=4))
+    assert ours[0] == pytest.approx(len(TRACKS[0]) + TRACKS[0][1][0] + 1.0 / (0.6 - 99.0))
+
+
+def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
+    code = (
+        "from worker.racer.rewards.reward import RewardFunction as F; from worker.racer.rewards.samples import oval\n"
+        f"made = F({SOURCE!r}, [oval()], 1); print('reason', made.reason, made.function is not None)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    assert said.stdout.splitlines()[-1:] == ["reason  True"], said.stderr
+
+
+def test_what_the_guard_refuses_is_not_run() -> None:
+    with pytest.raises(RewardRefused, match=r"^r\.py:1: IMPORT_ERROR: os can't be imported"):
+        RewardFunction(f"import os\n{SOURCE}", TRACKS, 2, file="r.py")
+
+
+class RaceSensor:
+    """What the racer's simulator is to a task: it gives the arrays, here filled with samples."""
+
+    arrays_type = RaceArrays
+    needs_bodies = False
+    names: tuple[str, ...] = ()
+
+    def rows(self, views: Any) -> list[str]:
+        return []
+
+    def build(self, context: SensorContext) -> RaceSensor:
+        self.arrays = race_arrays(len(samples()), TRACKS, context.device)
+        return self
+
+    def advance(self) -> None:
+        numbers = self.arrays.numbers.numpy()
+        for world, params in enumerate(samples().values()):
+            numbers[world], _ = parameters.row_of(params)
+
+    def settle(self) -> None:
+        pass
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        return {}
+
+
+@dataclass(frozen=True)
+class CarConfig(TaskConfig):
+    rewards: Mapping[str, float] = reward_weights(learner=2.0)
+
+
+class Car(DeclaredTask):
+    config_type = CarConfig
+    solver_options = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
+
+    def robot(self, config: CarConfig) -> Robot:
+        return Robot(
+            '<mujoco><worldbody><body><joint name="j" type="hinge"/><geom size="0.1"/></body></worldbody>'
+            '<actuator><motor joint="j"/></actuator></mujoco>'
+        )
+
+    def declare(self, config: CarConfig) -> Declaration:
+        from worker.tasks import Action, Observation
+
+        function = warp_function(translate("def reward_function(params):\n    return params['speed'] + 1\n").snippet)
+        return Declaration(
+            actions={"motor": Action(terms.effort)},
+            observations={"velocity": Observation(terms.joint_velocity)},
+            rewards={"learner": Reward(function)},
+            sensors={"race": RaceSensor()},
+        )
+
+
+def test_a_compiled_function_is_a_reward_term_of_a_declared_task() -> None:
+    task = Car(CarConfig(), len(samples()), seed=1, device="cpu")
+    task.reset()
+    task.step(torch.zeros_like(task.actions))
+    assert task.rewards.tolist() == pytest.approx([2.0 * (params["speed"] + 1.0) for params in samples().values()])

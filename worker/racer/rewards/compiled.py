@@ -1,0 +1,110 @@
+"""A translated reward function as a function of Warp, and its launch over the arrays of all cars."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import linecache
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
+from worker.racer.rewards.problems import Failure
+from worker.racer.rewards.translation.translate import told
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class RaceArrays:
+    """What a step tells the reward functions of all cars.
+
+    Attributes:
+        numbers: A row a car, shape ``(worlds, NUMBERS)``: :data:`~worker.racer.rewards.parameters.NUMBER_COLUMNS`, then how many objects
+            there are and the row of the car's track.
+        objects: Of each car its objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``:
+            :data:`~worker.racer.rewards.parameters.OBJECT_COLUMNS`.
+        waypoints: Centre lines of the tracks [m], shape ``(tracks, longest, 2)``.
+        counts: How many waypoints each track has, shape ``(tracks,)``.
+        errors: Of each car the last error of its reward function (16 times the line, and its number in
+            :data:`~worker.racer.rewards.translation.prelude.ERRORS`) and how many there were, shape ``(worlds, 2)``.
+    """
+
+    numbers: wp.array2d(dtype=wp.float32)
+    objects: wp.array3d(dtype=wp.float32)
+    waypoints: wp.array3d(dtype=wp.float32)
+    counts: wp.array(dtype=wp.int32)
+    errors: wp.array2d(dtype=wp.int32)
+
+
+def race_arrays(worlds: int, tracks: Sequence[Sequence[Point]], device: str) -> Any:
+    """Arrays for so many cars, all zero but the tracks.
+
+    Args:
+        worlds: Cars.
+        tracks: Waypoints of each track [m].
+        device: Where they are.
+    """
+    race = RaceArrays()
+    lines = np.zeros((len(tracks), max(map(len, tracks)), 2), dtype=np.float32)
+    for row, track in zip(lines, tracks, strict=True):
+        row[: len(track)] = track
+    race.numbers = wp.zeros((worlds, NUMBERS), dtype=wp.float32, device=device)
+    race.objects = wp.zeros((worlds, MOST_OBJECTS, OBJECT_NUMBERS), dtype=wp.float32, device=device)
+    race.waypoints = wp.array(lines, dtype=wp.float32, device=device)
+    race.counts = wp.array([len(track) for track in tracks], dtype=wp.int32, device=device)
+    race.errors = wp.zeros((worlds, 2), dtype=wp.int32, device=device)
+    return race
+
+
+@functools.cache
+def warp_function(snippet: str) -> Any:
+    """A Warp function of ``(world: int, race: RaceArrays) -> float``, which terms and kernels may call.
+
+    Args:
+        snippet: Its C++ body (:func:`worker.racer.rewards.translation.translate`).
+
+    A car whose reward has no value gets NaN, and a row of ``race.errors`` that says why.
+    """
+    name = f"reward_{hashlib.sha256(snippet.encode()).hexdigest()[:12]}"
+    scope: dict[str, Any] = {"wp": wp, "RaceArrays": RaceArrays, "snippet": snippet, "__name__": f"muster.{name}"}
+    # Warp reads the type of the result only where it sees this decorator
+    _run(f"@wp.func_native(snippet)\ndef {name}(world: int, race: RaceArrays) -> float:\n    ...\n", name, scope)
+    return scope[name]
+
+
+def kernels(functions: Sequence[Any], name: str) -> list[Any]:
+    """Kernels that call one reward function each for every car: ``(race, rewards)``; all of them are one module of Warp."""
+    scope: dict[str, Any] = {"wp": wp, "RaceArrays": RaceArrays, "__name__": f"muster.{name}"}
+    parts = []
+    for number, function in enumerate(functions):
+        scope[f"function_{number}"] = function
+        parts.append(
+            f"def reward_all_{number}(race: RaceArrays, rewards: wp.array(dtype=wp.float32)):\n"
+            f"    world = wp.tid()\n    rewards[world] = function_{number}(world, race)\n"
+        )
+    _run("\n".join(parts), name, scope)
+    module = wp.get_module(f"muster.{name}")
+    module.options["enable_backward"] = False
+    return [
+        wp.kernel(scope[f"reward_all_{number}"], module=module, enable_backward=False) for number in range(len(parts))
+    ]
+
+
+def _run(text: str, name: str, scope: dict[str, Any]) -> None:
+    """Define what a text defines; Warp finds it again under the name of its file."""
+    file = f"<{name}>"
+    linecache.cache[file] = (len(text), None, [f"{line}\n" for line in text.split("\n")], file)
+    exec(compile(text, file, "exec"), scope)
+
+
+def told_errors(errors: np.ndarray) -> dict[str, Failure]:
+    """What ``race.errors`` says: the calls that gave no reward, by their message."""
+    found: dict[str, Failure] = {}
+    for car in np.flatnonzero(errors[:, 1]).tolist():
+        code, count = errors[car].tolist()
+        found.setdefault(told(code), Failure(0, car)).count += count
+    return found

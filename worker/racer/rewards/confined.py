@@ -1,0 +1,179 @@
+"""A process that runs a learner's function: its limits, how it is loaded and called, and what its failures are called.
+
+It imports nothing but the standard library: a process that runs a function starts in a few hundredths of a second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import resource
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from worker.racer.rewards.problems import one_line
+
+MEMORY = 2 << 30
+"""Bytes of address space of a process that runs a reward function."""
+MOST_PRINTED = 64 << 10
+"""Characters that one call may print; what it prints is dropped."""
+_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
+_PARENT_DEATH_SIGNAL = 1
+Reward = Callable[[dict[str, Any]], Any]
+
+
+def confine(memory: int = MEMORY, cpu: int | None = None) -> None:
+    """Limit this process: memory, CPU time, no file with content, no core dump, no further process, and no network where it can be had.
+
+    Args:
+        memory: Bytes of address space.
+        cpu: Seconds of CPU time; None: no limit.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    libc.unshare(_NEW_USER | _NEW_NETWORK)  # refused in some containers; the rest holds there, too
+    limits = {resource.RLIMIT_AS: memory, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0, resource.RLIMIT_NPROC: 0}
+    if cpu is not None:
+        limits[resource.RLIMIT_CPU] = cpu
+    for kind, most in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (least, least))
+
+
+class Flooded(BaseException):
+    """A function printed more than :data:`MOST_PRINTED` characters in one call."""
+
+
+class Printed:
+    """Takes the place of standard output: counts what is printed, and drops it."""
+
+    def __init__(self, flooded: Callable[[], None]) -> None:
+        self.count = 0
+        self._flooded = flooded
+
+    def write(self, text: str) -> int:
+        self.count += len(text)
+        if self.count > MOST_PRINTED:
+            self._flooded()
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing to do."""
+
+
+def line_of_frame(frame: Any, file: str) -> int:
+    """The line of ``file`` that runs in a frame or above it; 0: none."""
+    while frame is not None:
+        if frame.f_code.co_filename == file:
+            return int(frame.f_lineno)
+        frame = frame.f_back
+    return 0
+
+
+def line_of(error: BaseException, file: str) -> int:
+    """The line of ``file`` in which an exception was raised or that called what raised it; 0: none."""
+    line, trace = 0, error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == file:
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line
+
+
+def load(source: str, file: str) -> Reward:
+    """Run a file's text and give its ``reward_function``.
+
+    Args:
+        source: Its text.
+        file: Its name, in tracebacks.
+    """
+    scope: dict[str, Any] = {"__name__": "reward_function"}
+    exec(compile(source, file, "exec", dont_inherit=True), scope)
+    function: Reward = scope["reward_function"]
+    return function
+
+
+def told_result(result: Any) -> str:
+    """What is wrong with what a function returned; empty: nothing is.
+
+    A truth value is no reward: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
+    """
+    if result is None:
+        return "it returned None; return a number on every way through the function"
+    kind = type(result).__name__
+    if isinstance(result, bool) or kind in ("bool", "bool_"):
+        return f"it returned {result}, a truth value; return a number such as float({result})"
+    if not isinstance(result, int | float) and not hasattr(result, "dtype"):
+        return f"it returned a {kind}; return a number"
+    if getattr(result, "shape", ()) != ():
+        return f"it returned an array of shape {result.shape}; return one number"
+    try:
+        value = float(result)
+    except (TypeError, ValueError, OverflowError):
+        return f"it returned a {kind} that is no float"
+    if not math.isfinite(value):
+        return f"it returned {value}; return a finite number"
+    if abs(value) > 3.4e38:
+        return f"it returned {value:g}; return a number of at most 3.4e38"
+    return ""
+
+
+def told_error(error: BaseException) -> str:
+    """What an exception that a function raised is told as."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error.name} is not installed here"
+    if isinstance(error, MemoryError):
+        return f"it used more than {MEMORY >> 30} GiB of memory"
+    if isinstance(error, RecursionError):
+        return "it calls itself too often (RecursionError)"
+    if isinstance(error, SystemExit):
+        return "it ended the program (SystemExit)"
+    return one_line(error)
+
+
+def changed(before: Any, after: Any, place: str = "params") -> str:
+    """The first part of ``params`` that a function changed; empty: none. NaN counts as equal to NaN."""
+    if type(before) is not type(after):
+        return place
+    if isinstance(before, Mapping):
+        if list(before) != list(after):
+            return place
+        pairs = [(f"{place}[{key!r}]", before[key], after[key]) for key in before]
+    elif isinstance(before, list | tuple):
+        if len(before) != len(after):
+            return place
+        pairs = [(f"{place}[{index}]", *pair) for index, pair in enumerate(zip(before, after, strict=True))]
+    else:
+        return "" if before == after or (before != before and after != after) else place
+    return next((found for name, one, other in pairs if (found := changed(one, other, name))), "")
+
+
+class Alarm:
+    """Ends a call that takes too long.
+
+    Args:
+        expired: Called with the frame that runs; it does not return as a rule.
+    """
+
+    def __init__(self, expired: Callable[[Any], None]) -> None:
+        signal.signal(signal.SIGALRM, lambda _, frame: expired(frame))
+
+    @staticmethod
+    def set(seconds: float) -> None:
+        """Start the clock; 0 stops it. A function that swallows the alarm gets it again every tenth of a second."""
+        signal.setitimer(signal.ITIMER_REAL, seconds, 0.1 if seconds else 0.0)
+
+
+@contextlib.contextmanager
+def printing(printed: Printed) -> Any:
+    """What is printed meanwhile goes to ``printed``."""
+    kept = sys.stdout, sys.stderr
+    sys.stdout = sys.stderr = printed
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = kept

@@ -1,0 +1,66 @@
+"""What is wrong with a reward function, in one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from worker.errors import UserError
+
+KINDS = ("SYNTAX_ERROR", "IMPORT_ERROR", "FORBIDDEN", "TEST_FAILURE", "TIMEOUT")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Why a reward function can't be used.
+
+    Attributes:
+        kind: One of :data:`KINDS`.
+        message: One line.
+        file: Its file.
+        line: Where, from 1; 0 where no line is the cause.
+    """
+
+    kind: str
+    message: str
+    file: str
+    line: int = 0
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {self.kind}: {self.message}"
+
+
+class RewardRefused(UserError):
+    """A reward function that the guard refused.
+
+    Args:
+        problem: Why.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(str(problem))
+        self.problem = problem
+
+
+class RewardFailed(UserError):
+    """A reward function that can't go on: it does not return, floods its output, or its process died. One line, with the car."""
+
+
+@dataclass
+class Failure:
+    """Calls that gave no reward.
+
+    Attributes:
+        count: How many.
+        car: The first car that had one.
+    """
+
+    count: int
+    car: int
+
+
+def one_line(error: BaseException, most: int = 200) -> str:
+    """An exception in one line."""
+    text = " ".join(str(error).split())
+    shown = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return shown if len(shown) <= most else shown[: most - 1] + "…"

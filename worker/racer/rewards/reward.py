@@ -1,0 +1,127 @@
+"""A reward function as a task uses it: for all cars of a step, compiled where it can be, else in Python workers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from worker.racer.rewards.compiled import kernels, race_arrays, told_errors, warp_function
+from worker.racer.rewards.guard import check_source, read_file
+from worker.racer.rewards.parameters import Point
+from worker.racer.rewards.problems import Failure, RewardRefused, one_line
+from worker.racer.rewards.translation import Outside, translate
+from worker.racer.rewards.workers import Workers
+
+
+class RewardFunction:
+    """A learner's ``reward_function(params)`` for all cars at once.
+
+    Args:
+        source: Text of its file.
+        tracks: Waypoints of each track [m].
+        worlds: How many cars there are.
+        device: Where the arrays are, such as ``cuda:0``.
+        file: Name of the file, in messages.
+        compiled: False: in Python workers, even if it could be compiled.
+        processes: How many Python workers; by default as many as there are processors.
+
+    Attributes:
+        race: The arrays that a step fills before the call (:class:`worker.racer.rewards.compiled.RaceArrays`).
+        function: The Warp function ``(world: int, race: RaceArrays) -> float``, which a declared task can name as a reward term; None
+            where it runs in Python workers.
+        reason: Why it is not compiled, one line; empty where it is.
+        notes: What the compiled function leaves out, a line each.
+
+    Raises:
+        RewardRefused: The guard refuses it.
+        RewardFailed: Its file can't be loaded by the Python workers.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        tracks: Sequence[Sequence[Point]],
+        worlds: int,
+        device: str = "cpu",
+        file: str = "reward_function.py",
+        *,
+        compiled: bool = True,
+        processes: int | None = None,
+    ) -> None:
+        if problem := check_source(source, file):
+            raise RewardRefused(problem)
+        self.file = file
+        self.function: Any = None
+        self.reason = "" if compiled else "Python workers were asked for"
+        self.notes: tuple[str, ...] = ()
+        if compiled:
+            try:
+                translated = translate(source)
+            except Outside as outside:
+                self.reason = f"{file}: {outside}"
+            else:
+                self.function, self.notes = warp_function(translated.snippet), translated.notes
+        if self.function is not None:
+            wp.init()  # a module's load does not do it
+            (self._kernel,) = kernels([self.function], self.function.key.replace(".", "_"))
+            try:
+                self._kernel.module.load(device)
+            except Exception as error:  # Warp has no type for what a compiler refuses
+                if "build failed" not in str(error):
+                    raise
+                self.function, self.notes = None, ()
+                told = one_line(error)
+                self.reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"
+        self.race = race_arrays(worlds, tracks, device)
+        self._rewards = wp.zeros(worlds, dtype=wp.float32, device=device)
+        self._workers: Workers | None = None
+        if self.function is None:
+            self._workers = Workers(source, file, tracks, worlds, processes)
+
+    @classmethod
+    def of_file(cls, path: Path, tracks: Sequence[Sequence[Point]], worlds: int, **options: Any) -> RewardFunction:
+        """The reward function in a file; options as of the class.
+
+        Raises:
+            RewardRefused: The file can't be read, or the guard refuses it.
+        """
+        return cls(read_file(path), tracks, worlds, file=str(path), **options)
+
+    def rewards(self) -> wp.array:
+        """The rewards of the cars in ``race``, shape ``(worlds,)``, float32, on the device; the same array each time.
+
+        NaN where the function raised an error or gave no finite number: :meth:`failures` says which and how often. The compiled function
+        is one launch, which a graph may capture; Python workers wait for the device and copy ``race`` to the host.
+
+        Raises:
+            RewardFailed: A Python worker's call does not return, floods its output or ends its process.
+        """
+        if self._workers is None:
+            wp.launch(
+                self._kernel, dim=len(self._rewards), inputs=[self.race, self._rewards], device=self._rewards.device
+            )
+        else:
+            self._workers.numbers[:] = self.race.numbers.numpy()
+            self._workers.objects[:] = self.race.objects.numpy()
+            self._rewards.assign(self._workers.rewards())
+        return self._rewards
+
+    def failures(self) -> dict[str, Failure]:
+        """The calls that gave no reward so far, by their message, the most frequent first. Waits for the device.
+
+        A compiled function keeps of each car its last error and the number of all: they count under the last one.
+        """
+        if self._workers is not None:
+            found = self._workers.failures
+        else:
+            errors = told_errors(self.race.errors.numpy())
+            found = {f"{self.file}: {told}": failure for told, failure in errors.items()}
+        return dict(sorted(found.items(), key=lambda item: -item[1].count))
+
+    def close(self) -> None:
+        """End the Python workers."""
+        if self._workers is not None:
+            self._workers.close()

@@ -1,0 +1,193 @@
+"""Sample inputs of reward functions: cars, and objects, placed on an oval that is computed here."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from worker.racer.rewards.parameters import BY_NAME, MOST_OBJECTS, PARAMETERS, Point
+
+WIDTH = 1.07
+"""Width of the oval's road [m]."""
+_CAR = 0.08
+"""Half the width of a car [m]."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Something on the track.
+
+    Attributes:
+        way: Along the centre line from the start [m].
+        offset: From the centre line to the left [m].
+        turned: From the direction of the track to the left [degrees].
+        speed: In m/s.
+    """
+
+    way: float
+    offset: float = 0.0
+    turned: float = 0.0
+    speed: float = 0.0
+
+
+class Line:
+    """A closed centre line.
+
+    Args:
+        points: The first one is also the last one [m].
+
+    Attributes:
+        points: As given.
+        starts: Way from the first point to each point [m].
+        length: Of the whole line [m].
+    """
+
+    def __init__(self, points: Sequence[Point]) -> None:
+        self.points = list(points)
+        self.starts = [0.0]
+        for before, after in zip(self.points, self.points[1:], strict=False):
+            self.starts.append(self.starts[-1] + math.dist(before, after))
+        self.length = self.starts[-1]
+
+    def at(self, way: float) -> tuple[int, Point, float]:
+        """The segment's number, the point and the direction [rad] at a way along the line, which may be more than a lap."""
+        way %= self.length
+        segment = max(index for index, start in enumerate(self.starts[:-1]) if start <= way)
+        (x0, y0), (x1, y1) = self.points[segment], self.points[segment + 1]
+        share = (way - self.starts[segment]) / max(self.starts[segment + 1] - self.starts[segment], 1e-9)
+        return segment, (x0 + share * (x1 - x0), y0 + share * (y1 - y0)), math.atan2(y1 - y0, x1 - x0)
+
+
+def oval(straight: float = 4.0, radius: float = 1.6, spacing: float = 0.15) -> list[Point]:
+    """Two straights and two half circles, driven to the left; the first point is also the last one [m]."""
+    half = math.pi * radius
+    length = 2.0 * (straight + half)
+    count = round(length / spacing)
+    points = []
+    for index in range(count):
+        way = length * index / count
+        side, along = divmod(way, straight + half)
+        sign = -1.0 if side else 1.0
+        if along < straight:
+            x, y = along - straight / 2, -radius
+        else:
+            angle = (along - straight) / radius - math.pi / 2
+            x, y = straight / 2 + radius * math.cos(angle), radius * math.sin(angle)
+        points.append((sign * x, sign * y))
+    return [*points, points[0]]
+
+
+def _degrees(angle: float) -> float:
+    """An angle [rad] in degrees, from -180 to 180."""
+    return (math.degrees(angle) + 180.0) % 360.0 - 180.0
+
+
+def sample(
+    line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any
+) -> dict[str, Any]:
+    """What a car's reward function is given.
+
+    Args:
+        line: Centre line of the track.
+        car: The car.
+        objects: What else is there.
+        is_reversed: Whether it drives against the line's direction.
+        **known: Values of further keys; also of those that follow from the rest.
+
+    Raises:
+        KeyError: There is no such key.
+    """
+    segment, (x, y), direction = line.at(car.way)
+    after = (segment + 1) % (len(line.points) - 1)
+    if is_reversed:
+        segment, after, direction = after, segment, direction + math.pi
+    far = abs(car.offset)
+    left = car.offset > 0.0
+    poses = [line.at(each.way) for each in objects]
+    ahead = sorted(range(len(objects)), key=lambda index: (objects[index].way - car.way) % line.length)
+    params = {
+        "all_wheels_on_track": far + _CAR <= WIDTH / 2,
+        "x": x - car.offset * math.sin(direction),
+        "y": y + car.offset * math.cos(direction),
+        "heading": _degrees(direction + math.radians(car.turned)),
+        "distance_from_center": far,
+        "is_left_of_center": left,
+        "is_reversed": is_reversed,
+        "is_crashed": False,
+        "is_offtrack": far - _CAR > WIDTH / 2,
+        "progress": 100.0 * (car.way % line.length) / line.length,
+        "steps": 1,
+        "speed": car.speed,
+        "steering_angle": 0.0,
+        "track_length": line.length,
+        "track_width": WIDTH,
+        "closest_waypoints": [segment, after],
+        "closest_objects": [ahead[-1], ahead[0]] if ahead else [0, 0],
+        "projection_distance": car.way % line.length,
+        "sim_time": 0.0,
+        "object_in_camera": any((each.way - car.way) % line.length < 2.0 for each in objects),
+        "waypoints": list(line.points),
+        "objects_location": [
+            (px - each.offset * math.sin(angle), py + each.offset * math.cos(angle))
+            for each, (_, (px, py), angle) in zip(objects, poses, strict=True)
+        ],
+        "objects_distance": [each.way % line.length for each in objects],
+        "objects_heading": [
+            _degrees(angle + math.radians(each.turned)) for each, (*_, angle) in zip(objects, poses, strict=True)
+        ],
+        "objects_left_of_center": [each.offset > 0.0 for each in objects],
+        "objects_speed": [each.speed for each in objects],
+        "objects_distance_from_center": [abs(each.offset) for each in objects],
+    }
+    for name, value in known.items():
+        if name not in BY_NAME:
+            raise KeyError(name)
+        params[name] = value
+    return {each.name: params[each.name] for each in PARAMETERS}
+
+
+def samples() -> dict[str, dict[str, Any]]:
+    """Sample inputs by name, on the oval: those with which the guard tries a function."""
+    line = Line(oval())
+    boxes = [Placed(7.0, 0.25), Placed(11.0, -0.25), Placed(15.5, 0.25)]
+    return {
+        "start": sample(line, Placed(0.02, 0.0, 0.0, 0.6)),
+        "straight": sample(line, Placed(1.5, 0.21, -8.0, 2.5), steps=40, sim_time=2.6, steering_angle=-12.0),
+        "curve": sample(line, Placed(6.1, -0.31, 15.0, 1.2), steps=95, sim_time=6.3, steering_angle=25.0),
+        "edge": sample(line, Placed(9.4, 0.5, 31.0, 3.0), steps=150, sim_time=10.0, steering_angle=-30.0),
+        "off-track": sample(line, Placed(12.0, -0.7, -55.0, 1.0), steps=171, sim_time=11.4, steering_angle=30.0),
+        "reversed": sample(line, Placed(3.3, 0.1, 5.0, 1.5), is_reversed=True, steps=60, sim_time=4.0),
+        "objects": sample(line, Placed(6.4, 0.2, 3.0, 1.8), boxes, steps=110, sim_time=7.3, steering_angle=10.0),
+        "crashed": sample(line, Placed(7.0, 0.25, 0.0, 0.5), boxes, is_crashed=True, steps=120, sim_time=8.0),
+        "finish": sample(line, Placed(line.length - 0.01, 0.05, 2.0, 3.9), progress=100.0, steps=310, sim_time=20.6),
+    }
+
+
+def random_sample(line: Line, chance: random.Random) -> dict[str, Any]:
+    """Sample inputs drawn at random: anywhere on the track and beside it, with up to :data:`MOST_OBJECTS` objects.
+
+    Args:
+        line: Centre line of the track.
+        chance: What draws.
+    """
+
+    def placed() -> Placed:
+        offset = chance.uniform(-0.75, 0.75)
+        return Placed(chance.uniform(0.0, line.length), offset, chance.gauss(0.0, 40.0), chance.uniform(0.1, 4.0))
+
+    objects = [placed() for _ in range(chance.choice((0, 0, 1, 2, 3, MOST_OBJECTS)))]
+    steps = chance.randrange(1, 600)
+    return sample(
+        line,
+        placed(),
+        objects,
+        is_reversed=chance.random() < 0.3,
+        steps=steps,
+        sim_time=steps / 15.0,
+        steering_angle=chance.choice((-30.0, -15.0, 0.0, 15.0, 30.0, chance.uniform(-30.0, 30.0))),
+        progress=chance.choice((chance.uniform(0.0, 100.0), 100.0)),
+        is_crashed=chance.random() < 0.1,
+    )

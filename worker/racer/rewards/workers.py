@@ -1,0 +1,183 @@
+"""A pool of processes that call a reward function for all cars of a step: for functions that are not compiled.
+
+The arrays are in shared memory; a step costs one message to each process and one back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from worker.racer.rewards.confined import MEMORY
+from worker.racer.rewards.guard import environment
+from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point
+from worker.racer.rewards.problems import Failure, RewardFailed
+
+SECONDS = 2.0
+"""For one call [s]."""
+_START = 120.0
+"""For a process to start and import what the function imports [s]."""
+
+
+class Workers:
+    """Processes that call a reward function.
+
+    Args:
+        source: Text of its file.
+        file: Its name, in messages.
+        tracks: Waypoints of each track [m].
+        worlds: How many cars there are.
+        processes: How many processes share them; by default one for each processor that may be used, at most one for each 16 cars.
+        seconds: For one call [s].
+        memory: Bytes of address space of each process.
+
+    The thread that makes the pool has to live as long as it: the kernel ends the processes with that thread.
+
+    Attributes:
+        numbers: What the cars are told, shape ``(worlds, NUMBERS)``, float32, to be filled before a call.
+        objects: Of their objects, shape ``(worlds, MOST_OBJECTS, OBJECT_NUMBERS)``, float32.
+        failures: The calls that gave no reward so far, by their message.
+
+    Raises:
+        RewardFailed: The file can't be loaded.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        file: str,
+        tracks: Sequence[Sequence[Point]],
+        worlds: int,
+        processes: int | None = None,
+        seconds: float = SECONDS,
+        memory: int = MEMORY,
+    ) -> None:
+        count = processes or min(len(os.sched_getaffinity(0)), -(-worlds // 16))
+        self.file, self._seconds, self._share = file, seconds, -(-worlds // count)
+        cells = worlds * (NUMBERS + MOST_OBJECTS * OBJECT_NUMBERS + 1)
+        self._descriptor = os.memfd_create("rewards")
+        os.ftruncate(self._descriptor, 4 * cells)
+        shared = np.frombuffer(mmap.mmap(self._descriptor, 0), dtype=np.float32)
+        self.numbers, rest = np.split(shared, [worlds * NUMBERS])
+        self.objects, self._rewards = np.split(rest, [worlds * MOST_OBJECTS * OBJECT_NUMBERS])
+        self.numbers = self.numbers.reshape(worlds, NUMBERS)
+        self.objects = self.objects.reshape(worlds, MOST_OBJECTS, OBJECT_NUMBERS)
+        self.failures: dict[str, Failure] = {}
+        asked = {
+            "source": source,
+            "file": file,
+            "seconds": seconds,
+            "memory": memory,
+            "root": str(Path(__file__).parents[3]),
+            "worlds": worlds,
+            "tracks": [np.asarray(track, dtype=np.float32).tolist() for track in tracks],
+            "shared": self._descriptor,
+        }
+        firsts = range(0, worlds, self._share)
+        self._processes: list[subprocess.Popen[bytes]] = []
+        try:
+            for first in firsts:
+                self._start({**asked, "first": first, "last": min(first + self._share, worlds)})
+            self._answers(_START)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, asked: Mapping[str, Any]) -> None:
+        process = subprocess.Popen(
+            [sys.executable, "-I", "-B", str(Path(__file__).with_name("interpreter.py"))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment(),
+            pass_fds=[self._descriptor],
+        )
+        self._processes.append(process)
+        assert process.stdin is not None
+        process.stdin.write(json.dumps(asked).encode() + b"\n")
+        process.stdin.flush()
+
+    def rewards(self) -> np.ndarray:
+        """The rewards of the cars in ``numbers`` and ``objects``, shape ``(worlds,)``, float32.
+
+        A call that raises, or returns anything but a finite number, gives NaN and is counted in ``failures``.
+
+        Raises:
+            RewardFailed: A call does not return, floods its output or ends its process. The pool is closed.
+        """
+        if not self._processes:
+            raise RewardFailed(f"{self.file}: the processes that call the reward function have ended")
+        try:
+            for process in self._processes:
+                assert process.stdin is not None
+                with contextlib.suppress(BrokenPipeError):  # its end is told when its answer is missing
+                    process.stdin.write(b"\n")
+                    process.stdin.flush()
+            self._answers(self._seconds * (self._share + 1) + 5.0)
+        except BaseException:
+            self.close()
+            raise
+        return self._rewards.copy()
+
+    def _answers(self, patience: float) -> None:
+        """Wait for a line from each process."""
+        until = time.monotonic() + patience
+        for number, process in enumerate(self._processes):
+            line = self._line(process, number, until)
+            said = json.loads(line)
+            if isinstance(said, dict):
+                place = f"{self.file}:{said['line']}" if said["line"] else self.file
+                car = f"car {said['car']}: " if said["car"] >= 0 else ""
+                raise RewardFailed(f"{place}: {car}{said['message']}")
+            for told, at, car, count in said:
+                place = f"{self.file}:{at}" if at else self.file
+                self.failures.setdefault(f"{place}: {told}", Failure(0, car)).count += count
+
+    def _line(self, process: subprocess.Popen[bytes], number: int, until: float) -> bytes:
+        """An answer, whole."""
+        assert process.stdout is not None
+        first = number * self._share
+        cars = f"cars {first} to {min(first + self._share, len(self._rewards)) - 1}"
+        said, poll = b"", select.poll()
+        poll.register(process.stdout, select.POLLIN)
+        while not said.endswith(b"\n"):
+            if not poll.poll(max(0.0, 1000.0 * (until - time.monotonic()))):
+                raise RewardFailed(f"{self.file}: {cars}: the function did not return, and its process takes no signal")
+            part = os.read(process.stdout.fileno(), 1 << 16)
+            if not part:
+                code = process.wait()
+                cause = f"signal {-code}" if code < 0 else f"exit code {code}"
+                raise RewardFailed(f"{self.file}: {cars}: the process of the function ended ({cause})")
+            said += part
+        return said
+
+    def close(self) -> None:
+        """End the processes."""
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        self._processes = []
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
