@@ -43,8 +43,9 @@ robots: $(READY)
 	$(BIN)/python -m tests.support.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes
 	$(PYTEST) tests/robots
 
+# pandas for MLflow's own server, which the extra has without it
 services: $(READY) kernels
-	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]'
+	$(BIN)/pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas
 	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_bundle_parts.py
 
 # one after the other: a cluster has this machine for itself

@@ -103,6 +103,7 @@ def server(tmp_path: Path) -> Iterator[str]:
     """MLflow's own server, with a database file and a directory of artifacts; its address."""
     pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
     pytest.importorskip("flask", reason="of the extra dev, with which the server runs")
+    pytest.importorskip("pandas", reason="which the server imports: make services")
     port = free_port()
     url = f"http://127.0.0.1:{port}"
     command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
