@@ -88,7 +88,7 @@ def test_a_recorded_training_has_the_images_of_each_step(running: Running, tmp_p
                 found[world.removeprefix("world_")].append(np.asarray(picture))
             elif (world, *rest) == ("world_0", "rl", "step"):
                 steps.append(int(each.decoded_message.action[0]))
-    assert len(steps) >= 24 and steps == sorted(set(steps))
+    assert len(steps) >= 12 and steps == sorted(set(steps))  # poles may fall before the clock ends an episode
     for world, images in found.items():
         assert len(images) == len(steps)
         for step, image in zip(steps, images, strict=True):
