@@ -144,7 +144,7 @@ def look_on(url: str, seconds: float, home: Path, stop: list[int], found: dict[s
 
 
 def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, Any]:
-    """Times of each frame that arrived [ms], shape ``(frames, 5)``: step, read, logged, arrived, next frame; and what else is told."""
+    """Times of each frame that arrived [ms], shape ``(frames, 5)``: step, read, logged, arrived, next frame; and the facts of the table."""
     command = [
         sys.executable,
         "-m",

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.engines.aws_config import config_path
 from orchestrator.errors import ServerError
@@ -30,11 +30,9 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        help="The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch).",
-        epilog="Examples:  muster aws up --region eu-west-1   then   muster serve --engine aws-batch",
+    group = make_group(
+        "The CloudFormation stack in which jobs run on AWS (network, volume, images, AWS Batch).",
+        "Examples:  muster aws up --region eu-west-1   then   muster serve --engine aws-batch",
     )
     group.command(epilog="Example:  muster aws up --region eu-west-1 --parameter InstanceTypes=g6.4xlarge")(up)
     group.command(epilog="Example:  muster aws down")(down)

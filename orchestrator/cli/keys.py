@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import Console, echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.home import local_url, muster_home
@@ -19,11 +19,9 @@ NameArgument = Annotated[str, typer.Argument(help="The key's name: who or what u
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        help="Access keys of this home directory's server: who may call it.\n\nAWS clients use one as a key pair, muster as MUSTER_TOKEN.",
-        epilog="Example:  muster keys create alice --queue robots",
+    group = make_group(
+        "Access keys of this home directory's server: who may call it.\n\nAWS clients use one as a key pair, muster as MUSTER_TOKEN.",
+        "Example:  muster keys create alice --queue robots",
     )
     group.command(epilog="Example:  muster keys create alice --queue robots")(create)
     group.command("list", epilog="Example:  muster keys list --json | jq '.[].name'")(list_keys)

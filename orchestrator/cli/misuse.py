@@ -33,6 +33,11 @@ class Group(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+def make_group(about: str, epilog: str) -> typer.Typer:
+    """A group of commands, which alone prints its help."""
+    return typer.Typer(cls=Group, no_args_is_help=True, rich_markup_mode="rich", help=about, epilog=epilog)
+
+
 def told(error: Any, commands: Sequence[str]) -> str:
     """What is wrong with the command line; empty where the error is that nothing was given, whose help is printed already.
 

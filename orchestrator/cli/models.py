@@ -13,7 +13,7 @@ from rich.table import Table
 from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
 from orchestrator.cli.jobs import JsonOption, scored
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import make_group
 from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
@@ -34,12 +34,9 @@ muster models verify ant@1"""
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        rich_markup_mode="rich",
-        epilog=_EXAMPLES,
-        help="Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+    group = make_group(
+        "Keep exported policies: register, list, show, diff, verify. A version is never changed.",
+        _EXAMPLES,
     )
     group.command("register", epilog="Example:  muster models register ant-1f2e3d4c@best --name ant")(register_model)
     group.command("list", epilog="Example:  muster models list --json")(list_models)

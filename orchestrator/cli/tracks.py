@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import make_group
 from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
@@ -35,12 +35,9 @@ muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        rich_markup_mode="rich",
-        epilog=_EXAMPLES,
-        help="Tracks of the racer: list, show, make, import. A track is never changed.",
+    group = make_group(
+        "Tracks of the racer: list, show, make, import. A track is never changed.",
+        _EXAMPLES,
     )
     group.command("list", epilog="Example:  muster tracks list --json")(list_tracks)
     group.command("show", epilog="Example:  muster tracks show chicane -o chicane.png")(show)

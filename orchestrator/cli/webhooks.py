@@ -8,19 +8,17 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from shared_store.wording import counted
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(
-        cls=Group,
-        no_args_is_help=True,
-        help="Webhooks of a controller: who is told when jobs end.\n\nThey are those of `muster serve --webhooks FILE`, a JSON "
+    group = make_group(
+        "Webhooks of a controller: who is told when jobs end.\n\nThey are those of `muster serve --webhooks FILE`, a JSON "
         'object of names: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}.',
-        epilog="Examples:  muster webhooks test chat   then   muster webhooks list",
+        "Examples:  muster webhooks test chat   then   muster webhooks list",
     )
     group.command("list", epilog="Example:  muster webhooks list --json | jq '.[].failed'")(list_webhooks)
     group.command(epilog="Example:  muster webhooks test chat")(test)

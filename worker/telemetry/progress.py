@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from shared_store.layout import Run
+from shared_store.wording import counted
 
 _SECONDS = 2.0
 """Between two plain lines of the same activity."""
@@ -64,4 +65,4 @@ def loading(run: Run, worlds: int) -> str:
     spec = (run.description() or {}).get("spec") or {}
     train = spec.get("train")
     task = str(train.get("task", "the task")) if isinstance(train, dict) else "the task"
-    return f"loading {task} in {worlds} world{'s' if worlds > 1 else ''} …"
+    return f"loading {task} in {counted(worlds, 'world')} …"

@@ -22,19 +22,11 @@ from shared_store.checkpoints import list_checkpoints
 from shared_store.files import read_json
 from shared_store.layout import Run, Store
 from tests.conftest import MUSTER, Serving, wait_for
+from tests.long.e2e.test_recordings import SMALL as RECORDED
 from tests.support.browser import Browser
 from worker.telemetry.page import need_rerun
 
-SMALL = {
-    "nodes": 1,
-    "train.worlds": 8,
-    "train.iterations": 1000000,
-    "train.config": {"episode_seconds": 0.5},
-    "checkpoint.every": 10,
-    "retry.attempts": 3,
-    "train.ppo.hidden_sizes": [8],
-    "train.ppo.steps": 8,
-}
+SMALL = {**RECORDED, "checkpoint.every": 10, "retry.attempts": 3}
 
 
 class View:

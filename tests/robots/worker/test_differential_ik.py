@@ -112,6 +112,17 @@ def made(kind: type[Planar], worlds: int = 2, **options: Any) -> Any:
     return task
 
 
+def continues_alike(one: Any, other: Any, action: torch.Tensor) -> bool:
+    """Whether a task that takes over the state of another one does as that does."""
+    for _ in range(3):
+        one.step(action)
+    other.load_state_dict(one.state_dict())
+    for task in (one, other):
+        for _ in range(3):
+            task.step(action)
+    return torch.equal(one.observations, other.observations)
+
+
 def asked(task: Any, positions: Any, wanted: Any, joints: Any = slice(None)) -> np.ndarray:
     """How far the joints' targets are from the joints, worlds being at these positions, shape ``(worlds, joints)``."""
     state = task.state_dict()
@@ -282,13 +293,7 @@ def test_targets_that_go_on_stay_near_the_joints_and_begin_anew_with_an_episode(
 def test_a_state_goes_on_bit_for_bit(goes_on: bool) -> None:
     one, other = made(Skew, from_targets=goes_on), made(Skew, from_targets=goes_on)
     action = torch.full((2, 6), 0.03)
-    for _ in range(3):
-        one.step(action)
-    other.load_state_dict(one.state_dict())
-    for task in (one, other):
-        for _ in range(3):
-            task.step(action)
-    assert torch.equal(one.observations, other.observations)
+    assert continues_alike(one, other, action)
     assert not wp.to_torch(one.sensors["tip"].arrays.wanted).any()
 
 

@@ -12,7 +12,7 @@ import torch
 
 from tests.support.worker.lift_reference import GAINS, HOME, TIPS, reference, stiffness, to_mujoco, touching_pairs
 from tests.support.worker.robots import need_mjlab
-from tests.support.worker.tasks import observe, play, put, same, statistics
+from tests.support.worker.tasks import observe, play, played_twice, plays_like_its_part, put, same, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.tasks import find_task
@@ -311,18 +311,12 @@ def test_fingertips_differ_from_world_to_world(lift: LiftCube) -> None:
 
 def test_it_goes_on_bit_for_bit_and_worlds_do_not_know_their_rank(lift: LiftCube) -> None:
     task = LiftCube(LiftCubeConfig(episode_seconds=0.3, command_seconds=(0.1, 0.15)), 3, seed=5)
-    play(task, 7, seed=1)
-    saved = task.state_dict()
-    first = play(task, 20, seed=2)
+    first, again = played_twice(task)
     assert torch.cat([step[2] for step in first]).any(), "an episode ended"
-    task.load_state_dict(saved)
-    assert same(first, play(task, 20, seed=2))
+    assert same(first, again)
 
     part = LiftCube(LiftCubeConfig(), 2, seed=1, first_world=2)
-    put(lift)
-    put(part)
-    for whole, alone in zip(play(lift, 8, seed=3), play(part, 8, seed=3), strict=True):
-        assert all(torch.equal(a[2:], b) for a, b in zip(whole, alone, strict=True))
+    assert plays_like_its_part(lift, part)
 
 
 def test_haste_costs_more_and_more(lift: LiftCube) -> None:

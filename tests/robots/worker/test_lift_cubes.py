@@ -13,7 +13,7 @@ import torch
 from tests.robots.worker.test_lift import site
 from tests.support.worker.lift_reference import HOME, reference, to_mujoco
 from tests.support.worker.robots import need_mjlab
-from tests.support.worker.tasks import observe, play, put, same, statistics
+from tests.support.worker.tasks import observe, play, played_twice, plays_like_its_part, put, same, statistics
 from worker.errors import UserError
 from worker.learning.job import configure
 from worker.simulation.objects import Box
@@ -134,18 +134,12 @@ def test_cubes_that_do_not_fit_beside_one_another_are_put_above_them() -> None:
 
 def test_it_goes_on_bit_for_bit_and_worlds_do_not_know_their_rank(lift: LiftCubes) -> None:
     task = LiftCubes(LiftCubesConfig(episode_seconds=0.3, command_seconds=(0.1, 0.15)), 3, seed=5)
-    play(task, 7, seed=1)
-    saved = task.state_dict()
-    first = play(task, 20, seed=2)
+    first, again = played_twice(task)
     assert torch.cat([step[2] for step in first]).any(), "an episode ended"
-    task.load_state_dict(saved)
-    assert same(first, play(task, 20, seed=2))
+    assert same(first, again)
 
     part = LiftCubes(LiftCubesConfig(), 2, seed=1, first_world=1)
-    put(lift)
-    put(part)
-    for whole, alone in zip(play(lift, 8, seed=3), play(part, 8, seed=3), strict=True):
-        assert all(torch.equal(a[1:], b) for a, b in zip(whole, alone, strict=True))
+    assert plays_like_its_part(lift, part)
 
 
 def test_random_ones_stay_finite_within_the_solvers_capacity() -> None:

@@ -39,5 +39,23 @@ def play(task: Task, steps: int, seed: int) -> list[tuple[torch.Tensor, ...]]:
     return history
 
 
+def played_twice(task: Task) -> tuple[list[tuple[torch.Tensor, ...]], list[tuple[torch.Tensor, ...]]]:
+    """What twenty steps give from a state in the middle, and what they give once that state is loaded again."""
+    play(task, 7, seed=1)
+    saved = task.state_dict()
+    first = play(task, 20, seed=2)
+    task.load_state_dict(saved)
+    return first, play(task, 20, seed=2)
+
+
+def plays_like_its_part(whole: Task, part: Task) -> bool:
+    """Whether the worlds from ``part.first_world`` on do the same in both tasks."""
+    put(whole)
+    put(part)
+    first = part.first_world
+    pairs = zip(play(whole, 8, seed=3), play(part, 8, seed=3), strict=True)
+    return all(torch.equal(a[first:], b) for steps in pairs for a, b in zip(*steps, strict=True))
+
+
 def same(left: list[tuple[torch.Tensor, ...]], right: list[tuple[torch.Tensor, ...]]) -> bool:
     return all(torch.equal(a, b) for x, y in zip(left, right, strict=True) for a, b in zip(x, y, strict=True))

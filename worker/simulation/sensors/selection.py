@@ -53,7 +53,7 @@ def chosen_one(objects: SelectionArrays, world: int) -> RobotArrays:
 
 @dataclass(frozen=True)
 class ObjectSelection:
-    """Objects of which one counts: ``terms.lift_one_command`` draws which, and ``terms.chosen_object_...`` are about that one.
+    """Objects of which a command chooses one: ``terms.lift_one_command`` draws it, and ``terms.chosen_object_...`` concern it.
 
     Attributes:
         objects: Pattern or patterns of names, as the task's ``objects`` gives them. Their roots are free.

@@ -1,4 +1,4 @@
-"""Several objects, of which one counts: a selection names them, a command chooses one for each world.
+"""One of several objects: a selection names them, a command chooses one for each world.
 
 The selection is a sensor, ``ObjectSelection("cube_*")``. The hand and the target are as for manipulation; the target is in the world frame.
 """
