@@ -90,5 +90,7 @@ def drive(
         motion.y += sixth * (
             first_speed * wp.sin(first) + 4.0 * middle_speed * wp.sin(middle) + last_speed * wp.sin(last)
         )
-        motion.heading, motion.speed, motion.steering = last, last_speed, last_steering
+        motion.heading = last
+        motion.speed = last_speed
+        motion.steering = last_steering
     return motion

@@ -11,9 +11,8 @@ import torch
 import warp as wp
 
 from worker.racer.car_arrays import CarArrays, begin_car, follow_car, move_car
-from worker.racer.obstacles import Obstacles
+from worker.racer.circuit import BOX, Circuit
 from worker.racer.road import road_arrays
-from worker.racer.track import Track
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.sensor import SensorContext, views_of
@@ -75,18 +74,14 @@ class Cars:
     """A car in every world; world number w, counted over all ranks, drives track w modulo their number.
 
     Attributes:
-        tracks: One or more.
-        corners: Where each track's own origin is in a world, (tracks, 2) [m].
-        obstacles: Of each track.
+        circuit: The tracks.
         choices: Steering [rad] and speed [m/s] of each choice; empty where actions are continuous.
         speed_lag: Time constant of the speed [s].
         steering_lag: Time constant of the steering [s].
         parts: Parts of a control step in which the motion is integrated.
     """
 
-    tracks: Sequence[Track]
-    corners: np.ndarray
-    obstacles: Obstacles
+    circuit: Circuit
     choices: Sequence[tuple[float, float]] = ()
     speed_lag: float = 0.0
     steering_lag: float = 0.0
@@ -118,9 +113,12 @@ class Driving:
         self._episodes = context.episodes
         device = context.device
         arrays = self.arrays = CarArrays()
-        arrays.road = road_arrays(declared.tracks, declared.corners, device)
+        circuit = declared.circuit
+        arrays.road = road_arrays(circuit.tracks, circuit.corners, device)
         arrays.choices = wp.array(np.array(declared.choices, np.float32).reshape(-1, 2), dtype=wp.vec2, device=device)
-        declared.obstacles.fill(arrays, device)
+        arrays.obstacle_half = wp.vec2(BOX[0] / 2, BOX[1] / 2)
+        arrays.obstacle_poses = wp.array(circuit.obstacle_poses.astype(np.float32), dtype=wp.vec3, device=device)
+        arrays.obstacle_along = wp.array(circuit.obstacle_along.astype(np.float32), dtype=wp.float32, device=device)
         kinds = {name: kind for kind, names in SHAPED.items() for name in names}
         kinds |= dict.fromkeys(COUNTED, wp.int32) | dict.fromkeys(MEASURED, wp.float32)
         for name, kind in kinds.items():

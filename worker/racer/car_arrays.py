@@ -142,15 +142,19 @@ def move_car(
     pose, factors = car.poses[world], car.factors[world]
     rear = ahead_of(pose, -0.5 * WHEELBASE, 0.0)
     motion = Motion()
-    motion.x, motion.y, motion.heading = rear[0], rear[1], pose[2]
-    motion.speed, motion.steering = car.speeds[world], car.steerings[world]
+    motion.x = rear[0]
+    motion.y = rear[1]
+    motion.heading = pose[2]
+    motion.speed = car.speeds[world]
+    motion.steering = car.steerings[world]
     motion = drive(
         motion, factors[0] * speed, factors[1] * steering + factors[2], speed_lag, steering_lag, seconds, parts
     )
     turned = motion.heading - pose[2]
     middle = ahead_of(wp.vec3(motion.x, motion.y, motion.heading), 0.5 * WHEELBASE, 0.0)
     car.poses[world] = wp.vec3(middle[0], middle[1], wrapped_angle(motion.heading))
-    car.speeds[world], car.steerings[world] = motion.speed, motion.steering
+    car.speeds[world] = motion.speed
+    car.steerings[world] = motion.steering
     put_car(world, worlds, robot, car)
     worlds.joint_qd[world, robot.dofs[X]] = (middle[0] - pose[0]) / seconds
     worlds.joint_qd[world, robot.dofs[Y]] = (middle[1] - pose[1]) / seconds
@@ -203,9 +207,14 @@ def look_round(world: int, car: CarArrays, begin: int, many: int):
     front = ahead_of(pose, FRONT, 0.0)
     place = project(road, track, front, car.backwards[world], begin, many)
     car.fronts[world] = front
-    car.rows[world], car.before[world], car.after[world] = place.row, place.before, place.after
-    car.distances[world], car.left[world] = place.distance, place.left
-    car.along[world], car.headings[world], car.widths[world] = place.along, place.heading, place.width
+    car.rows[world] = place.row
+    car.before[world] = place.before
+    car.after[world] = place.after
+    car.distances[world] = place.distance
+    car.left[world] = place.left
+    car.along[world] = place.along
+    car.headings[world] = place.heading
+    car.widths[world] = place.width
     wheels = int(4)  # noqa: RUF046 (a variable for Warp, not a constant)
     # no wheel is farther from the front than the rear ones
     if place.distance + wp.length(wp.vec2(FRONT + 0.5 * WHEELBASE, 0.5 * GAUGE)) >= road.clear[track]:
@@ -220,7 +229,8 @@ def look_at_obstacles(world: int, car: CarArrays):
     track = car.tracks[world]
     length = car.road.length[track]
     least, greatest = float(wp.inf), float(-1.0)
-    car.next_obstacle[world], car.last_obstacle[world] = -1, -1
+    car.next_obstacle[world] = -1
+    car.last_obstacle[world] = -1
     hit = bool(False)
     for number in range(car.obstacle_poses.shape[1]):
         if overlap(
@@ -261,7 +271,8 @@ def follow_car(world: int, car: CarArrays):
         standing = 0
     if moved >= 0.0:
         falling = 0
-    car.standing[world], car.falling[world] = standing, falling
+    car.standing[world] = standing
+    car.falling[world] = falling
 
 
 @wp.func
@@ -269,8 +280,11 @@ def begin_car(world: int, car: CarArrays):
     """Where a car was put down: look everywhere, and forget what was before."""
     look_round(world, car, 0, car.road.count[car.tracks[world]])
     car.commands[world] = wp.vec2(0.0, 0.0)
-    car.travelled[world], car.moved[world] = 0.0, 0.0
-    car.steps[world], car.standing[world], car.falling[world] = 0, 0, 0
+    car.travelled[world] = 0.0
+    car.moved[world] = 0.0
+    car.steps[world] = 0
+    car.standing[world] = 0
+    car.falling[world] = 0
 
 
 @wp.func

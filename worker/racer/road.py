@@ -144,10 +144,14 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
     place.distance = wp.length(point - place.point)
     forth = road.along[first + row] + share * road.steps[first + row]
     side = cross(segment, point - start)
-    place.before, place.after, place.along = row, following, forth
+    place.before = row
+    place.after = following
+    place.along = forth
     ahead = segment
     if backwards:
-        place.before, place.after, place.along = following, row, road.length[track] - forth
+        place.before = following
+        place.after = row
+        place.along = road.length[track] - forth
         side, ahead = -side, -segment
     if place.along >= road.length[track]:
         place.along = 0.0
@@ -183,7 +187,7 @@ def on_road(road: RoadArrays, track: int, point: wp.vec2) -> bool:
 def row_at(road: RoadArrays, track: int, forth: float) -> int:
     """The segment that has the point ``forth`` [m] from the start line, in the order of the waypoints; 0 <= forth < length."""
     first = road.first[track]
-    low, high = int(0), road.count[track]  # noqa: RUF046 (a variable for Warp, not a constant)
+    low, high = int(0), int(road.count[track])  # noqa: RUF046 (variables for Warp)
     while high - low > 1:
         middle = (low + high) / 2
         if road.along[first + middle] <= forth:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 import newton
 import numpy as np
 import warp as wp
 
 from worker.racer.arithmetic import Floats, norm
+from worker.racer.circuit import BOX, Circuit, bounds
 from worker.racer.geometry import place_at
-from worker.racer.obstacles import SIZE, Obstacles
 from worker.racer.track import Track
 
-GAP = 40.0
-"""Between tracks that lie side by side [m]: a camera as low as the car's sees nothing of the next one."""
 GRASS, ASPHALT, BORDER, DASHES = (0.16, 0.38, 0.14), (0.22, 0.23, 0.25), (0.95, 0.95, 0.95), (0.95, 0.75, 0.1)
-BOX = (0.75, 0.2, 0.12)
+CARDBOARD = (0.75, 0.2, 0.12)
 """Red, green and blue."""
 BORDER_WIDTH = 0.05
 DASH = (0.04, 0.3, 0.3)
@@ -55,23 +50,11 @@ CAR = """<mujoco model="racer"><worldbody><body name="car">
 """The car as MJCF. Nothing in it touches anything: a rule of its own moves it, :mod:`worker.racer.bicycle`."""
 
 
-def side_by_side(tracks: Sequence[Track]) -> Floats:
-    """Where each track's own origin is in a world, (tracks, 2) [m]: in rows and columns, :data:`GAP` apart; that of one track alone is 0."""
-    corners = np.zeros((len(tracks), 2))
-    if len(tracks) == 1:
-        return corners
-    low, high = zip(*(_bounds(track) for track in tracks), strict=True)
-    cell = (np.array(high) - np.array(low)).max(axis=0) + GAP
-    columns = math.ceil(math.sqrt(len(tracks)))
-    for number in range(len(tracks)):
-        corners[number] = cell * (number % columns, number // columns) - low[number]
-    return corners
-
-
-def add_scenery(builder: newton.ModelBuilder, tracks: Sequence[Track], corners: Floats, obstacles: Obstacles) -> None:
+def add_scenery(builder: newton.ModelBuilder, circuit: Circuit) -> None:
     """Add the ground of all tracks to a builder that holds one world, as shapes that are only seen."""
-    low = np.min([_bounds(track)[0] + corner for track, corner in zip(tracks, corners, strict=True)], axis=0) - FIELD
-    high = np.max([_bounds(track)[1] + corner for track, corner in zip(tracks, corners, strict=True)], axis=0) + FIELD
+    tracks, corners = circuit.tracks, circuit.corners
+    low = np.min([bounds(track)[0] + corner for track, corner in zip(tracks, corners, strict=True)], axis=0) - FIELD
+    high = np.max([bounds(track)[1] + corner for track, corner in zip(tracks, corners, strict=True)], axis=0) + FIELD
     field = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     _add(builder, "grass", field, np.array([[0, 1, 2], [0, 2, 3]]), _BELOW, GRASS)
     for number, (track, corner) in enumerate(zip(tracks, corners, strict=True)):
@@ -81,21 +64,17 @@ def add_scenery(builder: newton.ModelBuilder, tracks: Sequence[Track], corners: 
         for side, (inner, outer) in zip(("inner", "outer"), edges, strict=True):
             _add(builder, f"{side}_border_{number}", *_strip(inner + corner, outer + corner), _ABOVE[0], BORDER)
         _add(builder, f"dashes_{number}", *_dashes(track, corner), _ABOVE[1], DASHES)
-        for box, (x, y, heading) in enumerate(obstacles.poses[number]):
+        for box, (x, y, heading) in enumerate(circuit.obstacle_poses[number]):
             place = wp.transform(
-                wp.vec3(x + corner[0], y + corner[1], SIZE[2] / 2), wp.quat_from_axis_angle(wp.vec3(0, 0, 1), heading)
+                wp.vec3(x + corner[0], y + corner[1], BOX[2] / 2),
+                wp.quat_from_axis_angle(wp.vec3(0, 0, 1), float(heading)),
             )
-            half = {"hx": SIZE[0] / 2, "hy": SIZE[1] / 2, "hz": SIZE[2] / 2}
-            builder.add_shape_box(-1, xform=place, **half, cfg=_seen(), color=BOX, label=f"box_{number}_{box}")
+            half = {"hx": BOX[0] / 2, "hy": BOX[1] / 2, "hz": BOX[2] / 2}
+            builder.add_shape_box(-1, xform=place, **half, cfg=_seen(), color=CARDBOARD, label=f"box_{number}_{box}")
 
 
 def _seen() -> newton.ModelBuilder.ShapeConfig:
     return newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
-
-
-def _bounds(track: Track) -> tuple[Floats, Floats]:
-    rings = np.concatenate((track.inner, track.outer))
-    return rings.min(axis=0), rings.max(axis=0)
 
 
 def _towards(start: Floats, end: Floats) -> Floats:

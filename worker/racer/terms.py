@@ -179,9 +179,11 @@ def place_car(
     place = place_at(car.road, track, share * car.road.length[track], backwards)
     point = ahead_of(place, 0.0, wp.randf(stream, sideways[0], sideways[1]))
     heading = wrapped_angle(place[2] + wp.randf(stream, turned[0], turned[1]))
-    car.tracks[world], car.backwards[world] = track, backwards
+    car.tracks[world] = track
+    car.backwards[world] = backwards
     car.poses[world] = wp.vec3(point[0], point[1], heading)
-    car.speeds[world], car.steerings[world] = 0.0, 0.0
+    car.speeds[world] = 0.0
+    car.steerings[world] = 0.0
     car.factors[world] = wp.vec3(
         wp.randf(stream, speed_factor[0], speed_factor[1]),
         wp.randf(stream, steering_factor[0], steering_factor[1]),

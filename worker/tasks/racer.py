@@ -14,9 +14,9 @@ from worker.racer import terms as racing
 from worker.racer.actions import ActionSpace
 from worker.racer.car import Cars
 from worker.racer.checks import BadTrack
+from worker.racer.circuit import circuit_of
 from worker.racer.naming import resolve
-from worker.racer.obstacles import place_obstacles
-from worker.racer.scenery import CAR, add_scenery, side_by_side
+from worker.racer.scenery import CAR, add_scenery
 from worker.racer.track import Track
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.camera import CameraSensor
@@ -55,16 +55,14 @@ class Racer(DeclaredTask):
         """
         config: Any = self.config
         try:
-            self.tracks = tracks_of(config)
+            self.circuit = circuit_of(tracks_of(config), config.obstacles)
             self.actions_of_car = config.actions()
-            self.corners = side_by_side(self.tracks)
-            self.obstacles = place_obstacles(self.tracks, config.obstacles)
         except BadTrack as error:
             raise ValueError(f"config.track: {error}") from error
         except Refused as error:
             raise ValueError(f"config.{error}") from error
         super().build(builder)
-        add_scenery(builder, self.tracks, self.corners, self.obstacles)
+        add_scenery(builder, self.circuit)
 
     def move(self) -> None:
         """Drive every car for one control step: the bicycle's rule, and no physics."""
@@ -120,9 +118,7 @@ class Racer(DeclaredTask):
     def sensors_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """The cars, which are driven and followed like a sensor's measurements."""
         cars = Cars(
-            self.tracks,
-            self.corners,
-            self.obstacles,
+            self.circuit,
             self.actions_of_car.radians,
             config.speed_lag,
             config.steering_lag,
