@@ -81,7 +81,8 @@ def drive(
         first_turning = first_speed * wp.tan(motion.steering) / WHEELBASE
         middle_turning = middle_speed * wp.tan(middle_steering) / WHEELBASE
         last_turning = last_speed * wp.tan(last_steering) / WHEELBASE
-        first, sixth = motion.heading, part / 6.0
+        first = motion.heading
+        sixth = part / 6.0
         middle = first + part / 24.0 * (5.0 * first_turning + 8.0 * middle_turning - last_turning)
         last = first + sixth * (first_turning + 4.0 * middle_turning + last_turning)
         motion.x += sixth * (

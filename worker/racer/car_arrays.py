@@ -101,7 +101,8 @@ class CarArrays:
 @wp.func
 def ahead_of(pose: wp.vec3, forward: float, sideward: float) -> wp.vec2:
     """The point ``forward`` [m] before and ``sideward`` [m] to the left of a pose."""
-    cosine, sine = wp.cos(pose[2]), wp.sin(pose[2])
+    cosine = wp.cos(pose[2])
+    sine = wp.sin(pose[2])
     return wp.vec2(pose[0] + forward * cosine - sideward * sine, pose[1] + forward * sine + sideward * cosine)
 
 
@@ -109,14 +110,16 @@ def ahead_of(pose: wp.vec3, forward: float, sideward: float) -> wp.vec2:
 def from_car(pose: wp.vec3, point: wp.vec2) -> wp.vec2:
     """A point as the car sees it from its front: how far ahead and how far to the left [m]."""
     away = point - ahead_of(pose, FRONT, 0.0)
-    cosine, sine = wp.cos(pose[2]), wp.sin(pose[2])
+    cosine = wp.cos(pose[2])
+    sine = wp.sin(pose[2])
     return wp.vec2(away[0] * cosine + away[1] * sine, away[1] * cosine - away[0] * sine)
 
 
 @wp.func
 def put_car(world: int, worlds: WorldArrays, robot: RobotArrays, car: CarArrays):
     """Bring the joints of a world to where its car is."""
-    pose, corner = car.poses[world], car.road.corner[car.tracks[world]]
+    pose = car.poses[world]
+    corner = car.road.corner[car.tracks[world]]
     worlds.joint_q[world, robot.coordinates[X]] = corner[0] + pose[0]
     worlds.joint_q[world, robot.coordinates[Y]] = corner[1] + pose[1]
     worlds.joint_q[world, robot.coordinates[HEADING]] = pose[2]
@@ -139,7 +142,8 @@ def move_car(
     steering = worlds.controls[world, robot.actuators[STEERING]]
     speed = worlds.controls[world, robot.actuators[WHEELS]]
     car.commands[world] = wp.vec2(steering, speed)
-    pose, factors = car.poses[world], car.factors[world]
+    pose = car.poses[world]
+    factors = car.factors[world]
     rear = ahead_of(pose, -0.5 * WHEELBASE, 0.0)
     motion = Motion()
     motion.x = rear[0]
@@ -159,7 +163,8 @@ def move_car(
     worlds.joint_qd[world, robot.dofs[X]] = (middle[0] - pose[0]) / seconds
     worlds.joint_qd[world, robot.dofs[Y]] = (middle[1] - pose[1]) / seconds
     worlds.joint_qd[world, robot.dofs[HEADING]] = turned / seconds
-    rolling, wheels = motion.speed / WHEEL_RADIUS, robot.coordinates[WHEELS]
+    rolling = motion.speed / WHEEL_RADIUS
+    wheels = robot.coordinates[WHEELS]
     worlds.joint_qd[world, robot.dofs[WHEELS]] = rolling
     worlds.joint_q[world, wheels] = wrapped_angle(worlds.joint_q[world, wheels] + seconds * rolling)
 
@@ -203,7 +208,9 @@ def overlap(first: wp.vec3, first_half: wp.vec2, second: wp.vec3, second_half: w
 @wp.func
 def look_round(world: int, car: CarArrays, begin: int, many: int):
     """Find where the car is on its track; the nearest segment is one of ``many`` from row ``begin`` on."""
-    track, pose, road = car.tracks[world], car.poses[world], car.road
+    track = car.tracks[world]
+    pose = car.poses[world]
+    road = car.road
     front = ahead_of(pose, FRONT, 0.0)
     place = project(road, track, front, car.backwards[world], begin, many)
     car.fronts[world] = front
@@ -260,13 +267,16 @@ def gap_to(world: int, car: CarArrays, number: int, length: float) -> float:
 def follow_car(world: int, car: CarArrays):
     """After a control step: where the car is now, and how it has come on."""
     track = car.tracks[world]
-    front, along, window = car.fronts[world], car.along[world], car.road.window[track]
+    front = car.fronts[world]
+    along = car.along[world]
+    window = car.road.window[track]
     look_round(world, car, car.rows[world] - window, 2 * window + 1)
     moved = advance(car.road, track, along, car.along[world])
     car.moved[world] = moved
     car.travelled[world] = car.travelled[world] + moved
     car.steps[world] = car.steps[world] + 1
-    standing, falling = car.standing[world] + 1, car.falling[world] + 1
+    standing = car.standing[world] + 1
+    falling = car.falling[world] + 1
     if wp.length(car.fronts[world] - front) >= LEAST_MOVE:
         standing = 0
     if moved >= 0.0:

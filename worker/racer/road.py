@@ -105,7 +105,8 @@ def nearest(road: RoadArrays, track: int, point: wp.vec2, begin: int, many: int)
         begin: A row, of any size: rows go round.
         many: At most as many as the track has are looked at.
     """
-    count, first = road.count[track], road.first[track]
+    count = road.count[track]
+    first = road.first[track]
     best, best_row, best_share = float(wp.inf), int(0), float(0.0)  # noqa: RUF046 (variables for Warp, not constants)
     for number in range(wp.min(many, count)):
         row = (begin + number) % count
@@ -118,7 +119,9 @@ def nearest(road: RoadArrays, track: int, point: wp.vec2, begin: int, many: int)
         away = point - start - share * segment
         squared = wp.dot(away, away)
         if squared < best:
-            best, best_row, best_share = squared, row, share
+            best = squared
+            best_row = row
+            best_share = share
     return best_row, best_share
 
 
@@ -128,13 +131,16 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
 
     ``backwards`` says whether it drives against the order of the waypoints.
     """
-    count, first = road.count[track], road.first[track]
+    count = road.count[track]
+    first = road.first[track]
     row, share = nearest(road, track, point, begin, many)
     # a segment has the waypoint at which its driver enters it, and not the one at which it leaves
     if not backwards and share >= 1.0:
-        row, share = next_row(road, track, row), float(0.0)
+        row = next_row(road, track, row)
+        share = float(0.0)
     elif backwards and share <= 0.0:
-        row, share = (row + count - 1) % count, float(1.0)
+        row = (row + count - 1) % count
+        share = float(1.0)
     following = next_row(road, track, row)
     start = road.center[first + row]
     segment = road.center[first + following] - start
@@ -152,7 +158,8 @@ def project(road: RoadArrays, track: int, point: wp.vec2, backwards: bool, begin
         place.before = following
         place.after = row
         place.along = road.length[track] - forth
-        side, ahead = -side, -segment
+        side = -side
+        ahead = -segment
     if place.along >= road.length[track]:
         place.along = 0.0
     place.left = side > 0.0
@@ -187,7 +194,8 @@ def on_road(road: RoadArrays, track: int, point: wp.vec2) -> bool:
 def row_at(road: RoadArrays, track: int, forth: float) -> int:
     """The segment that has the point ``forth`` [m] from the start line, in the order of the waypoints; 0 <= forth < length."""
     first = road.first[track]
-    low, high = int(0), int(road.count[track])  # noqa: RUF046 (variables for Warp)
+    low = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
+    high = int(road.count[track])
     while high - low > 1:
         middle = (low + high) / 2
         if road.along[first + middle] <= forth:
@@ -209,17 +217,20 @@ def around(value: float, length: float) -> float:
 @wp.func
 def place_at(road: RoadArrays, track: int, along: float, backwards: bool) -> wp.vec3:
     """The point of the centre line ``along`` [m] from the start line in driving direction, x and y [m], and its heading there [rad]."""
-    first, length = road.first[track], road.length[track]
+    first = road.first[track]
+    length = road.length[track]
     forth = around(along, length)
     if backwards:
         forth = around(length - forth, length)
     row = row_at(road, track, forth)
     share = (forth - road.along[first + row]) / road.steps[first + row]
     if backwards and share <= 0.0:
-        row, share = (row + road.count[track] - 1) % road.count[track], float(1.0)
+        row = (row + road.count[track] - 1) % road.count[track]
+        share = float(1.0)
     start = road.center[first + row]
     segment = road.center[first + next_row(road, track, row)] - start
-    point, ahead = start + share * segment, segment
+    point = start + share * segment
+    ahead = segment
     if backwards:
         ahead = -segment
     return wp.vec3(point[0], point[1], wp.atan2(ahead[1], ahead[0]))

@@ -21,7 +21,7 @@ FIELD = 30.0
 """How far the grass goes on behind the tracks [m]."""
 _BELOW, _ABOVE = -0.01, (0.002, 0.003)
 
-CAR = """<mujoco model="racer"><worldbody><body name="car">
+CAR = """<mujoco model="racer"><compiler angle="radian"/><worldbody><body name="car">
   <inertial pos="0 0 0.05" mass="6.36" diaginertia="0.03 0.06 0.08"/>
   <joint name="x" type="slide" axis="1 0 0"/>
   <joint name="y" type="slide" axis="0 1 0"/>
@@ -32,18 +32,18 @@ CAR = """<mujoco model="racer"><worldbody><body name="car">
   <body name="front_left" pos="0.082 0.08 0.035">
     <inertial pos="0 0 0" mass="0.34" diaginertia="0.0002 0.0004 0.0002"/>
     <joint name="steering" type="hinge" axis="0 0 1" range="-0.6 0.6"/>
-    <geom name="front_left" type="cylinder" size="0.035 0.0125" euler="90 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
+    <geom name="front_left" type="cylinder" size="0.035 0.0125" euler="1.5708 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
   </body>
   <body name="front_right" pos="0.082 -0.08 0.035">
     <inertial pos="0 0 0" mass="0.34" diaginertia="0.0002 0.0004 0.0002"/>
     <joint name="steering_right" type="hinge" axis="0 0 1" range="-0.6 0.6"/>
-    <geom name="front_right" type="cylinder" size="0.035 0.0125" euler="90 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
+    <geom name="front_right" type="cylinder" size="0.035 0.0125" euler="1.5708 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
   </body>
   <body name="rear_axle" pos="-0.082 0 0.035">
     <inertial pos="0 0 0" mass="0.68" diaginertia="0.0004 0.0008 0.0004"/>
     <joint name="speed" type="hinge" axis="0 1 0"/>
-    <geom name="rear_left" type="cylinder" size="0.035 0.0125" pos="0 0.08 0" euler="90 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
-    <geom name="rear_right" type="cylinder" size="0.035 0.0125" pos="0 -0.08 0" euler="90 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
+    <geom name="rear_left" type="cylinder" size="0.035 0.0125" pos="0 0.08 0" euler="1.5708 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
+    <geom name="rear_right" type="cylinder" size="0.035 0.0125" pos="0 -0.08 0" euler="1.5708 0 0" rgba="0.05 0.05 0.05 1" contype="0" conaffinity="0"/>
   </body>
 </body></worldbody>
 <actuator><position joint="steering" kp="1"/><velocity joint="speed" kv="1"/></actuator></mujoco>"""

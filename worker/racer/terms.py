@@ -73,7 +73,8 @@ def road_width(world: int, car: CarArrays) -> float:
 @wp.func
 def obstacle_ahead(world: int, car: CarArrays) -> wp.vec2:
     """The next obstacle as the car's front sees it: ahead, left [m]; (4, 0) where none is within 4 m along the centre line."""
-    number, track = car.next_obstacle[world], car.tracks[world]
+    number = car.next_obstacle[world]
+    track = car.tracks[world]
     seen = wp.vec2(UNSEEN, 0.0)
     if number >= 0 and gap_to(world, car, number, car.road.length[track]) < UNSEEN:
         pose = car.obstacle_poses[track, number]
@@ -120,7 +121,8 @@ def reversed_course(world: int, car: CarArrays, steps: int) -> bool:
 @wp.func
 def final_progress(world: int, car: CarArrays) -> float:
     """Progress [%], such that its mean over the steps of an episode is that at the episode's end."""
-    steps, length = float(car.steps[world]), car.road.length[car.tracks[world]]
+    steps = float(car.steps[world])
+    length = car.road.length[car.tracks[world]]
     before = 100.0 * wp.clamp((car.travelled[world] - car.moved[world]) / length, 0.0, 1.0)
     return steps * progress_of(world, car) - (steps - 1.0) * before
 
@@ -164,7 +166,8 @@ def place_car(
         steering_factor: Least and greatest factor on the steering that is asked.
         steering_offset: Least and greatest angle that is added to it [rad].
     """
-    episode, tracks = int(episodes.lasting[world, lasting]), car.road.first.shape[0]
+    episode = int(episodes.lasting[world, lasting])
+    tracks = car.road.first.shape[0]
     # counted up to a million, as float32 can; the starts go on from there as from 0
     episodes.lasting[world, lasting] = float((episode + 1) % 1000000)
     number = episodes.random[world, 1]
