@@ -26,9 +26,9 @@ CAR = """<mujoco model="racer"><compiler angle="radian"/><worldbody><body name="
   <joint name="x" type="slide" axis="1 0 0"/>
   <joint name="y" type="slide" axis="0 1 0"/>
   <joint name="heading" type="hinge" axis="0 0 1"/>
-  <geom name="chassis" type="box" size="0.13 0.07 0.02" pos="0.01 0 0.05" rgba="0.12 0.12 0.14 1" contype="0" conaffinity="0"/>
-  <geom name="cabin" type="box" size="0.07 0.055 0.025" pos="-0.02 0 0.095" rgba="0.1 0.35 0.75 1" contype="0" conaffinity="0"/>
-  <geom name="mast" type="box" size="0.008 0.008 0.02" pos="0.02 0 0.135" rgba="0.3 0.3 0.3 1" contype="0" conaffinity="0"/>
+  <geom name="chassis" type="box" size="0.13 0.07 0.015" pos="0.01 0 0.045" rgba="0.12 0.12 0.14 1" contype="0" conaffinity="0"/>
+  <geom name="cabin" type="box" size="0.07 0.055 0.03" pos="-0.03 0 0.09" rgba="0.1 0.35 0.75 1" contype="0" conaffinity="0"/>
+  <geom name="mast" type="box" size="0.008 0.02 0.015" pos="0.035 0 0.135" rgba="0.3 0.3 0.3 1" contype="0" conaffinity="0"/>
   <body name="front_left" pos="0.082 0.08 0.035">
     <inertial pos="0 0 0" mass="0.34" diaginertia="0.0002 0.0004 0.0002"/>
     <joint name="steering" type="hinge" axis="0 0 1" range="-0.6 0.6"/>

@@ -56,7 +56,7 @@ class FrontCameraConfig:
     """Rays of each pixel."""
     fov: Annotated[float, Field(gt=0, lt=math.pi)] = 0.887
     """Vertical field of view [rad]: with 4:3 the horizontal one is 1.13."""
-    position: Annotated[tuple[Finite, Finite, Finite], Field(strict=False), expecting("[x, y, z]")] = (0.02, 0.0, 0.16)
+    position: Annotated[tuple[Finite, Finite, Finite], Field(strict=False), expecting("[x, y, z]")] = (0.05, 0.0, 0.14)
     """On the car: ahead of its middle, to the left, above the road [m]."""
     pitch: Annotated[float, Field(gt=-1.5, lt=1.5)] = 0.262
     """How far it looks down [rad]; 0.262 are 15 degrees."""

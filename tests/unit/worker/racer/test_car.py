@@ -181,7 +181,8 @@ def test_the_car_moves_as_a_bicycle_that_is_integrated_by_hand() -> None:
     asked = np.array([[4.0, 0.5236], [1.0, -0.3], [0.5, 0.1], [2.0, -0.5236]])
     starts = np.array([[0, 0, 0, 0, 0], [1, 2, -1, 3, 0.4], [0.3, -1, 2, 0.1, 0], [0, 0, 3, 4, 0.5]], float)
     lags = (0.2, 0.05)
-    motions = wp.array([tuple(row) for row in starts], dtype=Motion)
+    rows = np.array([tuple(row) for row in starts], dtype=Motion.numpy_dtype())
+    motions = wp.array(rows, dtype=Motion)
     ends = wp.zeros(4, dtype=Motion)
     wp.launch(_drive, dim=4, inputs=[motions, wp.array(asked, dtype=wp.vec2), wp.vec2(*lags)], outputs=[ends])
     for start, (speed, steering), end in zip(starts, asked, ends.numpy(), strict=True):
