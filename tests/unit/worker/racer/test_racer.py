@@ -14,7 +14,7 @@ from worker.learning.job import configure
 from worker.racer.geometry import on_road, place_at, project
 from worker.racer.presets import make_preset
 from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.policy_contract import contract_of
+from worker.tasks.policy_contract import policy_contract
 from worker.tasks.racer import Racer, RacerPixels, RacerPixelsAndState
 
 OVAL = make_preset("oval")
@@ -27,7 +27,7 @@ def racer(worlds: int = 1, **fields: Any) -> Racer:
 
 
 def known(task: Racer, name: str) -> np.ndarray:
-    found: np.ndarray = getattr(task.sensors["car"].arrays, name).numpy()
+    found: np.ndarray = getattr(task.sensors["car"].arrays, name).numpy().copy()
     return found
 
 
@@ -56,7 +56,7 @@ def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
     assert task.dones.all() and not task.time_outs.any()
     assert counted(task, "termination_lap_complete") == 2
     assert rewards.numpy() == pytest.approx(100.0, abs=1.0)  # percent, and the rest of the last step
-    assert OVAL.length / 1.25 < steps / 15 < 1.1 * OVAL.length / 1.25  # 1.25 m/s, and the way to that
+    assert 0.9 * OVAL.length < 1.25 * steps / 15 < OVAL.length  # 1.25 m/s, with curves cut
     length = counted(task, "episode_length")
     assert counted(task, "metric_progress") / length == pytest.approx(100.0, rel=1e-4)
     task.clear_statistics()
@@ -137,18 +137,18 @@ def test_the_clock_ends_an_episode_last() -> None:
 
 
 def test_a_car_that_touches_an_obstacle_has_crashed() -> None:
-    task = racer(track="oval", obstacles=(ObstacleConfig(2.0, "center"),))
+    task = racer(track="oval", obstacles=(ObstacleConfig(1.5, "center"),))
     column = task.observation_names.index("obstacle_ahead")
-    assert task.observations[0, column : column + 2].numpy() == pytest.approx([2.0 - 0.14, 0.0], abs=1e-4)
+    assert task.observations[0, column : column + 2].numpy() == pytest.approx([1.5 - 0.14, 0.0], abs=1e-4)
     while not task.dones.any():
         along = known(task, "along")[0]
-        assert along < 1.8 and not known(task, "crashed")[0]  # the front of the box
+        assert along < 1.3 and not known(task, "crashed")[0]  # the front of the box
         task.step(straight(task))
-    assert counted(task, "termination_crashed") == 1 and along > 1.8 - 1.25 / 15
-    beside = racer(track="oval", obstacles=(ObstacleConfig(2.0, "inner"),))
-    for _ in range(45):
+    assert counted(task, "termination_crashed") == 1 and along > 1.3 - 1.25 / 15
+    beside = racer(track="oval", obstacles=(ObstacleConfig(1.5, "inner"),))
+    for _ in range(35):
         beside.step(straight(beside))
-    assert known(beside, "along")[0] > 2.5 and counted(beside, "episodes") == 0
+    assert known(beside, "along")[0] > 1.8 and counted(beside, "episodes") == 0
     assert known(beside, "next_obstacle")[0] == known(beside, "last_obstacle")[0] == 0
     assert beside.observations[0, column].item() == 4.0  # it lies behind
 
@@ -170,6 +170,8 @@ def test_starts_go_round_the_track_and_turn_round() -> None:
 def test_controls_arrive_as_late_as_the_latency_says() -> None:
     task = racer(64, track="oval", randomize={"action_latency": 3})
     arrived = np.full(64, -1)
+    task.step(-torch.ones(64, 2))
+    assert (known(task, "commands")[:, 1] == 0.5).all()  # there are none before the first ones
     for step in range(5):
         task.step(torch.ones(64, 2))
         arrived[(arrived < 0) & (known(task, "commands")[:, 1] == 2.0)] = step
@@ -191,7 +193,7 @@ def test_choices_are_those_of_the_metadata() -> None:
     task.step(torch.arange(5.0)[:, None])
     asked = [(math.radians(each["steering_angle"]), each["speed"]) for each in FIVE]
     np.testing.assert_allclose(known(task, "commands"), asked, atol=1e-6)
-    assert contract_of(task).discrete
+    assert policy_contract(task, "Racer").discrete
 
 
 def test_continuous_actions_reach_from_end_to_end() -> None:
@@ -200,7 +202,7 @@ def test_continuous_actions_reach_from_end_to_end() -> None:
     task.step(torch.tensor([[-1.0, -1.0], [1.0, 1.0], [9.0, 0.0]]))
     expected = [[math.radians(-20), 1.0], [math.radians(30), 3.0], [math.radians(30), 2.0]]
     np.testing.assert_allclose(known(task, "commands"), expected, atol=1e-6)
-    steering, speed = contract_of(task).actions
+    steering, speed = policy_contract(task, "Racer").actions
     assert (steering.name, steering.unit, speed.name, speed.unit) == ("steering", "rad", "speed", "m/s")
     assert (speed.scale, speed.offset) == (1.0, 2.0)
 
@@ -308,7 +310,7 @@ def test_a_camera_sees_grass_asphalt_border_and_boxes_and_every_world_its_own() 
     }
     shares = {name: where.float().mean().item() for name, where in seen.items()}
     assert min(shares.values()) > 0.002, shares
-    assert shares["asphalt"] > 0.2 and seen["grass"][:12].sum() == 0  # sky above
+    assert shares["asphalt"] > 0.2 and seen["grass"][:9].sum() == 0  # sky above
     assert (images[0] != images[3]).any()  # 5 % of the track farther each
 
     different = {"light": (0.5, 1.0), "colors": 0.2, "camera_angle": 0.05}
