@@ -11,7 +11,7 @@ from worker.racer.circuit import BOX, Circuit, bounds
 from worker.racer.geometry import place_at
 from worker.racer.track import Track
 
-GRASS, ASPHALT, BORDER, DASHES = (0.16, 0.38, 0.14), (0.22, 0.23, 0.25), (0.95, 0.95, 0.95), (0.95, 0.75, 0.1)
+GRASS, ASPHALT, BORDER, DASHES = (0.26, 0.55, 0.2), (0.22, 0.23, 0.25), (0.95, 0.95, 0.95), (0.95, 0.75, 0.1)
 CARDBOARD = (0.75, 0.2, 0.12)
 """Red, green and blue."""
 BORDER_WIDTH = 0.05

@@ -128,11 +128,13 @@ def final_progress(world: int, car: CarArrays) -> float:
 
 
 @wp.func
-def lap_time(world: int, episodes: EpisodeArrays, car: CarArrays, lasting: int, seconds: float) -> float:
-    """How long the world's last complete lap took [s]; 0 before the first one."""
+def lap_time(world: int, car: CarArrays, seconds: float) -> float:
+    """How long a lap took [s], such that its mean over the steps of an episode is that; 0 of an episode without a complete lap."""
+    time = float(0.0)
     if progress_of(world, car) >= 100.0:
-        episodes.lasting[world, lasting] = float(car.steps[world]) * seconds
-    return episodes.lasting[world, lasting]
+        steps = float(car.steps[world])
+        time = steps * steps * seconds
+    return time
 
 
 @wp.func

@@ -95,7 +95,7 @@ class Racer(DeclaredTask):
                     steering_offset=config.steering_offset,
                 )
             },
-            metrics={"progress": Metric(racing.final_progress), "lap_time": Metric(racing.lap_time, lasting=1)},
+            metrics={"progress": Metric(racing.final_progress), "lap_time": Metric(racing.lap_time)},
             success="lap_complete",
             sensors=self.sensors_of(config),
         )
