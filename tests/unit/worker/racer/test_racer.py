@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from shared_store.layout import Store
 from worker.errors import UserError
 from worker.learning.job import configure
+from worker.racer.generator import make_random
 from worker.racer.geometry import on_road, place_at, project
+from worker.racer.naming import keep
 from worker.racer.presets import make_preset
 from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
 from worker.tasks.policy_contract import policy_contract
@@ -279,6 +282,16 @@ def test_what_only_a_rank_can_see_is_refused_in_one_line(tmp_path: Any) -> None:
     (tmp_path / "model_metadata.json").write_text('{"action_space": [')
     with pytest.raises(ValueError, match="it is not JSON"):
         RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
+
+
+def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    hills = make_random(5, "hills")
+    keep(Store(tmp_path), hills, {"seed": 5})
+    with pytest.raises(ValueError, match=r"config.track: track 'hills': there is no such track"):
+        Racer.sketch(RacerConfig(track=("oval", "hills")))
+    monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
+    circuit = Racer.sketch(RacerConfig(track=("oval", "hills"))).circuit
+    assert [track.digest for track in circuit.tracks] == [OVAL.digest, hills.digest]
 
 
 def test_a_metadata_file_says_what_its_content_says(tmp_path: Any) -> None:
