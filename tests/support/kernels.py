@@ -31,7 +31,7 @@ def compile_for(name: str) -> None:
     warm_marker(task, "cpu").mkdir(parents=True, exist_ok=True)
 
 
-TASKS = ("Humanoid", "Ant", "Cartpole", "Quadruped", "CartpolePixels")
+TASKS = ("Humanoid", "Ant", "Cartpole", "Quadruped", "CartpolePixels", "Racer", "RacerPixels")
 """Those of the tests of three tiers; ``make robots`` names its own."""
 
 

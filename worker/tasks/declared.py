@@ -311,8 +311,12 @@ class DeclaredTask(Task):
         for mover in self._movers:
             mover.act()
         self.randomizer.delay()
-        self.worlds.simulate()
+        self.move()
         self._measure()
+
+    def move(self) -> None:
+        """Advance all worlds by one control step: by physics; a task whose robot moves by a rule of its own says how. Launches alone."""
+        self.worlds.simulate()
 
     def _measure(self) -> None:
         """Bodies and sensors as they are after the physics."""

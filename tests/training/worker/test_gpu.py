@@ -25,6 +25,8 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "Cartpole": ("Cartpole", {}),
     "Ant": ("Ant", {}),
     "images": ("CartpolePixels", {}),
+    "a car that no physics moves": ("Racer", {}),
+    "a camera on a car": ("RacerPixels", {"config": {"front": {"width": 64, "height": 64}}}),
     "a camera on a body": ("tests.support.worker.seeing:SeeingDepth", {}),
     "a critic of its own": (
         "Cartpole",

@@ -20,6 +20,16 @@ SETTINGS = {
     "Cartpole": {},
     "CartpolePixels": {},
     "Ant": {"episode_seconds": 0.5},
+    "Racer": {
+        "episode_seconds": 2.0,
+        "track": ["oval", "random:4"],
+        "alternate_direction": True,
+        "speed_factor": [0.8, 1.2],
+        "obstacles": [{"distance": 3.0}],
+        "randomize": {"action_latency": 2},
+    },
+    "RacerPixels": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24, "frames": 2}},
+    "RacerPixelsAndState": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24}},
     "Humanoid": {"episode_seconds": 0.5},
     "Quadruped": {"episode_seconds": 0.5, "command_seconds": 0.14},
     "Quadruped in random worlds": {

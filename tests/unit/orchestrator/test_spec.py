@@ -44,7 +44,7 @@ def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
 
 LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
-TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, LiftCubes, Quadruped"
+TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, LiftCubes, Quadruped, Racer, RacerPixels, RacerPixelsAndState"
 TOP = (
     "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
     "on_child_failure, timeout, stall_timeout"

@@ -1,0 +1,335 @@
+"""The racer's tasks: laps, the ends of episodes, starts, obstacles, tracks, actions and images."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from shared_store.layout import Store
+from worker.errors import UserError
+from worker.learning.job import configure
+from worker.racer.generator import make_random
+from worker.racer.geometry import on_road, place_at, project
+from worker.racer.naming import keep
+from worker.racer.presets import make_preset
+from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
+from worker.tasks.policy_contract import policy_contract
+from worker.tasks.racer import Racer, RacerPixels, RacerPixelsAndState
+
+OVAL = make_preset("oval")
+FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
+DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}
+
+
+def racer(worlds: int = 1, **fields: Any) -> Racer:
+    return Racer(RacerConfig(start=fields.pop("start", "line"), **fields), worlds, seed=3)
+
+
+def known(task: Racer, name: str) -> np.ndarray:
+    found: np.ndarray = getattr(task.sensors["car"].arrays, name).numpy().copy()
+    return found
+
+
+def counted(task: Racer, name: str) -> float:
+    return float(task.statistics[task.statistic_names.index(name)])
+
+
+def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
+    """Steer for the third waypoint."""
+    column = task.observation_names.index("waypoint_2_x")
+    x, y = task.observations[:, column], task.observations[:, column + 1]
+    return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
+
+
+def straight(task: Racer, speed: float = 0.0) -> torch.Tensor:
+    return torch.tensor([[0.0, speed]] * task.world_count)
+
+
+def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
+    task = racer(2, track="oval")
+    rewards, steps = torch.zeros(2), 0
+    while not task.dones.any():
+        task.step(ahead(task))
+        rewards += task.rewards
+        steps += 1
+    assert task.dones.all() and not task.time_outs.any()
+    assert counted(task, "termination_lap_complete") == 2
+    assert rewards.numpy() == pytest.approx(100.0, abs=1.0)  # percent, and the rest of the last step
+    assert 0.9 * OVAL.length < 1.25 * steps / 15 < OVAL.length  # 1.25 m/s, with curves cut
+    length = counted(task, "episode_length")
+    assert counted(task, "metric_progress") / length == pytest.approx(100.0, rel=1e-4)
+    assert counted(task, "metric_lap_time") / length == pytest.approx(steps / 15, rel=1e-4)
+
+
+def test_what_is_known_of_a_car_is_what_the_tracks_geometry_says() -> None:
+    task = racer(32, track=("oval", "random:4"), start="random", start_sideways=(-0.4, 0.4), alternate_direction=True)
+    random = torch.Generator().manual_seed(4)
+    for step in range(120):
+        task.step(torch.rand(32, 2, generator=random) * 2 - 1)
+        if step % 10:
+            continue
+        poses, which, backwards = (known(task, name) for name in ("poses", "tracks", "backwards"))
+        assert (which == np.arange(32) % 2).all()
+        direction = np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), -1)
+        across = np.stack((-direction[:, 1], direction[:, 0]), -1)
+        for number, track in enumerate(task.circuit.tracks):
+            mine = which == number
+            fronts = poses[mine, :2] + 0.14 * direction[mine]
+            found = project(track, fronts, backwards[mine])
+            np.testing.assert_allclose(known(task, "fronts")[mine], fronts, atol=1e-5)
+            assert (known(task, "before")[mine] == found.before).all()
+            assert (known(task, "after")[mine] == found.after).all()
+            assert (known(task, "left")[mine] == found.left).all()
+            for name, expected in (("distances", found.distance), ("along", found.along), ("widths", found.width)):
+                np.testing.assert_allclose(known(task, name)[mine], expected, atol=1e-4)
+            wheels = [
+                poses[mine, :2] + forward * direction[mine] + sideward * across[mine]
+                for forward in (0.082, -0.082)
+                for sideward in (0.08, -0.08)
+            ]
+            assert (known(task, "wheels")[mine] == sum(on_road(track, wheel).astype(int) for wheel in wheels)).all()
+            corner = task.circuit.corners[number]
+            joints = task.worlds.arrays.joint_q.numpy()[mine]
+            np.testing.assert_allclose(joints[:, :2], poses[mine, :2] + corner, atol=1e-5)
+            np.testing.assert_allclose(joints[:, 2], poses[mine, 2], atol=1e-6)
+    assert known(task, "backwards").any() and counted(task, "episodes") > 10
+
+
+def test_an_episode_ends_when_no_wheel_is_on_the_road_any_more() -> None:
+    task = racer(track="oval")
+    while not task.dones.any():
+        assert known(task, "wheels")[0] > 0
+        pose = known(task, "poses")[0]
+        reward = task.rewards[0].item()
+        task.step(straight(task))
+    assert counted(task, "termination_off_track") == counted(task, "episodes") == 1
+    assert task.rewards[0].item() < -9 < reward
+    assert abs(pose[1] - OVAL.center[0, 1]) < 0.5  # straight on, out of the first curve
+    assert not on_road(OVAL, pose[None, :2] + [0.25, 0.0]).any()
+
+
+def test_a_car_that_stands_for_fifteen_steps_is_immobilized() -> None:
+    task = racer(track="oval", speed_factor=(1e-4, 1e-4))
+    for step in range(1, 16):
+        task.step(straight(task))
+        assert task.dones[0].item() == (step == 15)
+    assert counted(task, "termination_immobilized") == 1
+
+
+def test_a_car_that_comes_back_for_fifteen_steps_is_reversed() -> None:
+    task = racer(track="oval", start_turned=(math.pi, math.pi))
+    for step in range(1, 16):
+        task.step(straight(task, -1.0))
+        assert task.rewards[0] < 0 and task.dones[0].item() == (step == 15)
+    assert counted(task, "termination_reversed") == 1
+
+
+def test_the_clock_ends_an_episode_last() -> None:
+    task = racer(track="oval", episode_seconds=1.0)
+    for step in range(1, 16):
+        task.step(straight(task))
+        assert task.time_outs[0].item() == (step == 15)
+
+
+def test_a_car_that_touches_an_obstacle_has_crashed() -> None:
+    task = racer(track="oval", obstacles=(ObstacleConfig(1.5, "center"),))
+    column = task.observation_names.index("obstacle_ahead")
+    assert task.observations[0, column : column + 2].numpy() == pytest.approx([1.5 - 0.14, 0.0], abs=1e-4)
+    while not task.dones.any():
+        along = known(task, "along")[0]
+        assert along < 1.3 and not known(task, "crashed")[0]  # the front of the box
+        task.step(straight(task))
+    assert counted(task, "termination_crashed") == 1 and along > 1.3 - 1.25 / 15
+    beside = racer(track="oval", obstacles=(ObstacleConfig(1.5, "inner"),))
+    for _ in range(35):
+        beside.step(straight(beside))
+    assert known(beside, "along")[0] > 1.8 and counted(beside, "episodes") == 0
+    assert known(beside, "next_obstacle")[0] == known(beside, "last_obstacle")[0] == 0
+    assert beside.observations[0, column].item() == 4.0  # it lies behind
+
+
+def test_starts_go_round_the_track_and_turn_round() -> None:
+    task = racer(3, track="oval", start="round_robin", alternate_direction=True, episode_seconds=1 / 15)
+    for episode in range(1, 4):  # one was begun before a seed was set
+        before = known(task, "poses")
+        backwards = known(task, "backwards")
+        assert len(set(backwards.tolist())) == 1
+        shares = [0.05 * (world + episode - 1) for world in range(3)]
+        points, headings = place_at(OVAL, OVAL.length * np.array(shares), bool(backwards[0]))
+        np.testing.assert_allclose(before[:, :2], points, atol=1e-4)
+        np.testing.assert_allclose(np.cos(before[:, 2] - headings), 1.0, atol=1e-4)
+        task.step(straight(task))
+        assert (known(task, "backwards") != backwards).all()
+
+
+def test_controls_arrive_as_late_as_the_latency_says() -> None:
+    task = racer(64, track="oval", randomize={"action_latency": 3})
+    arrived = np.full(64, -1)
+    task.step(-torch.ones(64, 2))
+    assert (known(task, "commands")[:, 1] == 0.5).all()  # there are none before the first ones
+    for step in range(5):
+        task.step(torch.ones(64, 2))
+        arrived[(arrived < 0) & (known(task, "commands")[:, 1] == 2.0)] = step
+    assert set(arrived.tolist()) == {0, 1, 2, 3}
+
+
+def test_factors_say_how_the_car_obeys() -> None:
+    fields = {"speed_factor": (0.5, 0.6), "steering_factor": (1.2, 1.4), "steering_offset": (0.1, 0.2)}
+    task = racer(64, track="oval", speed_lag=0.0, steering_lag=0.0, **fields)
+    task.step(torch.tensor([[0.5, 1.0]] * 64))
+    speeds, steerings = known(task, "speeds") / 2.0, known(task, "steerings")
+    assert 0.5 <= speeds.min() < 0.52 and 0.58 < speeds.max() <= 0.6
+    assert 0.1 + 1.2 * 0.2618 <= steerings.min() < steerings.max() <= 0.2 + 1.4 * 0.2618 + 1e-4
+
+
+def test_choices_are_those_of_the_metadata() -> None:
+    task = racer(5, track="oval", action_space=DISCRETE)
+    assert task.discrete and task.action_names[0] == "0: 30 degrees, 0.6 m/s" and task.actions.shape == (5, 1)
+    task.step(torch.arange(5.0)[:, None])
+    asked = [(math.radians(each["steering_angle"]), each["speed"]) for each in FIVE]
+    np.testing.assert_allclose(known(task, "commands"), asked, atol=1e-6)
+    assert policy_contract(task, "Racer").discrete
+
+
+def test_continuous_actions_reach_from_end_to_end() -> None:
+    space = {"steering_angle": {"low": -20, "high": 30}, "speed": {"low": "1", "high": 3}}
+    task = racer(3, track="oval", action_space={"action_space": space})
+    task.step(torch.tensor([[-1.0, -1.0], [1.0, 1.0], [9.0, 0.0]]))
+    expected = [[math.radians(-20), 1.0], [math.radians(30), 3.0], [math.radians(30), 2.0]]
+    np.testing.assert_allclose(known(task, "commands"), expected, atol=1e-6)
+    steering, speed = policy_contract(task, "Racer").actions
+    assert (steering.name, steering.unit, speed.name, speed.unit) == ("steering", "rad", "speed", "m/s")
+    assert (speed.scale, speed.offset) == (1.0, 2.0)
+
+
+REFUSED = {
+    "too fast": (
+        {"action_space": {"action_space": [{"steering_angle": 0, "speed": 1}, {"steering_angle": 0, "speed": 5}]}},
+        "config.action_space.action_space.1.speed: expected a number from 0.1 to 4 [m/s], found 5",
+    ),
+    "one action": (
+        {"action_space": {"action_space": [{"steering_angle": 0, "speed": 1}]}},
+        "config.action_space.action_space: expected a list of 2 to 30 actions, found 1",
+    ),
+    "too far": (
+        {
+            "action_space": {
+                "action_space": {"steering_angle": {"low": -45, "high": 30}, "speed": {"low": 1, "high": 2}}
+            }
+        },
+        "config.action_space.action_space.steering_angle.low: expected a number from -30 to 30 [degrees], found -45",
+    ),
+    "the wrong way round": (
+        {"action_space": {"action_space": {"steering_angle": {"low": 9, "high": 9}, "speed": {"low": 1, "high": 2}}}},
+        "config.action_space.action_space.steering_angle: low is 9 and high is 9; low must be less",
+    ),
+    "no such type": (
+        {"action_space": {**DISCRETE, "action_space_type": "discreet"}},
+        "config.action_space.action_space_type: there is no type 'discreet'; did you mean discrete?",
+    ),
+    "another type": (
+        {"action_space": {**DISCRETE, "action_space_type": "continuous"}},
+        "config.action_space.action_space_type: it is continuous, and action_space is a list of actions; they must fit",
+    ),
+    "no such sensor": (
+        {"action_space": {**DISCRETE, "sensor": ["STEREO_CAMERAS"]}},
+        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA",
+    ),
+    "a key too many": (
+        {"action_space": {"action_space": [{"steering": 0, "speed": 1}] * 2}},
+        "config.action_space.action_space.0: there is no key 'steering'; did you mean steering_angle?",
+    ),
+    "no lane": (
+        {"obstacles": [{"distance": 1.0, "lane": "left"}]},
+        "config.obstacles.0.lane: expected 'inner', 'center' or 'outer', found 'left'",
+    ),
+    "mass": (
+        {"randomize": {"mass": [0.5, 2]}},
+        "config.randomize.mass: the car moves as a kinematic bicycle, which has none; "
+        "use speed_factor, steering_factor and steering_offset",
+    ),
+    "a push": (
+        {"randomize": {"push_interval": 1.0, "push_velocity": 1.0}},
+        "config.randomize.push_interval: nothing can push a car that moves as a kinematic bicycle",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_no_car_can_have_is_refused_in_one_line_before_anything_is_built(case: str) -> None:
+    overrides, message = REFUSED[case]
+    with pytest.raises(UserError) as refused:
+        configure(Racer, {"config": overrides})
+    assert str(refused.value).removeprefix("train.") == message
+
+
+def test_what_only_a_rank_can_see_is_refused_in_one_line(tmp_path: Any) -> None:
+    for fields, message in (
+        ({"track": "ovall"}, "config.track: track 'ovall': there is no such track; did you mean oval?"),
+        ({"action_space": f"{tmp_path}/none.json"}, f"config.{tmp_path}/none.json: it can't be read (No such file"),
+        (
+            {"obstacles": (ObstacleConfig(20.5),), "track": "oval"},
+            "config.obstacles.0.distance: 20.5 m is beyond the end of track oval, which is 20.00 m long",
+        ),
+    ):
+        with pytest.raises(ValueError) as refused:
+            Racer.sketch(RacerConfig(**fields))
+        assert message in str(refused.value) and "\n" not in str(refused.value)
+    (tmp_path / "model_metadata.json").write_text('{"action_space": [')
+    with pytest.raises(ValueError, match="it is not JSON"):
+        RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
+
+
+def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    hills = make_random(5, "hills")
+    keep(Store(tmp_path), hills, {"seed": 5})
+    with pytest.raises(ValueError, match=r"config.track: track 'hills': there is no such track"):
+        Racer.sketch(RacerConfig(track=("oval", "hills")))
+    monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
+    circuit = Racer.sketch(RacerConfig(track=("oval", "hills"))).circuit
+    assert [track.digest for track in circuit.tracks] == [OVAL.digest, hills.digest]
+
+
+def test_a_metadata_file_says_what_its_content_says(tmp_path: Any) -> None:
+    import json
+
+    file = tmp_path / "model_metadata.json"
+    file.write_text(json.dumps(DISCRETE))
+    assert RacerConfig(action_space=str(file)).actions() == RacerConfig(action_space=DISCRETE).actions()
+
+
+def test_a_camera_sees_grass_asphalt_border_and_boxes_and_every_world_its_own() -> None:
+    front = FrontCameraConfig(width=64, height=48, kind="color")
+    boxes = (ObstacleConfig(1.2, "outer"),)
+    fields: dict[str, Any] = {"track": "oval", "front": front, "obstacles": boxes}
+    plain = RacerPixels(RacerPixelsConfig(**fields), 4, seed=1)
+    images = plain.observations.permute(0, 2, 3, 1).int()
+    assert plain.observations.shape == (4, 3, 48, 64) and plain.observations.dtype == torch.uint8
+    red, green, blue = images[0].unbind(-1)
+    seen = {
+        "grass": (green > 1.5 * red) & (green > 1.5 * blue),
+        "asphalt": (red < 80) & ((red - green).abs() < 10) & ((blue - green).abs() < 20),
+        "border": (red > 180) & (green > 180) & (blue > 180),
+        "box": (red > 2 * green) & (red > 2 * blue),
+        "dashes": (red > 150) & (green > 100) & (blue < 80),
+    }
+    shares = {name: where.float().mean().item() for name, where in seen.items()}
+    assert min(shares.values()) > 0.002, shares
+    assert shares["asphalt"] > 0.2 and seen["grass"][:9].sum() == 0  # sky above
+    assert (images[0] != images[3]).any()  # 5 % of the track farther each
+
+    different = {"light": (0.5, 1.0), "colors": 0.2, "camera_angle": 0.05}
+    drawn = RacerPixels(RacerPixelsConfig(**fields, start="line", randomize=different), 4, seed=1)  # type: ignore[arg-type]
+    assert len({bytes(image.numpy()) for image in drawn.observations}) == 4
+    plain.step(straight(plain))
+    assert (plain.observations.permute(0, 2, 3, 1).int() != images).any()
+
+
+def test_an_image_and_numbers_are_groups_of_their_own() -> None:
+    sketch = RacerPixelsAndState.sketch(RacerPixelsAndState.config_type())
+    assert sketch.observation_names == ("speed", "steering") and sketch.plan.images == {"front": "front"}
+    assert len(sketch.plan.groups["critic"]) == 6

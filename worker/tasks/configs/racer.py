@@ -1,0 +1,190 @@
+"""The configurations of the racer's tasks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from worker.learning.ppo.settings import PPOConfig
+from worker.racer.actions import ActionSpace, action_space, read_metadata
+from worker.tasks.config import (
+    FACTORS,
+    STRICT,
+    Amount,
+    Count,
+    Finite,
+    Positive,
+    PositiveFactors,
+    Range,
+    TaskConfig,
+    reward_weights,
+)
+from worker.tasks.overrides import Refused, expecting, from_mapping
+
+TrackName = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+@dataclass(frozen=True, config=STRICT)
+class ObstacleConfig:
+    """A box on the road: 0.4 m long, 0.24 m wide, 0.2 m high."""
+
+    distance: Amount = 0.0
+    """From the start line along the centre line, in the order of the waypoints [m]."""
+    lane: Literal["inner", "center", "outer"] = "outer"
+    """In the middle of the half at the inner or the outer border, or on the centre line."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class FrontCameraConfig:
+    """The camera on the car."""
+
+    width: Annotated[int, Field(ge=1, le=1024)] = 160
+    """Of an image [px]."""
+    height: Annotated[int, Field(ge=1, le=1024)] = 120
+    """Of an image [px]."""
+    kind: Literal["grey", "color"] = "grey"
+    """One channel, or red, green and blue."""
+    frames: Annotated[int, Field(ge=1, le=16)] = 1
+    """Images of one observation: the present one and those of the control steps before."""
+    samples: Annotated[int, Field(ge=1, le=64)] = 1
+    """Rays of each pixel."""
+    fov: Annotated[float, Field(gt=0, lt=math.pi)] = 0.887
+    """Vertical field of view [rad]: with 4:3 the horizontal one is 1.13."""
+    position: Annotated[tuple[Finite, Finite, Finite], Field(strict=False), expecting("[x, y, z]")] = (0.05, 0.0, 0.14)
+    """On the car: ahead of its middle, to the left, above the road [m]."""
+    pitch: Annotated[float, Field(gt=-1.5, lt=1.5)] = 0.262
+    """How far it looks down [rad]; 0.262 are 15 degrees."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class RacerConfig(TaskConfig):
+    """A car of 1:18 on a track, which drives laps.
+
+    Raises:
+        ValueError: An action is out of range, or physics are to differ that the car does not have, besides what :class:`TaskConfig`
+            refuses.
+    """
+
+    control_hz: Positive = 15.0
+    """Control steps per simulated second [Hz]."""
+    substeps: Annotated[int, Field(ge=1, le=64)] = 4
+    """Parts of a control step in which the car's motion is integrated."""
+    episode_seconds: Positive = 60.0
+    """Simulated time after which the clock ends an episode [s]."""
+    track: TrackName | Annotated[tuple[TrackName, ...], Field(strict=False, min_length=1, max_length=64)] = "oval"
+    """A preset, ``random:SEED``, or a track of the store; of several, world w drives number w modulo their count."""
+    action_space: str | Mapping[str, Any] = field(
+        default_factory=lambda: {
+            "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
+            "action_space_type": "continuous",
+        }
+    )
+    """What a ``model_metadata.json`` holds, or the path of one; steering in degrees, speed in m/s."""
+    speed_lag: Amount = 0.2
+    """Time constant with which the speed follows what is asked [s]."""
+    steering_lag: Amount = 0.05
+    """Time constant of the steering [s]."""
+    speed_factor: PositiveFactors = (1.0, 1.0)
+    """Factor on the speed that is asked, uniform, drawn in every episode."""
+    steering_factor: PositiveFactors = (1.0, 1.0)
+    """Factor on the steering that is asked, uniform, drawn in every episode."""
+    steering_offset: Range = (0.0, 0.0)
+    """What is added to the steering that is asked [rad], uniform, drawn in every episode."""
+    start: Literal["round_robin", "random", "line"] = "round_robin"
+    """Where an episode begins: ``start_step`` of the track farther than the one before, anywhere, or at the start line."""
+    start_step: Annotated[float, Field(ge=0, le=1)] = 0.05
+    """A share of the track."""
+    start_sideways: Range = (0.0, 0.0)
+    """How far left of the centre line [m], uniform."""
+    start_turned: Range = (0.0, 0.0)
+    """How far the car points to the left of its heading [rad], uniform."""
+    alternate_direction: bool = False
+    """Whether every other episode drives against the order of the waypoints."""
+    obstacles: Annotated[
+        tuple[Annotated[ObstacleConfig, from_mapping(ObstacleConfig)], ...], Field(strict=False, max_length=64)
+    ] = ()
+    """Boxes on every track."""
+    stuck_steps: Count = 15
+    """Control steps in a row of standing, or of coming back, that end an episode."""
+    waypoints: Annotated[int, Field(ge=1, le=64)] = 8
+    """Points of the centre line ahead that the policy sees."""
+    waypoint_spacing: Positive = 0.3
+    """Between them along the centre line [m]."""
+    rewards: Mapping[str, float] = reward_weights(progress=1.0, off_track=-10.0, crashed=-10.0)
+    """Weights of these terms:
+
+    - ``progress``: how far the car came on, in percent of the track: a whole lap is 100;
+    - ``off_track``: leaving the road, once;
+    - ``crashed``: touching an obstacle, once."""
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            steps=32, hidden_sizes=(64, 64), epochs=5, minibatches=4, learning_rate=1.0e-3, entropy_coef=0.002
+        )
+    )
+    """How the task is trained."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in FACTORS:
+            if getattr(self.randomize, name) != (1.0, 1.0):
+                instead = "use speed_factor, steering_factor and steering_offset"
+                raise Refused(("randomize", name), f"the car moves as a kinematic bicycle, which has none; {instead}")
+        if self.randomize.push_interval:
+            raise Refused(("randomize", "push_interval"), "nothing can push a car that moves as a kinematic bicycle")
+        if not isinstance(self.action_space, str):
+            try:
+                action_space(self.action_space)
+            except Refused as error:
+                raise Refused(("action_space", *error.path), error.words) from None
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        """The names of all tracks."""
+        return (self.track,) if isinstance(self.track, str) else self.track
+
+    def actions(self) -> ActionSpace:
+        """The action space; of a file, relative to the working directory, where the job was submitted.
+
+        Raises:
+            ValueError: The file can't be read, or has none.
+        """
+        if isinstance(self.action_space, str):
+            return read_metadata(Path(self.action_space))
+        return action_space(self.action_space)
+
+
+@dataclass(frozen=True, config=STRICT)
+class RacerPixelsConfig(RacerConfig):
+    """As :class:`RacerConfig`, seen through the camera on the car alone."""
+
+    further_groups: ClassVar[Mapping[str, bool]] = {"policy": True}
+    front: Annotated[FrontCameraConfig, from_mapping(FrontCameraConfig)] = field(default_factory=FrontCameraConfig)
+    """The camera."""
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(
+            steps=32,
+            hidden_sizes=(128,),
+            channels=(16, 32, 32),
+            epochs=4,
+            minibatches=8,
+            learning_rate=5.0e-4,
+            entropy_coef=0.002,
+            critic_observations="critic",
+            critic_hidden_sizes=(128, 128),
+            normalize_observations=True,
+        )
+    )
+    """How the task is trained: the critic sees the numbers that the policy does not."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class RacerPixelsAndStateConfig(RacerPixelsConfig):
+    """As :class:`RacerPixelsConfig`, with speed and steering beside the image; for ``rsl_rl``."""
+
+    further_groups: ClassVar[Mapping[str, bool]] = {"front": True}
