@@ -1,4 +1,4 @@
-"""What looking at a policy costs, and how fast it is judged and shipped: tap, recordings, evaluation, export, on this device.
+"""What looking at a policy costs, and how fast it is judged and shipped: tap, recordings, evaluation, rendering, export, on this device.
 
     python -m benchmarks.seeing [--tasks Cartpole Ant] [--out DIRECTORY]
 
@@ -38,15 +38,17 @@ from worker.evaluation.episodes import play
 from worker.export import export
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policy
+from worker.telemetry.picture import Camera
 from worker.telemetry.recording import Recording
 from worker.telemetry.rollout import Rollout
 
-WORLDS = {"Cartpole": 4096, "Ant": 4096, "Humanoid": 4096, "Quadruped": 4096}
+WORLDS = {"Cartpole": 4096, "Ant": 4096, "CartpolePixels": 1024, "Humanoid": 4096, "Quadruped": 4096}
 WORLDS_CPU = {"Cartpole": 1024, "Ant": 64}
 WARM, STRETCH, ROUNDS = 8, 40 if CUDA else 20, 3
 CHANGES = ("recorded", "left", "viewed")
 TAPPED, EPISODES = 4, 2
 """Worlds that are recorded, and episodes of each of a checkpoint's recording."""
+PICTURES = 60
 JUDGED = 256
 """Worlds of the evaluation: blocks of 32 act one after the other, so that its rate is the same with more of them."""
 
@@ -159,6 +161,17 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
     return best
 
 
+def rendered(run: Run) -> dict[str, float]:
+    """Pictures a second of the camera of ``muster render``, 640 x 360 px, after the first, for which kernels are loaded."""
+    rollout = Rollout.of(run, None, TAPPED)
+    camera, spent = Camera(rollout.stage(rollout.task.device), 640, 360), list[float]()
+    for rows in rollout.steps(PICTURES + 1):
+        started = time.perf_counter()
+        camera.take(rows.coordinates[-1])
+        spent.append(time.perf_counter() - started)
+    return {"rendered": PICTURES / sum(spent[1:])}
+
+
 def exported(run: Run) -> dict[str, float]:
     """Seconds of an export with its judgement, 16 episodes."""
     rollout = Rollout.of(run, None, 16)
@@ -183,7 +196,7 @@ def measure(task: str, worlds: int) -> dict[str, Any]:
             rounds.append((took(run, marks), took(twin.job.run, marks)))
             twin.close()
             if number == ROUNDS - 1:
-                row = {**recorded(run, Path(store)), **judged(run, worlds), **exported(run)}
+                row = {**recorded(run, Path(store)), **judged(run, worlds), **rendered(run), **exported(run)}
     alone = statistics.median(unseen[0] for _, unseen in rounds)
     parts = range(len(rounds[0][0]))
     ratios = [statistics.median(seen[part] / unseen[part] for seen, unseen in rounds) - 1.0 for part in parts]
@@ -210,12 +223,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         "Of its checkpoint:",
         "",
         f"| task | recording of {TAPPED} worlds [control steps/s] | a simulated minute | training [steps/s] | worlds of the evaluation | its rate "
-        "[steps/s] | episodes/s | their mean length [steps] | export, judged on 16 episodes [s] |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
+        "[steps/s] | episodes/s | their mean length [steps] | rendering, 640 x 360 px [pictures/s] | export, judged on 16 episodes [s] |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     lines += [
         f"| {row['task']} | {row['record_rate']:,.0f} | {row['minute'] / 1e6:.1f} MB | {row['training_rate']:,.0f} | {row['judged']} | "
-        f"{row['evaluation_rate']:,.0f} | {row['episodes']:,.0f} | {row['length']:,.0f} | {row['export']:.1f} |"
+        f"{row['evaluation_rate']:,.0f} | {row['episodes']:,.0f} | {row['length']:,.0f} | {row['rendered']:,.0f} | {row['export']:.1f} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
@@ -228,6 +241,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     add_option(parser)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     watch, rows = Watch(options.loaded_anyway), list[dict[str, Any]]()
     for task in options.tasks:
         rows.append(measure(task, worlds[task]) | watch.check(f"while {task} was measured"))
