@@ -114,6 +114,8 @@ class Cars:
     stuck_steps: int = 15
     traced: bool = False
     arrays_type: ClassVar[Any] = CarArrays
+    meaning: ClassVar[str] = "Cars"
+    """What a policy's contract says of it: what is measured is the same on every track."""
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """None: a term that reads the car is called once."""
