@@ -26,6 +26,7 @@ TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
 KINDS: dict[str, dict[str, Any]] = {
     "train": {"train": TRAIN},
     "evaluate": {"evaluate": {"run": "other"}},
+    "race": {"race": {"run": "other"}},
     "export": {"export": {"run": "other"}},
     "record": {"record": {"run": "other"}},
     "render": {"render": {"run": "other"}},
