@@ -81,13 +81,22 @@ REFUSED = {
     ("taught", "--set", "resource.cpus=1"): (2, "resource: unknown key; did you mean resources?"),
     ("taught", "--name", "a b"): (2, "name: expected letters"),
     ("taught", "--set", "resources.cpus=400"): (2, "lower nodes or resources"),
-    ("taught", "--race"): (2, "race: run taught trained Cartpole, which drives no laps; a race is for runs of a racer's"),
+    ("taught", "--race"): (
+        2,
+        "race: run taught trained Cartpole, which drives no laps; a race is for runs of a racer's",
+    ),
     ("fast-car", "--trials", "3"): (2, "--trials: it is for races; add --race"),
     ("fast-car", "-o", "there"): (2, "--output: it is for races; add --race"),
     ("fast-car", "--race", "--episodes", "3"): (2, "--episodes: a race has --trials, each in a world of its own"),
     ("fast-car", "--race", "--trials", "0"): (2, "race.trials: expected a value greater than or equal to 1, found 0"),
-    ("fast-car", "--race", "--penalty", "-1"): (2, "race.off_track_penalty: expected a value greater than or equal to 0"),
-    ("fast-car", "--race", "--set", "config.put_bakc=2.0"): (2, "race.config.put_bakc: RacerConfig has no such key; did you"),
+    ("fast-car", "--race", "--penalty", "-1"): (
+        2,
+        "race.off_track_penalty: expected a value greater than or equal to 0",
+    ),
+    ("fast-car", "--race", "--set", "config.put_bakc=2.0"): (
+        2,
+        "race.config.put_bakc: RacerConfig has no such key; did you",
+    ),
     ("fast-car", "--race", "--set", "config.put_back=20.0"): (2, "race.config.put_back: expected a value less than"),
     ("fast-car", "--race", "--set", "race.traks=[oval]"): (2, "race.traks: unknown key; did you mean track?"),
     ("fast-car", "--race", "--set", "nodes=2"): (2, "race: it runs on one node with at most one GPU"),
@@ -198,7 +207,9 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
 
 def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Serving, tmp_path: Path) -> None:
     spec = tmp_path / "race.yaml"
-    spec.write_text('{"name": "final", "race": {"run": "fast-car", "trials": 5, "continuous": true, "track": ["oval"]}}')
+    spec.write_text(
+        '{"name": "final", "race": {"run": "fast-car", "trials": 5, "continuous": true, "track": ["oval"]}}'
+    )
     done = call_muster("submit", str(spec), "--json", home=full.home)
     assert done.returncode == 0, done.stderr
     detail = full.detail(json.loads(done.stdout)["jobId"])

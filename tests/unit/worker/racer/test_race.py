@@ -122,11 +122,26 @@ def test_a_step_log_has_a_row_a_step_as_deepracer_s_tools_read_it(tmp_path: Path
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == SIM_TRACE_COLUMNS and len(rows) == 1 + int(played.lengths[0])
     start, first, last = rows[0], rows[1], rows[-1]
-    assert (start["episode_status"], start["steps"], start["tstamp"], start["progress"]) == ("prepare", "0", "0.000", "0.0000")
+    assert (start["episode_status"], start["steps"], start["tstamp"], start["progress"]) == (
+        "prepare",
+        "0",
+        "0.000",
+        "0.0000",
+    )
     x, y = OVAL.center[0] + [0.14, 0.0]  # the front of a car on the line, on a straight along x
     assert (float(start["X"]), float(start["Y"])) == pytest.approx((x, y), abs=1e-4)
-    assert (first["steps"], first["tstamp"], first["done"], first["all_wheels_on_track"]) == ("1", "0.067", "False", "True")
-    assert (first["steer"], first["throttle"], first["action"], first["pause_duration"]) == ("0.00", "1.25", "-1", "0.00")
+    assert (first["steps"], first["tstamp"], first["done"], first["all_wheels_on_track"]) == (
+        "1",
+        "0.067",
+        "False",
+        "True",
+    )
+    assert (first["steer"], first["throttle"], first["action"], first["pause_duration"]) == (
+        "0.00",
+        "1.25",
+        "-1",
+        "0.00",
+    )
     assert float(first["track_len"]) == pytest.approx(OVAL.length, abs=0.005)
     statuses = [row["episode_status"] for row in rows[1:]]
     assert statuses.count("off_track") == 2 and statuses[-1] == "off_track"
@@ -166,7 +181,9 @@ def test_laps_are_dealt_the_tracks_in_turn_and_the_table_has_what_the_summary_ha
     for name, values in table.items():
         if name in told["race"]["trials"][0] and name != "seed":
             assert values == [trial[name] for trial in told["race"]["trials"]], name
-    assert {"trial", "status", "completion", "lap_time", "time", "off_tracks", "resets", "penalty", "steps"} <= set(table)
+    assert {"trial", "status", "completion", "lap_time", "time", "off_tracks", "resets", "penalty", "steps"} <= set(
+        table
+    )
     assert len(list(run.evaluations.rglob("*-iteration.csv"))) == 3
     plain = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "other")
     assert "compared" not in plain  # a race is compared with races
