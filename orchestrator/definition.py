@@ -13,7 +13,7 @@ from orchestrator.scheduling.snapshot import NodeShape, Shape
 from orchestrator.spec import Spec
 from shared_store.log_files import LIMIT
 
-_MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "export", "record", "render")}
+_MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "race", "export", "record", "render")}
 
 
 def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:

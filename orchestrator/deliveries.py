@@ -248,7 +248,7 @@ def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None
     if kind_of(job) == "train" and is_of_earlier_run(job, run):
         return None, None
     with suppress(OSError, ValueError):  # a volume that is away: the message does without
-        if kind_of(job) == "evaluate":
+        if kind_of(job) in ("evaluate", "race"):
             own = (
                 each for each in list_evaluations(run) if each["name"] == evaluation_name(each["checkpoint"], job.id)
             )

@@ -19,15 +19,16 @@ AUTOMATIC_TAG = "muster:automatic-evaluation"
 
 
 def evaluation_document(
-    run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None
+    run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None, kind: str = "evaluate"
 ) -> dict[str, Any]:
-    """The spec of a job that evaluates ``run``, on one node like those of its training.
+    """The spec of a job that evaluates ``run``, or races it, on one node like those of its training.
 
     Args:
         run: Name of the run.
         trained: Spec of the training.
-        section: What ``evaluate`` says beside the run.
-        name: Of the job; ``evaluate-RUN`` where None.
+        section: What ``evaluate`` or ``race`` says beside the run.
+        name: Of the job; ``evaluate-RUN`` or ``race-RUN`` where None.
+        kind: ``evaluate`` or ``race``.
     """
     kept = {
         key: trained[key]
@@ -39,9 +40,9 @@ def evaluation_document(
         resources["gpus"] = 1
     return {
         **kept,
-        "name": name or f"evaluate-{run}".replace(".", "-")[:100],
+        "name": name or f"{kind}-{run}".replace(".", "-")[:100],
         **({"resources": resources} if resources else {}),
-        "evaluate": {"run": run, **section},
+        kind: {"run": run, **section},
     }
 
 

@@ -37,9 +37,10 @@ from orchestrator.spec_values import (
     Section,
     TaskName,
 )
+from shared_store.races import DEFAULTS, TRIALS
 from shared_store.wording import explain, kind_of, nearest, path_of
 
-KINDS = ("train", "evaluate", "export", "record", "render", "command")
+KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
 """What a job can do: exactly one of these keys is in a spec."""
 
 LONGEST_CHANGES = 24 << 10
@@ -124,6 +125,34 @@ class Evaluate(Section):
     keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
+class Race(Section):
+    """Have a checkpoint of a racer's run drive laps from the start line, in a world each."""
+
+    run: RunName
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
+    trials: int = Field(default=TRIALS, ge=1, le=100, description="laps")
+    continuous: bool = Field(
+        default=DEFAULTS["continuous"], description="whether a car is put back; else a lap ends with its first mishap"
+    )
+    off_track_penalty: float = Field(default=DEFAULTS["off_track_penalty"], ge=0, description="of each time [s]")
+    crash_penalty: float = Field(default=DEFAULTS["crash_penalty"], ge=0, description="of each obstacle [s]")
+    max_resets: int = Field(default=DEFAULTS["max_resets"], ge=0, le=1_000_000, description="in a lap")
+    seconds: float = Field(default=DEFAULTS["seconds"], gt=0, le=3600, description="simulated, of a lap")
+    track: Annotated[str, Field(min_length=1, max_length=100)] | list[str] | None = Field(
+        default=None,
+        description="name, or names that are dealt to the laps in turn; those of the training where absent",
+    )
+    seed: int | None = Field(
+        default=None, ge=0, lt=2**63, description="of the worlds; by default one that follows from the training's"
+    )
+    config: dict[str, Any] = Field(
+        default_factory=dict, description="further changes of the configuration with which the run was trained"
+    )
+    keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
+
+
 class Export(Section):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
@@ -177,6 +206,7 @@ class Spec(Section):
     resources: Resources = Field(default_factory=Resources)
     train: Train | None = None
     evaluate: Evaluate | None = None
+    race: Race | None = None
     export: Export | None = None
     record: Record | None = None
     render: Render | None = None
@@ -208,6 +238,8 @@ class Spec(Section):
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; {found}")
         if self.evaluation is not None and self.train is None:
             raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
+        if self.race is not None and (self.nodes.max > 1 or self.resources.gpus > 1):
+            raise ValueError("race: it runs on one node with at most one GPU")
         return self
 
     @model_validator(mode="after")

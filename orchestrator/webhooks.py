@@ -73,7 +73,7 @@ class Webhook(BaseModel):
     statuses: list[Literal["SUCCEEDED", "FAILED"]] = Field(default=["SUCCEEDED", "FAILED"], min_length=1)
     queues: list[str] | None = None
     """Names of job queues; None: all."""
-    kinds: list[Literal["train", "evaluate", "export", "record", "render", "command"]] | None = None
+    kinds: list[Literal["train", "evaluate", "race", "export", "record", "render", "command"]] | None = None
     """Of :data:`orchestrator.spec.KINDS`; None: all."""
     link: Annotated[str, AfterValidator(_url)] | None = None
     """Where the receiver's people reach this controller; None: where it listens."""
@@ -111,7 +111,7 @@ def kind_of(job: Job) -> str:
 
 
 def run_of(job: Job) -> str:
-    """The run that a job trains, or of which it evaluates, exports, records or renders a checkpoint."""
+    """The run that a job trains, or of which it evaluates, races, exports, records or renders a checkpoint."""
     section = _spec(job).get(kind_of(job))
     named = section.get("run") if isinstance(section, dict) else None
     return named if isinstance(named, str) and NAME.fullmatch(named) else job.run

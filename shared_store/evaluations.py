@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from shared_store import races
 from shared_store.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.layout import LARGEST_DESCRIPTION, Run
 from shared_store.wording import counted
@@ -100,6 +101,9 @@ def kept_checkpoints(run: Run) -> set[str]:
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """An evaluation as a person reads it."""
+    if _mapping(summary, "race"):
+        yield from races.lines(summary)
+        return
     task, seed = summary.get("task"), summary.get("seed")
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
     for place, value in flattened(_mapping(summary, "config")):

@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from shared_store.outcomes import EX_TEMPFAIL
+from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
 from shared_store.settings import merged
+from worker.errors import UserError
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
 
 if TYPE_CHECKING:
+    from worker.evaluation.race import Laps
     from worker.tasks.task import Task
 
 EPISODES = 100
@@ -20,12 +23,16 @@ WORLDS = 1024
 """Greatest number of worlds that a rank simulates at once, unless the job says more."""
 
 
-def main() -> int:
-    """Evaluate; returns the exit code: 0 done, 75 left on request (started again, it begins anew)."""
+def main(kind: str = "evaluate") -> int:
+    """Evaluate; returns the exit code: 0 done, 75 left on request (started again, it begins anew).
+
+    Args:
+        kind: The section of the job: ``evaluate``, or ``race`` of a job whose episodes are the laps of a race.
+    """
     stop = StopRequest().listen()  # before the imports, which take seconds
-    job = Job.from_env(os.environ, "evaluate")
-    run = job.named_run()
-    episodes = job.setting("episodes", EPISODES)
+    job = Job.from_env(os.environ, kind)
+    run, race = job.named_run(), kind == "race"
+    episodes = job.setting("trials", TRIALS) if race else job.setting("episodes", EPISODES)
     from worker.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -48,13 +55,16 @@ def main() -> int:
     with user_errors("task"):
         task_type = find_task(facts["task"])
     changes = job.section.get("config") or {}
+    if race:
+        changes = _race_changes(job, task_type, gang.size)
     trained = facts["train"]
-    config = configure(task_type, {**trained, "config": merged(trained.get("config") or {}, changes)}, "evaluate")
+    config = configure(task_type, {**trained, "config": merged(trained.get("config") or {}, changes)}, kind)
     seed = job.setting("seed", held_out_seed(trained.get("seed", 0)), least=0)
     seed_generators(seed)
-    blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / SIZE)
+    size = episodes if race else SIZE  # each lap of a race in a world, and no further ones beside them
+    blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / size)
     dealt = Share.of(gang.rank, gang.size, max(blocks, gang.size))
-    share, total = Share(dealt.first * SIZE, dealt.count * SIZE, dealt.total * SIZE), dealt.total * SIZE
+    share, total = Share(dealt.first * size, dealt.count * size, dealt.total * size), dealt.total * size
 
     def build(first: int) -> Task:
         task = build_task(task_type, config, Share(first + share.first, share.count, total), gang, seed)
@@ -64,13 +74,15 @@ def main() -> int:
     task = build(0)
     # a GPU adds in no fixed order: there one batch is faster, and blocks would make no two evaluations equal
     policies = load_policies(checkpoint, gang.device, dealt.count if gang.device == "cpu" else 1)
-    policy = Blocks(policies) if gang.device == "cpu" else policies[0]
+    policy = Blocks(policies, size) if gang.device == "cpu" else policies[0]
     check_contract(checkpoint, task)
     end_startup()
     started = time.perf_counter()
     rounds = _rounds(task, build, math.ceil(episodes / total), total, seed)
+    laps = _laps(task) if race else None
+    look = laps.note if laps else None
     try:
-        played = play(rounds, policy, gang, episodes=episodes, is_asked_to_stop=lambda: stop.requested)
+        played = play(rounds, policy, gang, episodes=episodes, is_asked_to_stop=lambda: stop.requested, look=look)
     except Stopped:
         if gang.is_main:
             print(
@@ -79,13 +91,32 @@ def main() -> int:
         return EX_TEMPFAIL
     result = result_of(task, played, checkpoint.name, seed, started)
     if gang.is_main:
-        print(result, flush=True)
+        if not laps:
+            print(result, flush=True)
         known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
-        told = result.write(run, job.id, iteration=checkpoint.iteration, config=changes, **known)
-        print("\n".join(lines(told)), flush=True)
-        print(f"written: {run.evaluations / told['table']} and .json", flush=True)
+        driven = laps.race(played, rules_of(job.section), seed) if laps else None
+        summary = result.write(run, job.id, driven, iteration=checkpoint.iteration, config=changes, **known)
+        print("\n".join(lines(summary)), flush=True)
+        print(f"written: {run.evaluations / summary['table']} and .json", flush=True)
     gang.close()
     return 0
+
+
+def _race_changes(job: Job, task_type: type[Task], ranks: int) -> dict[str, Any]:
+    """What the race changes of the training's configuration. Raises UserError for a task that drives no laps, and for several ranks."""
+    if not task_type.config_type.races:
+        raise UserError(f"race: run {job.section.get('run')} trained {task_type.__name__}, {NO_RACER}")
+    if ranks > 1:
+        raise UserError(f"race: it runs on one node with at most one GPU, not on {ranks} ranks")
+    if not isinstance(job.section.get("config") or {}, dict):
+        raise UserError("race.config: expected a mapping")
+    return race_changes(job.section)
+
+
+def _laps(task: Any) -> Laps:
+    from worker.evaluation.race import Laps
+
+    return Laps(task)
 
 
 def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, seed: int) -> Iterator[Task]:

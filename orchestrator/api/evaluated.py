@@ -1,7 +1,8 @@
-"""What an evaluation asks of the run that it evaluates, checked before its job exists."""
+"""What an evaluation or a race asks of its run, checked before its job exists."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.api.checkpoints import choose, refusal
@@ -9,14 +10,16 @@ from orchestrator.api.errors import ClientError
 from orchestrator.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
+from shared_store.races import NO_RACER, key_of, race_changes
 from shared_store.settings import merged
 
 
-def check_evaluation(run: Run, section: Any) -> Checkpoint | None:
-    """The checkpoint that the ``evaluate`` section of a spec means; None where the section is none, which the rank refuses.
+def check_evaluation(run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:
+    """The checkpoint that the section ``evaluate`` or ``race`` of a spec means; None where the section is none, which the rank refuses.
 
-    Raises ClientError: there is no such checkpoint, it can't be read, or the task that it was trained on refuses the changes.
+    Raises ClientError: there is no such checkpoint, it can't be read, its task drives no laps of a race, or refuses the changes.
     """
+    section = spec.get(key)
     if not isinstance(section, dict):
         return None
     wanted, changes = section.get("checkpoint"), section.get("config") or {}
@@ -32,9 +35,14 @@ def check_evaluation(run: Run, section: Any) -> Checkpoint | None:
     task, trained = facts.get("task"), facts.get("train")
     kind = task_config(task) if isinstance(task, str) else None
     before = trained.get("config") if isinstance(trained, dict) else None
+    if key == "race":
+        if kind is not None and not kind.races:
+            raise ClientError(f"race: run {run.name} trained {task}, {NO_RACER}")
+        changes = race_changes(section)
     if changes and kind is not None:
         problem = kind.problem_with(merged(before if isinstance(before, dict) else {}, changes))
         if problem:
             path, words = problem
-            raise ClientError(f"{'.'.join(map(str, ('evaluate', 'config', *path)))}: {words}")
+            named = key_of(section, path) if key == "race" else ".".join(map(str, ("evaluate", "config", *path)))
+            raise ClientError(f"{named}: {words}")
     return chosen

@@ -114,8 +114,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     needs, definition = _gang_of(body), body.definition
     for source in sources_of(needs):
         run = permitted_run(controller, source.run, Operation.READ_RUN)
-        if source.key == "evaluate":
-            check_evaluation(run, (needs.spec or {}).get("evaluate"))
+        if source.key in ("evaluate", "race"):
+            check_evaluation(run, needs.spec or {}, source.key)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))

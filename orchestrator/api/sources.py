@@ -75,8 +75,8 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> Teach
         if permissions.visible_queues() is not None:
             nobodys = RunRecord(name=source.run, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
-        if source.key == "evaluate" and not is_waiting:
-            check_evaluation(context.run(source.run), (needs.spec or {}).get("evaluate"))
+        if source.key in ("evaluate", "race") and not is_waiting:
+            check_evaluation(context.run(source.run), needs.spec or {}, source.key)
         if is_teacher and not is_waiting:
             needed = TeacherNeeded(source.run, _checkpoint(context, source))
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take
@@ -167,7 +167,7 @@ def _sources(spec: str) -> Iterator[Source]:
     except (ValueError, RecursionError):
         return  # refused where it is read
     sections = document if isinstance(document, dict) else {}
-    for kind in ("evaluate", "export", "record", "render"):
+    for kind in ("evaluate", "race", "export", "record", "render"):
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield Source(section["run"], kind)

@@ -1,8 +1,10 @@
-"""``muster evaluate``."""
+"""``muster evaluate``, races included."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -13,11 +15,16 @@ from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
+from orchestrator.errors import ServerError, UsageError
 from orchestrator.evaluating import evaluation_document
 from orchestrator.spec import Spec, override, validate
+from shared_store.races import SIM_TRACE
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500
-muster evaluate ant-1f2e3d4c@300 --set 'config.randomize.friction=[0.4, 0.6]' --name ant-on-ice"""
+muster evaluate ant-1f2e3d4c@300 --set 'config.randomize.friction=[0.4, 0.6]' --name ant-on-ice
+muster evaluate racer-1f2e3d4c --race --trials 5 --continuous --penalty 5 -o race"""
+
+_RACE = "Race"
 
 
 def register(app: typer.Typer) -> None:
@@ -48,6 +55,42 @@ def evaluate(
         ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Of the job; evaluate-RUN by default.")] = None,
+    race: Annotated[
+        bool, typer.Option("--race", help="Drive laps of a race from the start line.", rich_help_panel=_RACE)
+    ] = False,
+    trials: Annotated[
+        int | None, typer.Option(help="Laps; 3 by default.", rich_help_panel=_RACE, show_default=False)
+    ] = None,
+    continuous: Annotated[
+        bool | None,
+        typer.Option(
+            "--continuous/--no-continuous",
+            help="Put a car back that left the road or crashed, or end its lap, as by default.",
+            rich_help_panel=_RACE,
+        ),
+    ] = None,
+    penalty: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds for each time off the track and each crash; 1 by default.",
+            rich_help_panel=_RACE,
+            show_default=False,
+        ),
+    ] = None,
+    track: Annotated[
+        list[str] | None,
+        typer.Option(help="Instead of the training's; laps take several in turn. Repeatable.", rich_help_panel=_RACE),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Copy the SimTrace files into this directory, as log tools expect them.",
+            rich_help_panel=_RACE,
+            show_default=False,
+        ),
+    ] = None,
     engine: Annotated[str | None, typer.Option(help="What runs it, of the engines that the controller has.")] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
@@ -58,20 +101,38 @@ def evaluate(
     A job like any other, followed to its end, with a controller of its own where none is running. The policy takes its mean action.
     Every episode becomes a row of a Parquet file beside a summary in the run's evaluations/. The job has one node, with the resources
     that the run's nodes have, and at most one GPU.
+
+    With --race the episodes are laps of a racer from the start line, one world each, timed, with a file of all steps.
     """
     run, checkpoint = split_reference(source)
-    asked = {"checkpoint": checkpoint, "episodes": episodes, "worlds": worlds, "seed": seed}
+    rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None}
+    _refuse_mixed(race, {"episodes": episodes, "worlds": worlds}, {**rules, "output": output})
+    if output is not None and (output / SIM_TRACE).exists():
+        raise UsageError(f"-o {output}: {output / SIM_TRACE} exists; name another directory")
+    asked = {"checkpoint": checkpoint, "episodes": episodes, "worlds": worlds, "seed": seed, **rules}
+    if (seconds := asked.pop("penalty")) is not None:
+        asked |= {"off_track_penalty": seconds, "crash_penalty": seconds}
     with controller(store, cpus) as connect:
         client = connect()
         elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
         spec = _spec(
-            client, named(run), name, {key: value for key, value in asked.items() if value is not None}, set_, elsewhere
+            client,
+            named(run),
+            name,
+            {key: value for key, value in asked.items() if value is not None},
+            set_,
+            elsewhere,
+            "race" if race else "evaluate",
         )
         job = submit_spec(client, spec, f"evaluate {source}")["jobId"]
         code = see_through(client, job, _only_errors if as_json else _told)
-        if as_json and code == 0:
+        if code == 0 and (as_json or output is not None):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
-            echo_json(next(each for each in found if each.get("job") == job), indent=1)
+            summary = next(each for each in found if each.get("job") == job)
+            if output is not None:
+                _copy(Path(client.get(f"/api/runs/{named(run)}")["path"]), summary["name"], output, as_json)
+            if as_json:
+                echo_json(summary, indent=1)
     raise typer.Exit(code)
 
 
@@ -82,12 +143,40 @@ def _spec(
     section: dict[str, Any],
     changes: Sequence[str] | None,
     elsewhere: Sequence[str],
+    kind: str,
 ) -> Spec:
     """The job, on nodes like those of the training. Raises SpecError, ApiError for a run that does not exist."""
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
-    document = evaluation_document(run, trained, section, name)
-    worlds = [f"evaluate.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
+    document = evaluation_document(run, trained, section, name, kind)
+    worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     return validate(override(document, [*worlds, *elsewhere]), f"evaluation of {run}")
+
+
+def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:
+    """Options of races go with --race alone, and the other ones without it. Raises UsageError."""
+    wrong = [name for name, value in (episodes if race else rules).items() if value is not None]
+    if wrong:
+        instead = "a race has --trials, each in a world of its own" if race else "it is for races; add --race"
+        raise UsageError(f"--{wrong[0]}: {instead}")
+
+
+def _copy(run: Path, evaluation: str, output: Path, quiet: bool) -> None:
+    """Bring the SimTrace files of a race to ``output``. Raises ServerError."""
+    made = run / "evaluations" / evaluation / SIM_TRACE
+    if not made.is_dir():
+        raise ServerError(f"-o {output}: the run's directory {run} can't be seen from this machine; they lie in {made}")
+    hidden = output / f".{SIM_TRACE}.{evaluation}.tmp"
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(made, hidden)
+        hidden.rename(output / SIM_TRACE)
+    except OSError as error:
+        shutil.rmtree(hidden, ignore_errors=True)
+        raise ServerError(
+            f"-o {output}: it can't be written ({error.strerror or error}); the files lie in {made}"
+        ) from None
+    if not quiet:
+        echo(f"copied: {output / SIM_TRACE}")
 
 
 def _told(client: Client, job: str) -> int:

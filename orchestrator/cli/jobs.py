@@ -39,7 +39,13 @@ JobArgument = Annotated[
 
 _PATIENCE = 3.0
 """Seconds after which a stop that takes its time says why."""
-_OF_RUN = {"evaluate": "evaluates", "export": "exports", "record": "records", "render": "renders"}
+_OF_RUN = {
+    "evaluate": "evaluates",
+    "race": "races",
+    "export": "exports",
+    "record": "records",
+    "render": "renders",
+}
 """What a job of each kind does with another run."""
 COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 

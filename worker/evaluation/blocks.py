@@ -24,19 +24,20 @@ class Blocks:
     """One policy for each block of worlds, together acting for all of them.
 
     Args:
-        policies: Of each block, alike; they may remember their episodes. There are ``SIZE`` worlds for each.
+        policies: Of each block, alike; they may remember their episodes. There are ``size`` worlds for each.
+        size: Worlds of a block.
     """
 
-    def __init__(self, policies: Sequence[Policy]) -> None:
-        self._policies = policies
+    def __init__(self, policies: Sequence[Policy], size: int = SIZE) -> None:
+        self._policies, self._size = policies, size
 
     def act(self, observations: TensorDict) -> torch.Tensor:
         """Mean actions, shape ``(worlds, actions)``."""
-        parts: Any = observations.split(SIZE)
+        parts: Any = observations.split(self._size)
         return torch.cat([policy.act(part) for policy, part in zip(self._policies, parts, strict=True)])
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
         """Forget the running episodes of all worlds, or where ``worlds`` is true."""
-        parts = [None] * len(self._policies) if worlds is None else worlds.split(SIZE)
+        parts = [None] * len(self._policies) if worlds is None else worlds.split(self._size)
         for policy, part in zip(self._policies, parts, strict=True):
             policy.reset(part)

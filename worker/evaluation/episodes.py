@@ -87,6 +87,7 @@ def play(
     *,
     episodes: int | None = None,
     is_asked_to_stop: Callable[[], bool] = lambda: False,
+    look: Callable[[torch.Tensor], None] | None = None,
 ) -> Episodes:
     """One episode of every world in each round; all ranks call it.
 
@@ -99,13 +100,14 @@ def play(
         gang: The ranks.
         episodes: How many are kept, the first ones; all by default.
         is_asked_to_stop: Whether this rank was asked to leave; looked at now and then.
+        look: Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool.
 
     Raises:
         Stopped: A rank was asked to leave.
     """
     parts, task = [], None
     for task in rounds:
-        parts.append(_gather(_one_round(task, policy, gang, is_asked_to_stop), gang))
+        parts.append(_gather(_one_round(task, policy, gang, is_asked_to_stop, look), gang))
     assert task is not None
     ended = task.ended
     success = ended.meaning if ended and ended.says_success else None
@@ -114,7 +116,13 @@ def play(
     return Episodes(torch.cat(parts)[:episodes], ended.columns, ended.names, success)
 
 
-def _one_round(task: Task, policy: Acting, gang: Gang, is_asked_to_stop: Callable[[], bool]) -> torch.Tensor:
+def _one_round(
+    task: Task,
+    policy: Acting,
+    gang: Gang,
+    is_asked_to_stop: Callable[[], bool],
+    look: Callable[[torch.Tensor], None] | None,
+) -> torch.Tensor:
     """Rows of the first episode of each world after a reset, shape ``(worlds, columns)``."""
     task.reset()
     policy.reset()
@@ -125,6 +133,8 @@ def _one_round(task: Task, policy: Acting, gang: Gang, is_asked_to_stop: Callabl
     for step in range(task.max_episode_length):
         task.step(policy.act(observations))
         policy.reset(task.dones)
+        if look is not None:
+            look(running)
         rows[:, _RETURN] += torch.where(running, task.rewards, 0.0)
         rows[:, _LENGTH] += running
         over = running & (task.dones != 0)

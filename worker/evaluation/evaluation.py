@@ -24,6 +24,7 @@ from worker.evaluation.table import write_table
 from worker.learning.algorithm import Policy
 
 if TYPE_CHECKING:
+    from worker.evaluation.race import Race
     from worker.tasks.task import Task
 
 FORMAT = 1
@@ -105,21 +106,27 @@ class Evaluation:
             "seconds": self.seconds,
         }
 
-    def write(self, run: Run, job: str = "", **facts: Any) -> dict[str, Any]:
+    def write(self, run: Run, job: str = "", race: Race | None = None, **facts: Any) -> dict[str, Any]:
         """Write the table, then the summary, which is also returned. Raises OSError.
 
         Args:
             run: The run that was evaluated.
             job: Id of the job that did nothing else; it names the files.
+            race: What the episodes are the trials of; its step logs are written before the table.
             **facts: What else the summary says.
         """
         name = evaluation_name(self.checkpoint, job)
         summary = {**self.summary(), **facts, "job": job or None, "table": f"{name}.parquet", "time": time.time()}
+        if race is not None:
+            summary["race"] = race.summary()
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
+        earlier = [each for each in earlier if ("race" in each) == (race is not None)]
         if earlier:
             summary["compared"] = self._compared(run, earlier[-1], summary)
         summary = _finite(summary)
-        write_table(run.evaluations / summary["table"], self.played, self.seed)
+        if race is not None:
+            race.write_sim_traces(run.evaluations / name)
+        write_table(run.evaluations / summary["table"], self.played, self.seed, race.columns() if race else None)
         write_json(run.evaluations / f"{name}.json", summary)
         return summary
 

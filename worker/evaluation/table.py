@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from shared_store.files import write_atomic
 from worker.evaluation.episodes import Episodes
 
 
-def write_table(path: Path, played: Episodes, seed: int | None) -> None:
+def write_table(
+    path: Path, played: Episodes, seed: int | None, further: Mapping[str, Sequence[Any]] | None = None
+) -> None:
     """Write the episodes, whole or not at all. The same episodes are the same bytes. Raises OSError.
 
     Columns: ``episode`` (its number), ``seed`` (of the worlds; none of those of a training), ``return``, ``length`` [steps], ``success``,
@@ -19,6 +23,7 @@ def write_table(path: Path, played: Episodes, seed: int | None) -> None:
         path: Of the file.
         played: The episodes.
         seed: Of the worlds.
+        further: Columns of further facts, by name; numbers are float64 unless all are whole.
     """
     import pyarrow as arrow
     import pyarrow.parquet
@@ -35,6 +40,10 @@ def write_table(path: Path, played: Episodes, seed: int | None) -> None:
         "cause": arrow.array(played.ends, arrow.string()),
         **{name: arrow.array(played.term(name).numpy(), arrow.float64()) for name in played.terms},
     }
+    for name, values in (further or {}).items():
+        whole = all(isinstance(value, int) for value in values)
+        text = all(isinstance(value, str) for value in values)
+        columns[name] = arrow.array(values, arrow.string() if text else arrow.int64() if whole else arrow.float64())
     buffer = io.BytesIO()
     pyarrow.parquet.write_table(arrow.table(columns), buffer)
     for left in path.parent.glob(f".{path.name}.*.tmp"):  # of an evaluation that was killed

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from worker.racer.car_arrays import CarArrays, begin_car, follow_car, move_car
+from worker.racer.car_arrays import CarArrays, ResetRules, begin_car, follow_car, move_car
 from worker.racer.circuit import BOX, Circuit
+from worker.racer.resets import COUNTS, forget_mishaps, go_on, note_mishap
 from worker.racer.road import road_arrays
+from worker.racer.trace import COLUMNS, trace_car
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.sensors.sensor import SensorContext, views_of
@@ -28,7 +30,11 @@ LASTING = (
     *("travelled", "steps", "standing", "falling"),
 )
 """What the next control step reads; the rest follows from it."""
-SHAPED = {wp.vec2: ("commands", "fronts"), wp.vec3: ("poses", "factors"), wp.bool: ("backwards", "left", "crashed")}
+SHAPED = {
+    wp.vec2: ("commands", "fronts"),
+    wp.vec3: ("poses", "factors", "put_poses"),
+    wp.bool: ("backwards", "left", "crashed", "put"),
+}
 COUNTED = (
     "tracks",
     "rows",
@@ -40,8 +46,9 @@ COUNTED = (
     "falling",
     "next_obstacle",
     "last_obstacle",
+    "mishaps",
 )
-MEASURED = ("speeds", "steerings", "distances", "along", "headings", "widths", "travelled", "moved")
+MEASURED = ("speeds", "steerings", "distances", "along", "headings", "widths", "travelled", "moved", "set_back")
 
 
 @wp.kernel
@@ -59,7 +66,14 @@ def _move(
 
 @wp.kernel
 def _follow(car: CarArrays):
-    follow_car(wp.tid(), car)
+    world = wp.tid()
+    follow_car(world, car)
+    note_mishap(world, car)
+
+
+@wp.kernel
+def _trace(car: CarArrays):
+    trace_car(wp.tid(), car)
 
 
 @wp.kernel
@@ -67,6 +81,9 @@ def _begin(episodes: EpisodeArrays, car: CarArrays):
     world = wp.tid()
     if episodes.ages[world] == 0:
         begin_car(world, car)
+        forget_mishaps(world, car)
+    elif car.put[world]:
+        go_on(world, car)
 
 
 @dataclass(frozen=True)
@@ -79,6 +96,11 @@ class Cars:
         speed_lag: Time constant of the speed [s].
         steering_lag: Time constant of the steering [s].
         parts: Parts of a control step in which the motion is integrated.
+        continuous: Whether a car that can't go on is put back; else its episode ends.
+        put_back: How far behind where it was [m].
+        max_resets: How often in an episode; the next time it ends.
+        stuck_steps: Control steps in a row of standing, or of coming back, after which a car does not go on.
+        traced: Whether :mod:`worker.racer.trace` notes each control step.
     """
 
     circuit: Circuit
@@ -86,7 +108,14 @@ class Cars:
     speed_lag: float = 0.0
     steering_lag: float = 0.0
     parts: int = 4
+    continuous: bool = False
+    put_back: float = 1.0
+    max_resets: int = 100
+    stuck_steps: int = 15
+    traced: bool = False
     arrays_type: ClassVar[Any] = CarArrays
+    meaning: ClassVar[str] = "Cars"
+    """What a policy's contract says of it: what is measured is the same on every track."""
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """None: a term that reads the car is called once."""
@@ -123,6 +152,14 @@ class Driving:
         kinds |= dict.fromkeys(COUNTED, wp.int32) | dict.fromkeys(MEASURED, wp.float32)
         for name, kind in kinds.items():
             setattr(arrays, name, wp.zeros(self._count, dtype=kind, device=device))
+        arrays.counts = wp.zeros((self._count, len(COUNTS)), dtype=wp.int32, device=device)
+        self._traced = declared.traced
+        arrays.trace = wp.zeros((self._count if self._traced else 0, len(COLUMNS)), dtype=wp.float32, device=device)
+        self._lasting = (*LASTING, "counts") if declared.continuous else LASTING
+        rules = ResetRules()
+        rules.continuous, rules.put_back = declared.continuous, declared.put_back
+        rules.max_resets, rules.stuck_steps = declared.max_resets, declared.stuck_steps
+        arrays.rules = rules  # a copy: it has to be complete
         self._moving = [context.worlds.arrays, context.robots["robot"], arrays]
         self._moving += [declared.speed_lag, declared.steering_lag, 1.0 / context.control_hz, declared.parts]
 
@@ -133,11 +170,13 @@ class Driving:
     def advance(self) -> None:
         """Where the cars are after a control step."""
         wp.launch(_follow, dim=self._count, inputs=[self.arrays], device=self._device)
+        if self._traced:
+            wp.launch(_trace, dim=self._count, inputs=[self.arrays], device=self._device)
 
     def settle(self) -> None:
-        """Where the cars are that were put down."""
+        """Where the cars are that were put down, or back."""
         wp.launch(_begin, dim=self._count, inputs=[self._episodes, self.arrays], device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """What the next control step reads."""
-        return views_of(self.arrays, *LASTING)
+        return views_of(self.arrays, *self._lasting)

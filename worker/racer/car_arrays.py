@@ -28,6 +28,23 @@ X, Y, HEADING, STEERING, STEERING_RIGHT, WHEELS = (wp.constant(joint) for joint 
 
 
 @wp.struct
+class ResetRules:
+    """When a car is put back, and where.
+
+    Attributes:
+        continuous: Whether it is put back at all; else its episode ends.
+        put_back: How far behind where it was [m].
+        max_resets: How often in an episode.
+        stuck_steps: Control steps in a row of standing, or of coming back, after which it does not go on.
+    """
+
+    continuous: bool
+    put_back: float
+    max_resets: int
+    stuck_steps: int
+
+
+@wp.struct
 class CarArrays:
     """The cars, one row a world, and the road that they share. A car drives the track ``tracks[world]``, in that track's own frame.
 
@@ -64,6 +81,14 @@ class CarArrays:
         falling: Steps in a row in which it came back, shape ``(worlds,)``.
         next_obstacle: Index of the first obstacle ahead; -1: there is none, shape ``(worlds,)``.
         last_obstacle: Index of the first one behind; -1: there is none, shape ``(worlds,)``.
+        rules: When cars are put back.
+        mishaps: What went wrong in the last control step, see :data:`worker.racer.resets.MISHAPS`; 0: nothing, shape ``(worlds,)``.
+        put: Whether the car is put back for it, shape ``(worlds,)``.
+        put_poses: Where to, where ``put``: as ``poses``, shape ``(worlds,)``.
+        set_back: How much of its way along the centre line it loses by that [m], shape ``(worlds,)``.
+        counts: How often what happened in the episode, see :data:`worker.racer.resets.COUNTS`; shape ``(worlds, 5)``.
+        trace: The last control step as race results have it, see :data:`worker.racer.trace.COLUMNS`; shape ``(worlds, 13)``, without
+            rows where nobody asked for it.
     """
 
     road: RoadArrays
@@ -96,6 +121,13 @@ class CarArrays:
     falling: wp.array(dtype=wp.int32)
     next_obstacle: wp.array(dtype=wp.int32)
     last_obstacle: wp.array(dtype=wp.int32)
+    rules: ResetRules
+    mishaps: wp.array(dtype=wp.int32)
+    put: wp.array(dtype=wp.bool)
+    put_poses: wp.array(dtype=wp.vec3)
+    set_back: wp.array(dtype=wp.float32)
+    counts: wp.array2d(dtype=wp.int32)
+    trace: wp.array2d(dtype=wp.float32)
 
 
 @wp.func

@@ -237,6 +237,20 @@ def place_at(road: RoadArrays, track: int, along: float, backwards: bool) -> wp.
 
 
 @wp.func
+def width_at(road: RoadArrays, track: int, along: float, backwards: bool) -> float:
+    """Width of the road ``along`` [m] from the start line in driving direction [m]."""
+    first = road.first[track]
+    length = road.length[track]
+    forth = around(along, length)
+    if backwards:
+        forth = around(length - forth, length)
+    row = row_at(road, track, forth)
+    share = (forth - road.along[first + row]) / road.steps[first + row]
+    here = road.width[first + row]
+    return here + share * (road.width[first + next_row(road, track, row)] - here)
+
+
+@wp.func
 def advance(road: RoadArrays, track: int, before: float, after: float) -> float:
     """By how far a car has come on between two ``along`` [m], over the start line too; less than 0 where it went back."""
     half = road.length[track] / 2.0

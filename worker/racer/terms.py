@@ -84,8 +84,8 @@ def obstacle_ahead(world: int, car: CarArrays) -> wp.vec2:
 
 @wp.func
 def progress_made(world: int, car: CarArrays) -> float:
-    """How far the car came on in this step, as a share of the track [%]; less than 0 where it came back."""
-    return 100.0 * car.moved[world] / car.road.length[car.tracks[world]]
+    """How far the car came on in this step, as a share of the track [%]; less than 0 where it came back, or is put back."""
+    return 100.0 * (car.moved[world] - car.set_back[world]) / car.road.length[car.tracks[world]]
 
 
 @wp.func
@@ -101,6 +101,18 @@ def hit_obstacle(world: int, car: CarArrays) -> bool:
 
 
 @wp.func
+def ends_crashed(world: int, car: CarArrays) -> bool:
+    """The car touches an obstacle, and is not put back."""
+    return car.crashed[world] and not car.put[world]
+
+
+@wp.func
+def ends_off_track(world: int, car: CarArrays) -> bool:
+    """No wheel is on the road, and the car is not put back."""
+    return car.wheels[world] == 0 and not car.put[world]
+
+
+@wp.func
 def lap_complete(world: int, car: CarArrays) -> bool:
     """The car has come as far as the track is long since the episode began."""
     return progress_of(world, car) >= 100.0
@@ -108,14 +120,14 @@ def lap_complete(world: int, car: CarArrays) -> bool:
 
 @wp.func
 def immobilized(world: int, car: CarArrays, steps: int) -> bool:
-    """The car moved by less than 0.3 mm in each of the last ``steps``."""
-    return car.standing[world] >= steps
+    """The car moved by less than 0.3 mm in each of the last ``steps``, and is not put back."""
+    return car.standing[world] >= steps and not car.put[world]
 
 
 @wp.func
 def reversed_course(world: int, car: CarArrays, steps: int) -> bool:
-    """The car came back in each of the last ``steps``."""
-    return car.falling[world] >= steps
+    """The car came back in each of the last ``steps``, and is not put back."""
+    return car.falling[world] >= steps and not car.put[world]
 
 
 @wp.func
@@ -124,7 +136,8 @@ def final_progress(world: int, car: CarArrays) -> float:
     steps = float(car.steps[world])
     length = car.road.length[car.tracks[world]]
     before = 100.0 * wp.clamp((car.travelled[world] - car.moved[world]) / length, 0.0, 1.0)
-    return steps * progress_of(world, car) - (steps - 1.0) * before
+    now = 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / length, 0.0, 1.0)
+    return steps * now - (steps - 1.0) * before
 
 
 @wp.func

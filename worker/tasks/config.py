@@ -199,6 +199,8 @@ class TaskConfig(_Common):
     further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
     """Observation groups besides ``policy`` and ``critic``, and of each whether it is of images, such as ``{"camera": True}``; ``policy``,
     too, where a declaration makes it an image. Jobs are checked against these names when they are submitted."""
+    races: ClassVar[bool] = False
+    """Whether an episode is a lap of a race, as a job's ``race`` has it run."""
 
     @classmethod
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:

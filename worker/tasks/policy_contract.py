@@ -151,7 +151,9 @@ def _term(plan: Plan, seen: Seen, first: int) -> Term:
 
 
 def _sensor(declared: Any) -> str:
-    """A sensor in a line, such as ``ImuSensor, site imu``."""
+    """A sensor in a line, such as ``ImuSensor, site imu``; in its own words where it has a ``meaning``."""
+    if meaning := getattr(declared, "meaning", ""):
+        return str(meaning)
     return ", ".join(filter(None, (type(declared).__name__, settings(declared))))
 
 

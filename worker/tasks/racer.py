@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import newton
 
 from shared_store.layout import Store
+from worker.racer import resets
 from worker.racer import terms as racing
 from worker.racer.actions import ActionSpace
 from worker.racer.car import Cars
@@ -76,8 +77,8 @@ class Racer(DeclaredTask):
             rewards=self.rewards_of(config),
             terminations={
                 "lap_complete": Termination(racing.lap_complete),
-                "crashed": Termination(racing.hit_obstacle),
-                "off_track": Termination(racing.left_road),
+                "crashed": Termination(racing.ends_crashed),
+                "off_track": Termination(racing.ends_off_track),
                 "immobilized": Termination(racing.immobilized, steps=config.stuck_steps),
                 "reversed": Termination(racing.reversed_course, steps=config.stuck_steps),
             },
@@ -93,9 +94,14 @@ class Racer(DeclaredTask):
                     speed_factor=config.speed_factor,
                     steering_factor=config.steering_factor,
                     steering_offset=config.steering_offset,
-                )
+                ),
+                **resetting(config),
             },
-            metrics={"progress": Metric(racing.final_progress), "lap_time": Metric(racing.lap_time)},
+            metrics={
+                "progress": Metric(racing.final_progress),
+                "lap_time": Metric(racing.lap_time),
+                **mishap_metrics(config),
+            },
             success="lap_complete",
             sensors=self.sensors_of(config),
         )
@@ -123,6 +129,11 @@ class Racer(DeclaredTask):
             config.speed_lag,
             config.steering_lag,
             config.substeps,
+            config.continuous,
+            config.put_back,
+            config.max_resets,
+            config.stuck_steps,
+            config.trace,
         )
         return {"car": cars}
 
@@ -199,6 +210,21 @@ def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
         "steering": Action(terms.position_target, joints="steering", **steering),
         "speed": Action(terms.velocity_target, joints="speed", **speed),
     }
+
+
+def resetting(config: RacerConfig) -> Mapping[str, Event]:
+    """What puts cars back, in each control step, where they are."""
+    step = 1.0 / config.control_hz
+    return {"put_back": Event(resets.put_back, when="interval", seconds=(step, step))} if config.continuous else {}
+
+
+def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
+    """How often an episode's car was put back and why, and its penalties [s], where cars are put back."""
+    if not config.continuous:
+        return {}
+    penalties = {"off_track": config.off_track_penalty, "crash": config.crash_penalty}
+    counts = {name: Metric(resets.happened, column=number) for number, name in enumerate(resets.COUNTS)}
+    return {**counts, "penalty": Metric(resets.penalty, **penalties)}
 
 
 def tracks_of(config: RacerConfig) -> list[Track]:

@@ -71,6 +71,7 @@ class RacerConfig(TaskConfig):
             refuses.
     """
 
+    races: ClassVar[bool] = True
     control_hz: Positive = 15.0
     """Control steps per simulated second [Hz]."""
     substeps: Annotated[int, Field(ge=1, le=64)] = 4
@@ -112,6 +113,18 @@ class RacerConfig(TaskConfig):
     """Boxes on every track."""
     stuck_steps: Count = 15
     """Control steps in a row of standing, or of coming back, that end an episode."""
+    continuous: bool = False
+    """Whether a car that leaves the road, crashes, stands or comes back is put back and drives on, instead of ending its episode."""
+    put_back: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """How far behind where it was [m]."""
+    off_track_penalty: Amount = 1.0
+    """Added to a lap's time for each time that the car left the road [s]."""
+    crash_penalty: Amount = 1.0
+    """For each obstacle that it touched [s]."""
+    max_resets: Annotated[int, Field(ge=0, le=1_000_000)] = 100
+    """How often a car is put back in an episode; the next time the episode ends."""
+    trace: bool = False
+    """Whether each control step is noted on the device for the files of a race; a race sets it."""
     waypoints: Annotated[int, Field(ge=1, le=64)] = 8
     """Points of the centre line ahead that the policy sees."""
     waypoint_spacing: Positive = 0.3

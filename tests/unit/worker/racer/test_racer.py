@@ -333,3 +333,9 @@ def test_an_image_and_numbers_are_groups_of_their_own() -> None:
     sketch = RacerPixelsAndState.sketch(RacerPixelsAndState.config_type())
     assert sketch.observation_names == ("speed", "steering") and sketch.plan.images == {"front": "front"}
     assert len(sketch.plan.groups["critic"]) == 6
+
+
+def test_a_policy_means_the_same_on_another_track_and_by_other_rules() -> None:
+    here = racer(track="oval")
+    there = racer(track=("chicane", "random:3"), continuous=True, trace=True, speed_lag=0.1)
+    assert policy_contract(here, "Racer") == policy_contract(there, "Racer")

@@ -1,0 +1,190 @@
+"""A race: what is noted of each control step of its trials, their times and penalties, and their SimTrace files."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+import warp as wp
+
+from shared_store.files import write_atomic
+from shared_store.races import SIM_TRACE
+from worker.racer.resets import MISHAPS
+from worker.racer.trace import COLUMNS
+
+if TYPE_CHECKING:
+    from worker.evaluation.episodes import Episodes
+    from worker.tasks.racer import Racer
+
+SIM_TRACE_COLUMNS = (
+    *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done", "all_wheels_on_track"),
+    *("progress", "closest_waypoint", "track_len", "tstamp", "episode_status", "pause_duration"),
+    *("obstacle_crash_counter", "wall_clock"),
+)
+"""Of a SimTrace file, as DeepRacer's community reads it."""
+COMPLETE = "lap_complete"
+_CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}
+"""What a trial calls how often each mishap happened."""
+_STATUS = {"time_out": "time_up"}
+"""What SimTrace files call an end otherwise."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A lap from the start line, as far as it went.
+
+    Attributes:
+        steps: A row of numbers for each control step, shape ``(steps, 15)``: :data:`worker.racer.trace.COLUMNS`, the reward, and the
+            action, which is -1 where actions are continuous.
+        clocks: When each was done, by the clock [s].
+        status: By what it ended.
+        track: Name of the track.
+        length: Of its centre line [m].
+        control_hz: Control steps a second [Hz].
+    """
+
+    steps: torch.Tensor
+    clocks: Sequence[float]
+    status: str
+    track: str
+    length: float
+    control_hz: float
+
+    def summary(self, number: int, rules: Mapping[str, Any], seed: int) -> dict[str, Any]:
+        """Times in simulated seconds: ``lap_time`` without penalties, null of a lap that is not complete, ``time`` with them."""
+        seconds = len(self.steps) / self.control_hz
+        counts = {name: int(self.steps[-1, COLUMNS.index(kind)]) for name, kind in _CALLED.items()}
+        penalty = counts["off_tracks"] * rules["off_track_penalty"] + counts["crashes"] * rules["crash_penalty"]
+        return {
+            "trial": number,
+            "status": self.status,
+            "completion": float(self.steps[-1, COLUMNS.index("progress")]),
+            "lap_time": seconds if self.status == COMPLETE else None,
+            "time": seconds + penalty,
+            **counts,
+            "resets": int(self.steps[-1, COLUMNS.index("resets")]),
+            "penalty": float(penalty),
+            "steps": len(self.steps),
+            "seed": seed,
+        }
+
+    def sim_trace(self, episode: int) -> Iterator[str]:
+        """The lines of its SimTrace file. Where the car is and where it points is said of its front, angles in degrees."""
+        yield ",".join(SIM_TRACE_COLUMNS)
+        before = [0.0] * len(MISHAPS)
+        for number, row in enumerate(self.steps.tolist()):
+            told = dict(zip((*COLUMNS, "reward", "action"), row, strict=True))
+            counts = [told[name] for name in MISHAPS]
+            status = next((name for name, now, then in zip(MISHAPS, counts, before, strict=True) if now > then), "")
+            before = counts
+            if done := number == len(self.steps) - 1:
+                status = _STATUS.get(self.status, self.status)
+            yield ",".join(
+                (
+                    *(f"{episode}", f"{number + 1}", f"{told['x']:.4f}", f"{told['y']:.4f}"),
+                    *(f"{math.degrees(told['heading']):.4f}", f"{math.degrees(told['steering']):.2f}"),
+                    *(f"{told['speed']:.2f}", f"{told['action']:.0f}", f"{told['reward']:.4f}", f"{done}"),
+                    *(f"{told['wheels'] == 4}", f"{told['progress']:.4f}", f"{told['waypoint']:.0f}"),
+                    *(f"{self.length:.2f}", f"{(number + 1) / self.control_hz:.3f}", status or "in_progress", "0.00"),
+                    *(f"{told['crashed']:.0f}", f"{self.clocks[number]:.3f}"),
+                )
+            )
+
+
+@dataclass(frozen=True)
+class Race:
+    """The trials of a race.
+
+    Attributes:
+        trials: In their order.
+        rules: See :func:`shared_store.races.rules_of`.
+        directions: In which each track is driven, by its name.
+        seed: Of the worlds.
+    """
+
+    trials: Sequence[Trial]
+    rules: Mapping[str, Any]
+    directions: Mapping[str, str]
+    seed: int
+
+    def summary(self) -> dict[str, Any]:
+        """As JSON values. Best, average and total are of complete laps with their penalties; there is a total where all are complete."""
+        trials = [trial.summary(number, self.rules, self.seed) for number, trial in enumerate(self.trials, 1)]
+        laps = [trial["time"] for trial in trials if trial["status"] == COMPLETE]
+        total = math.fsum(laps)
+        return {
+            "rules": dict(self.rules),
+            "track": list(self.directions),
+            "direction": ", ".join(dict.fromkeys(self.directions.values())),
+            "trials": trials,
+            "completed": len(laps),
+            "total_time": total if len(laps) == len(trials) else None,
+            "best_lap": min(laps, default=None),
+            "average_lap": total / len(laps) if laps else None,
+            **{name: sum(trial[name] for trial in trials) for name in ("off_tracks", "crashes", "resets")},
+        }
+
+    def columns(self) -> dict[str, list[Any]]:
+        """What a table has of each trial, by column."""
+        trials = self.summary()["trials"]
+        return {name: [trial[name] for trial in trials] for name in trials[0] if name != "seed"}
+
+    def write_sim_traces(self, evaluation: Path) -> None:
+        """Write a SimTrace file for each trial below the directory of an evaluation, in the layout that log tools look for.
+
+        Raises OSError.
+        """
+        folder = evaluation / SIM_TRACE / "evaluation" / evaluation.name / "evaluation-simtrace"
+        folder.mkdir(parents=True, exist_ok=True)
+        for episode, trial in enumerate(self.trials):
+            text = "\n".join(trial.sim_trace(episode)) + "\n"
+            write_atomic(folder / f"{episode}-iteration.csv", text.encode())
+
+
+class Laps:
+    """Looks on while trials are driven, one in each world.
+
+    Args:
+        task: Whose configuration has ``trace``.
+    """
+
+    def __init__(self, task: Racer) -> None:
+        self._task = task
+        arrays = task.sensors["car"].arrays
+        self._trace = wp.to_torch(arrays.trace)
+        self._tracks = [task.circuit.tracks[number] for number in arrays.tracks.numpy().tolist()]
+        self._noted: list[tuple[float, torch.Tensor, torch.Tensor]] = []
+
+    def note(self, running: torch.Tensor) -> None:
+        """Keep the last control step of the worlds whose trial had not ended before it, shape ``(worlds,)``, bool."""
+        task = self._task
+        action = task.actions if task.discrete else torch.full_like(task.rewards, -1.0)[:, None]
+        rows = torch.cat([self._trace, task.rewards[:, None], action], 1)
+        worlds = running.nonzero()[:, 0]
+        self._noted.append((time.time(), worlds.cpu(), rows[worlds].cpu()))
+
+    def race(self, played: Episodes, rules: Mapping[str, Any], seed: int) -> Race:
+        """The race that these trials were.
+
+        Args:
+            played: How each ended.
+            rules: Of the race.
+            seed: Of the worlds.
+        """
+        steps: list[list[torch.Tensor]] = [[] for _ in self._tracks]
+        clocks: list[list[float]] = [[] for _ in self._tracks]
+        for clock, worlds, rows in self._noted:
+            for world, row in zip(worlds.tolist(), rows, strict=True):
+                steps[world].append(row)
+                clocks[world].append(clock)
+        hz = self._task.config.control_hz
+        trials = [
+            Trial(torch.stack(rows), times, status, track.name, track.length, hz)
+            for rows, times, status, track in zip(steps, clocks, played.ends, self._tracks, strict=True)
+        ]
+        return Race(trials, rules, {track.name: track.direction for track in self._tracks}, seed)
