@@ -10,7 +10,8 @@ from typing import Any
 
 from orchestrator.errors import UsageError
 from shared_store.files import write_atomic
-from shared_store.standings import Row, clock
+from shared_store.races import clock
+from shared_store.standings import Row
 
 COLUMNS = ("RANK", "ENTRY", "RACER", "MODEL", "TIME", "BEST LAP", "LAPS", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS")
 _NUMBERS = ("off_tracks", "crashes", "resets")

@@ -25,6 +25,7 @@ from shared_store.bundles import DamagedBundle
 from shared_store.documents import DocumentError, parse
 from shared_store.files import DamagedFile, read_json, refuse_links, write_json
 from shared_store.layout import NAME, Store
+from shared_store.races import race_changes, rules_of
 from shared_store.standings import BadRace, Contender, Ranking, read_race
 from shared_store.wording import counted, nearest, shown
 
@@ -37,6 +38,7 @@ CAR: Mapping[str, Any] = {
     "steering_factor": [1.0, 1.0],
     "steering_offset": [0.0, 0.0],
     "stuck_steps": 15,
+    "put_back": 1.0,
 }
 """Settings of the tasks ``Racer…`` that every car of a new league has, whatever it was trained with."""
 _NUMBER = re.compile(r"[1-9][0-9]{0,8}")
@@ -116,23 +118,25 @@ class League:
         race = summary.get("race")
         if not isinstance(race, Mapping):
             return "it is no race"
-        driven, ruled = race.get("rules"), asdict(self.rules)
-        for key in ruled.keys() - {"ranking"}:  # which follows from the times
+        driven, ruled = race.get("rules"), rules_of(self.section())
+        for key in sorted(ruled.keys() - {"ranking"}):  # which follows from the times
             value = driven.get(key) if isinstance(driven, Mapping) else None
-            if value != ruled[key] or isinstance(value, bool) != isinstance(ruled[key], bool):
+            if not _same(value, ruled[key]):
                 return f"its rules have {key} {shown(value)}, the league's {ruled[key]}"
-        if race.get("track") != list(self.track):
-            return f"it was driven on {shown(race.get('track'))}, the league is on {', '.join(self.track)}"
         if summary.get("seed") != self.seed:
             return f"its seed is {shown(summary.get('seed'))}, the league's {self.seed}"
-        config = summary.get("config")
+        config, own = summary.get("config"), race_changes(self.section())
         changes = config if isinstance(config, Mapping) else {}
-        if other := sorted(changes.keys() - self.car.keys() - {"track"}):
-            return f"its car has config.{other[0]} {shown(changes[other[0]])}, the league's has not"
-        for key, value in self.car.items():
-            if changes.get(key) != value:
-                return f"its car has config.{key} {shown(changes.get(key))}, the league's {shown(value)}"
+        for key in sorted(changes.keys() | own.keys()):
+            if key not in changes or key not in own or not _same(changes[key], own[key]):
+                return f"its config.{key} is {shown(changes.get(key))}, the league's {shown(own.get(key))}"
         return ""
+
+    def section(self) -> dict[str, Any]:
+        """What the section ``race`` of a job says of a race in this league, beside the run."""
+        rules = {key: value for key, value in asdict(self.rules).items() if key not in ("laps", "ranking")}
+        places = {"trials": self.rules.laps, "seed": self.seed, "track": list(self.track), "config": dict(self.car)}
+        return {**places, **rules}
 
     def check_tracks(self, store: Store) -> None:
         """Raise LeagueError where a track of the store is gone, damaged, or another one under its name."""
@@ -354,6 +358,11 @@ def digest_of_track(store: Store, name: str) -> str | None:
         return str(track.facts().get("digest"))
     except tracks.TrackError as error:
         raise LeagueError(str(error)) from None
+
+
+def _same(value: Any, other: Any) -> bool:
+    """Whether two values of a summary are the same: true is not 1."""
+    return bool(value == other) and isinstance(value, bool) == isinstance(other, bool)
 
 
 def moment(seconds: float) -> str:

@@ -215,11 +215,3 @@ def _row(each: Contender, status: Status, time: int | None, reason: str = "") ->
 
 def _seconds(milliseconds: int | None) -> float | None:
     return None if milliseconds is None else milliseconds / 1000
-
-
-def clock(seconds: float | None) -> str:
-    """``mm:ss.mmm``; ``-`` for None."""
-    if seconds is None:
-        return "-"
-    minutes, rest = divmod(round(1000 * seconds), 60_000)
-    return f"{minutes:02}:{rest // 1000:02}.{rest % 1000:03}"

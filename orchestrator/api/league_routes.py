@@ -23,7 +23,8 @@ from orchestrator.database import find_job
 from orchestrator.engines.several import FRESH
 from orchestrator.errors import SpecError
 from orchestrator.jobs import Status
-from orchestrator.league_races import is_racer, race_job
+from orchestrator.league_races import race_job
+from orchestrator.settings import task_config
 from shared_store import bundles, leagues
 from shared_store.bundles import DamagedBundle
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
@@ -56,7 +57,7 @@ class CreateRequest(_Strict):
     off_track_penalty: _Seconds = 1.0
     crash_penalty: _Seconds = 1.0
     max_resets: int = Field(default=100, ge=0, le=10_000, description="in one lap")
-    seconds: float = Field(default=1200.0, gt=0, le=86_400, description="simulated, that a lap may take")
+    seconds: float = Field(default=1200.0, gt=0, le=3600, description="simulated, that a lap may take")
     seed: int = Field(default=1, ge=0, lt=2**31)
     opens: _Moment | None = Field(default=None, description="Unix time in seconds; at once where absent")
     closes: _Moment | None = Field(default=None, description="Unix time in seconds; never where absent")
@@ -317,9 +318,10 @@ def _checked(controller: Controller, league: League, model: Model) -> Checkpoint
         league.check_tracks(controller.store)
     except LeagueError as error:
         raise _refused(error) from None
-    if not is_racer(facts.get("task")):
+    kind = task_config(str(facts.get("task")))
+    if kind is None or not kind.races:  # what a class of the user's own drives nobody knows
         raise ClientError(
-            f"model {model.reference} is of task {facts.get('task')}; a league takes models of the installed tasks Racer…"
+            f"model {model.reference} is of task {facts.get('task')}; a league takes models of the racer's installed tasks"
         )
     name, run = str(facts.get("checkpoint")), controller.store.run(str(facts.get("run")))
     found = checkpoint_called(run.checkpoints, name)

@@ -22,7 +22,8 @@ from orchestrator.client import Client, named
 from orchestrator.errors import UsageError
 from orchestrator.league_table import COLUMNS, cells, write
 from shared_store.leagues import moment
-from shared_store.standings import RANKINGS, clock, differences
+from shared_store.races import clock
+from shared_store.standings import RANKINGS, differences
 from shared_store.wording import counted, nearest
 
 LeagueArgument = Annotated[str, typer.Argument(metavar="NAME", help="A league.")]
@@ -79,7 +80,7 @@ def create(
     max_resets: Annotated[
         int, typer.Option(min=0, max=10_000, help="How often a car is put back in a lap; once more ends it.")
     ] = 100,
-    seconds: Annotated[float, typer.Option(min=0.1, max=86_400, help="Simulated time that a lap may take.")] = 1200.0,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Simulated time that a lap may take.")] = 1200.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of every race.")] = 1,
     opens: Annotated[
         str | None, typer.Option(help="2026-12-01T18:00, or with Z in UTC; at once by default.", show_default=False)

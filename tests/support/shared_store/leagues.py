@@ -6,9 +6,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from shared_store.leagues import CAR, League, Rules
+from shared_store.leagues import League, Rules
+from shared_store.races import race_changes
 
 RULES = asdict(Rules()) | {"ranking": None}
+CONFIG = race_changes(League("cup", ("oval",), Rules(), 7, "user ada", 1000.0).section())
+"""What a race of :func:`league` changes of the configuration."""
 
 
 def league(name: str = "cup", **changes: Any) -> League:
@@ -58,7 +61,7 @@ def race(times: Sequence[float | None], off_tracks: int = 0, resets: int = 0, **
 def summary(driven: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """An evaluation's summary with a race."""
     figures = {"mean_return": 100.0, "mean_length": 185.0, "max_length": 18_000, "episodes": 3, "time": 2000.0}
-    facts = {"task": "Racer", "seed": 7, "config": dict(CAR), "versions": {"warp": "1.0"}, "race": driven}
+    facts = {"task": "Racer", "seed": 7, "config": dict(CONFIG), "versions": {"warp": "1.0"}, "race": driven}
     return {**figures, **facts, **changes}
 
 

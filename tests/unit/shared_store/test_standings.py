@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shared_store.standings import BadRace, Contender, Race, Ranking, clock, differences, read_race, table
+from shared_store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
 from tests.support.shared_store.leagues import race
 
 
@@ -142,11 +142,3 @@ def test_two_races_are_compared_to_the_last_bit() -> None:
     ]
     assert differences(before, race([12.0]))[-1] == "3 trials became 1"
     assert differences(before, {**before, "track": ["chicane"]}) == ["track: ['oval'] became ['chicane']"]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "told"),
-    [(None, "-"), (0.0, "00:00.000"), (12.34, "00:12.340"), (61.0006, "01:01.001"), (754.2, "12:34.200")],
-)
-def test_times_are_shown_as_minutes_seconds_and_milliseconds(seconds: float | None, told: str) -> None:
-    assert clock(seconds) == told
