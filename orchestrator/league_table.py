@@ -60,7 +60,7 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     from matplotlib.figure import Figure
 
     shown = [[*cells(row)[:-1], row["status"]] for row in rows]
-    figure = Figure(figsize=(11, 1.2 + 0.3 * len(shown)), dpi=120, layout="constrained")
+    figure = Figure(figsize=(11, 1.2 + 0.3 * len(shown)), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_axis_off()
@@ -73,5 +73,5 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     table.set_fontsize(9)
     table.auto_set_column_width(range(len(COLUMNS)))
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", bbox_inches="tight")
     return buffer.getvalue()

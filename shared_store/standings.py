@@ -32,14 +32,14 @@ class Race:
 
     Attributes:
         laps: How many were to be driven.
-        times: Of each lap that is complete, with its penalties [ms].
+        times: Of each lap that is complete, with its penalties [s].
         resets: How often the car was put back.
         off_tracks: How often it left the road.
         crashes: How often it touched an obstacle.
     """
 
     laps: int
-    times: tuple[int, ...]
+    times: tuple[float, ...]
     resets: int
     off_tracks: int
     crashes: int
@@ -47,7 +47,7 @@ class Race:
     @property
     def best(self) -> int | None:
         """The fastest lap [ms]."""
-        return min(self.times, default=None)
+        return _milliseconds(min(self.times)) if self.times else None
 
     def counts(self, ranking: Ranking) -> int | None:
         """The time by which it is ranked [ms]; None where it has none.
@@ -58,7 +58,8 @@ class Race:
             return None
         if ranking == "best":
             return self.best
-        return sum(self.times) if ranking == "total" else round(sum(self.times) / len(self.times))
+        total = math.fsum(self.times)  # of the exact times: rounded ones would add up to another
+        return _milliseconds(total if ranking == "total" else total / len(self.times))
 
 
 def read_race(race: Any) -> Race:
@@ -81,14 +82,18 @@ def read_race(race: Any) -> Race:
                 raise BadRace(f"{where}.{key}: expected a whole number, found {shown(value)}")
             counts[key] += value
         if trial["status"] == LAP_COMPLETE:
-            times.append(_milliseconds(trial.get("time"), f"{where}.time"))
+            times.append(_lap_time(trial.get("time"), f"{where}.time"))
     return Race(laps=laps, times=tuple(times), **counts)
 
 
-def _milliseconds(value: Any, where: str) -> int:
+def _lap_time(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
         raise BadRace(f"{where}: expected the lap's time in seconds, found {shown(value)}")
-    return round(1000 * value)
+    return float(value)
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(1000 * seconds)
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:

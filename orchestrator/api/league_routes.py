@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.api import permissions, submission
 from orchestrator.api.callers import user_name
@@ -33,11 +34,11 @@ from shared_store.files import DamagedFile
 from shared_store.leagues import League, LeagueError, Rules, StoredLeague, UnknownLeague
 from shared_store.models import Model
 from shared_store.standings import BadRace, Ranking, read_race, table
+from shared_store.wording import shown
 
 router = APIRouter()
 
-Racer = Annotated[str, StringConstraints(pattern=r"^\w[\w .'-]{0,63}$")]
-"""What a racer is called: letters, digits, spaces, '.', ''', '-' and '_', at most 64."""
+_RACER = re.compile(r"\w[\w .'-]{0,63}")
 _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 _Moment = Annotated[float, Field(ge=0, lt=1e11, allow_inf_nan=False)]
 
@@ -69,7 +70,9 @@ class RaceRequest(_Strict):
 
     model: str = Field(max_length=128)
     version: int | None = Field(default=None, ge=1, description="the newest where absent")
-    racer: Racer | None = Field(default=None, description="who races; the name of the key or user where absent")
+    racer: str | None = Field(
+        default=None, max_length=200, description="who races; the name of the key or user where absent"
+    )
     directory: str = Field(default="", description="working directory of the job")
 
 
@@ -183,7 +186,7 @@ def race(
     try:
         if closed := league.closed(time.time()):
             raise LeagueError(closed)
-        stored.admit(_caller(), body.racer or _racer())
+        stored.admit(_caller(), _racer(body))
     except LeagueError as error:
         raise _refused(error) from None
     return _submit(controller, league, model, body.directory, idempotency_key)
@@ -222,7 +225,7 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     job = _race_of(controller, league, body.job)
     summary = _summary(controller, league, model, checkpoint, job)
     entry = {
-        "racer": body.racer or _racer(),
+        "racer": _racer(body),
         "owner": _caller(),
         "model": {"name": model.name, "version": model.version, "digest": _digest(model), "task": summary["task"]},
         "evaluation": {"run": model.facts()["run"], "name": summary["name"], "job": job, "time": summary["time"]},
@@ -281,9 +284,16 @@ def _caller() -> str:
     return f"user {user_name(os.getuid())}" if identity == permissions.THIS_PROCESS else identity.name
 
 
-def _racer() -> str:
-    """What the caller races as, unless it says another name."""
-    return _caller().removeprefix("key ").removeprefix("user ")
+def _racer(body: RaceRequest) -> str:
+    """Who races: the caller, unless it says another name. Raises ClientError."""
+    if body.racer is None:
+        return _caller().removeprefix("key ").removeprefix("user ")
+    if not _RACER.fullmatch(body.racer):
+        raise ClientError(
+            f"racer {shown(body.racer)}: use letters, digits, spaces, dots, hyphens, apostrophes and '_', at most 64, the first a "
+            "letter or digit"
+        )
+    return body.racer
 
 
 def _submit(

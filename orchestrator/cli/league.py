@@ -19,7 +19,7 @@ from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from orchestrator.errors import UsageError
+from orchestrator.errors import ApiError, NotServing, UsageError
 from orchestrator.league_table import COLUMNS, cells, write
 from shared_store.leagues import moment
 from shared_store.races import clock
@@ -360,9 +360,14 @@ def verify(
 
 def _again(client: Client, path: str, entry: Mapping[str, Any]) -> list[str]:
     """What differs between an entry and its race, driven once more, a line each."""
-    started = client.post(path, {"directory": os.getcwd()}, seconds=300)
-    if code := see_through(client, started["jobId"], _quietly):
-        raise typer.Exit(code)
+    try:
+        started = client.post(path, {"directory": os.getcwd()}, seconds=300)
+    except NotServing:
+        raise
+    except ApiError as error:  # of this entry: its checkpoint is gone, say
+        return [str(error)]
+    if see_through(client, started["jobId"], _quietly):
+        return [f"its race was not driven again: job {started['jobId'][:8]} did not succeed"]
     listed = client.get(f"/api/runs/{named(started['run'])}/evaluations")
     again = next(each for each in listed if each.get("job") == started["jobId"])
     lines = differences(entry["race"], again["race"])

@@ -14,14 +14,16 @@ from tests.support.shared_store.leagues import race
 def contender(entry: int, times: list[int], racer: str = "", laps: int = 3, **facts: Any) -> Contender:
     """``times`` in milliseconds."""
     counts = {key: facts.pop(key, 0) for key in ("resets", "off_tracks", "crashes")}
-    return Contender(entry, racer or f"r{entry}", f"m@{entry}", Race(laps, tuple(times), **counts), **facts)
+    return Contender(
+        entry, racer or f"r{entry}", f"m@{entry}", Race(laps, tuple(time / 1000 for time in times), **counts), **facts
+    )
 
 
 @pytest.mark.parametrize(
     ("times", "total", "best", "average"),
     [
         ([12_000, 12_500, 13_001], 37_501, 12_000, 12_500),  # 37501 / 3 = 12500.3
-        ([12_000, 13_001], None, 12_000, 12_500),  # 25001 / 2 = 12500.5, to the even number
+        ([12_000, 13_002], None, 12_000, 12_501),
         ([15_000], None, 15_000, 15_000),
         ([], None, None, None),
     ],
@@ -29,13 +31,13 @@ def contender(entry: int, times: list[int], racer: str = "", laps: int = 3, **fa
 def test_total_wants_every_lap_and_the_others_count_the_complete_ones(
     times: list[int], total: int | None, best: int | None, average: int | None
 ) -> None:
-    driven = Race(3, tuple(times), 0, 0, 0)
+    driven = Race(3, tuple(time / 1000 for time in times), 0, 0, 0)
     assert [driven.counts(ranking) for ranking in ("total", "best", "average")] == [total, best, average]
 
 
-def test_a_race_is_read_with_its_penalties_in_whole_milliseconds() -> None:
+def test_a_race_is_read_with_its_penalties() -> None:
     driven = read_race(race([14.3404, 12.2, None], off_tracks=2, resets=2))
-    assert driven == Race(laps=3, times=(14_340, 12_200), resets=2, off_tracks=2, crashes=0)
+    assert driven == Race(laps=3, times=(14.3404, 12.2), resets=2, off_tracks=2, crashes=0)
 
 
 @pytest.mark.parametrize(
@@ -91,6 +93,11 @@ def test_times_that_differ_by_less_than_a_millisecond_are_equal() -> None:
     earlier, later = (read_race(race([time], off_tracks=0)) for time in (12.3404, 12.3396))
     rows = table([Contender(1, "a", "m@1", earlier), Contender(2, "b", "m@2", later)], "total")
     assert [(row.rank, row.racer, row.time) for row in rows] == [(1, "a", 12.34), (2, "b", 12.34)]
+
+
+def test_laps_are_added_up_before_they_are_rounded() -> None:
+    driven = read_race(race([10.46666666666667] * 3))
+    assert (driven.counts("total"), driven.counts("average"), driven.best) == (31_400, 10_467, 10_467)  # not 31401
 
 
 def test_of_a_racer_the_best_entry_is_ranked() -> None:
