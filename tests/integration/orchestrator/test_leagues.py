@@ -73,6 +73,14 @@ class Paddock:
         assert ended.returncode in (1, 2) and len(ended.stderr.splitlines()) == 1, ended.stdout + ended.stderr
         return ended.stderr
 
+    def races(self) -> list[dict[str, Any]]:
+        """The jobs of races."""
+        wanted = [{"name": "JOB_NAME", "values": ["race-*"]}]
+        found: list[dict[str, Any]] = self.server.client.batch("ListJobs", jobQueue="default", filters=wanted)[
+            "jobSummaryList"
+        ]
+        return found
+
     def rows(self, league: str, *options: str) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = json.loads(self.done("table", league, "--json", *options))
         return rows
@@ -159,9 +167,9 @@ def cups(paddock: Paddock) -> Paddock:
 
 @pytest.mark.parametrize("arguments", REFUSED)
 def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, arguments: tuple[str, ...]) -> None:
-    before = call_muster("list", "--json", home=cups.server.home).stdout
+    before = cups.races()
     assert REFUSED[arguments] in cups.refused(*arguments)
-    assert call_muster("list", "--json", home=cups.server.home).stdout == before
+    assert cups.races() == before
     assert "x" not in leagues.names(cups.store)
 
 
@@ -291,7 +299,7 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     onnx.write_bytes(b"Weights")
     verified = cups.muster("verify", "honest", "2", "--rerun")
     assert verified.returncode == 1 and "entry 2: model fast@2 was altered: " in verified.stdout
-    before = call_muster("list", "--json", home=cups.server.home).stdout
+    before = cups.races()
     assert "model fast@2 was altered: bundle " in cups.refused("submit", "honest", "fast@2")
     onnx.write_bytes(b"weights")
     weights = cups.store.run("racer").checkpoints / "00000012-e1" / "learner.pt"
@@ -304,7 +312,7 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     verified = cups.muster("verify", "honest", "2", "--rerun")
     assert verified.returncode == 1 and f"entry 2: model fast@2: {said}" in verified.stdout
     os.rename(weights.parent.with_name("away"), weights.parent)
-    assert call_muster("list", "--json", home=cups.server.home).stdout == before, "nothing was started"
+    assert cups.races() == before, "nothing was started"
 
     rules = leagues.find(cups.store, "honest").path / "definition" / "league.json"
     rules.chmod(0o644)
