@@ -27,7 +27,7 @@ LARGEST = 1 << 20
 """Bytes of a track's file, here and where one is imported."""
 PRESETS = ("oval", "rounded-rectangle", "chicane")
 """Tracks that lie in no store (:mod:`worker.racer.presets`)."""
-_DRAWN = re.compile(r"random:[0-9]{1,18}")
+_DRAWN = re.compile(r"random:([0-9]{1,19})")
 """A track that is drawn from a seed (:mod:`worker.racer.naming`)."""
 
 
@@ -82,7 +82,8 @@ def names(store: Store) -> list[str]:
 
 def is_made(name: str) -> bool:
     """Whether a track of this name is a preset or drawn from a seed, so that it is in no store."""
-    return name in PRESETS or _DRAWN.fullmatch(name) is not None
+    drawn = _DRAWN.fullmatch(name)
+    return name in PRESETS or (drawn is not None and int(drawn[1]) < 2**63)
 
 
 def find(store: Store, name: str, others: Sequence[str] = ()) -> StoredTrack:

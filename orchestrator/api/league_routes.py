@@ -227,7 +227,7 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     entry = {
         "racer": _racer(body),
         "owner": _caller(),
-        "model": {"name": model.name, "version": model.version, "digest": _digest(model), "task": summary["task"]},
+        "model": {"name": model.name, "version": model.version, "digest": _digest(model), "task": summary.get("task")},
         "evaluation": {"run": model.facts()["run"], "name": summary["name"], "job": job, "time": summary["time"]},
         "versions": summary.get("versions"),
         "race": summary["race"],
@@ -296,6 +296,12 @@ def _racer(body: RaceRequest) -> str:
     return body.racer
 
 
+def _suffix() -> str:
+    """Ends the names of a key's races: a job definition belongs to the key that registered it, and each may race any model of a queue."""
+    identity = permissions.current_identity.get()
+    return "" if identity.queues is None else identity.name.removeprefix("key ")
+
+
 def _submit(
     controller: Controller, league: League, model: Model, directory: str, idempotency_key: str | None
 ) -> dict[str, Any]:
@@ -312,7 +318,7 @@ def _submit(
         else:
             queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
             try:
-                spec = race_job(league, model.reference, facts, queue)
+                spec = race_job(league, model.reference, facts, queue, _suffix())
             except SpecError as error:
                 raise ClientError(str(error)) from None
             answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {})

@@ -100,7 +100,7 @@ ENTRIES = (
         "league",
         "league",
         _SHARED,
-        "Leagues of the racer: create, list, show, submit, table, disqualify, verify. Nothing of one is ever changed.",
+        "Leagues of the racer: create, submit, table, verify and more. Nothing of one is ever changed.",
     ),
     Entry(
         "schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors; or that of the policy contract."

@@ -38,7 +38,7 @@ muster league table cup -o cup.png   and   muster league verify cup 1 --rerun"""
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Leagues of the racer: create, list, show, submit, table, disqualify, verify. Nothing of one is ever changed.",
+        "Leagues of the racer: create, submit, table, verify and more. Nothing of one is ever changed.",
         _EXAMPLES,
     )
     group.command(
@@ -319,11 +319,15 @@ def disqualify(
     entry: EntryArgument,
     reason: Annotated[str, typer.Option(help="Stands in the table, for good.")],
     store: StoreOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Say beside an entry that it does not count, and why. The entry stays as it is. For the owner of the league."""
     with controller(store, None) as connect:
-        connect().post(f"/api/leagues/{named(league)}/entries/{entry}/disqualify", {"reason": reason})
-    echo(f"entry {entry} of {league} is disqualified: {reason}")
+        found = connect().post(f"/api/leagues/{named(league)}/entries/{entry}/disqualify", {"reason": reason})
+    if as_json:
+        echo_json(found, indent=1)
+    else:
+        echo(f"entry {entry} of {league} is disqualified: {reason}")
 
 
 def verify(
@@ -334,10 +338,11 @@ def verify(
     ] = False,
     store: StoreOption = None,
     cpus: CpusOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Check that entries and their models are as they were entered; exit 1 where anything differs."""
     path = f"/api/leagues/{named(league)}"
-    bad = 0
+    told = []
     with controller(store, cpus) as connect:
         client = connect()
         last = client.get(path)["entries"]
@@ -346,15 +351,15 @@ def verify(
             problems = [found["problem"]] if found.get("problem") else []
             if rerun and not problems:
                 problems = _again(client, f"{path}/entries/{number}/races", found)
-            bad += bool(problems)
-            for problem in problems:
-                echo(f"entry {number}: {problem}")
-            if not problems:
-                told = "every lap is the same to the last bit" if rerun else "as it was entered, and so is its model"
-                echo(f"entry {number}: {told}")
-    if entry is None and last == 0:
+            told.append({"entry": number, "problems": problems})
+            good = "every lap is the same to the last bit" if rerun else "as it was entered, and so is its model"
+            for line in [] if as_json else problems or [good]:
+                echo(f"entry {number}: {line}")
+    if as_json:
+        echo_json(told, indent=1)
+    elif not told:
         echo(f"{league} is as it was created and has no entries")
-    if bad:
+    if any(each["problems"] for each in told):
         raise typer.Exit(1)
 
 

@@ -292,6 +292,8 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
     verified = cups.muster("verify", "honest")
     assert verified.returncode == 1 and "entry 1: league honest: entry 1 is altered" in verified.stdout
+    listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
+    assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
     assert "entry 2: as it was entered" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
