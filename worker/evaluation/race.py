@@ -16,6 +16,7 @@ from shared_store.files import write_atomic
 from shared_store.races import SIM_TRACE
 from worker.racer.resets import MISHAPS
 from worker.racer.trace import COLUMNS
+from worker.simulation.capture import on_torch_stream
 
 if TYPE_CHECKING:
     from worker.evaluation.episodes import Episodes
@@ -39,8 +40,9 @@ class Trial:
     """A lap from the start line, as far as it went.
 
     Attributes:
-        steps: A row of numbers for each control step, shape ``(steps, 15)``: :data:`worker.racer.trace.COLUMNS`, the reward, and the
+        start: The row of the car before its first control step, shape ``(15,)``: :data:`worker.racer.trace.COLUMNS`, the reward, and the
             action, which is -1 where actions are continuous.
+        steps: The rows after each control step, shape ``(steps, 15)``.
         clocks: When each was done, by the clock [s].
         status: By what it ended.
         track: Name of the track.
@@ -48,6 +50,7 @@ class Trial:
         control_hz: Control steps a second [Hz].
     """
 
+    start: torch.Tensor
     steps: torch.Tensor
     clocks: Sequence[float]
     status: str
@@ -74,24 +77,28 @@ class Trial:
         }
 
     def sim_trace(self, episode: int) -> Iterator[str]:
-        """The lines of its SimTrace file. Where the car is and where it points is said of its front, angles in degrees."""
+        """The lines of its SimTrace file; where the car is is said of its front, angles are in degrees.
+
+        The first row, ``prepare``, is the car at the start: tools count steps and time from there.
+        """
         yield ",".join(SIM_TRACE_COLUMNS)
         before = [0.0] * len(MISHAPS)
-        for number, row in enumerate(self.steps.tolist()):
+        for number, row in enumerate([self.start.tolist(), *self.steps.tolist()]):
             told = dict(zip((*COLUMNS, "reward", "action"), row, strict=True))
             counts = [told[name] for name in MISHAPS]
             status = next((name for name, now, then in zip(MISHAPS, counts, before, strict=True) if now > then), "")
             before = counts
-            if done := number == len(self.steps) - 1:
+            status = status or ("in_progress" if number else "prepare")
+            if done := number == len(self.steps):
                 status = _STATUS.get(self.status, self.status)
             yield ",".join(
                 (
-                    *(f"{episode}", f"{number + 1}", f"{told['x']:.4f}", f"{told['y']:.4f}"),
+                    *(f"{episode}", f"{number}", f"{told['x']:.4f}", f"{told['y']:.4f}"),
                     *(f"{math.degrees(told['heading']):.4f}", f"{math.degrees(told['steering']):.2f}"),
                     *(f"{told['speed']:.2f}", f"{told['action']:.0f}", f"{told['reward']:.4f}", f"{done}"),
                     *(f"{told['wheels'] == 4}", f"{told['progress']:.4f}", f"{told['waypoint']:.0f}"),
-                    *(f"{self.length:.2f}", f"{(number + 1) / self.control_hz:.3f}", status or "in_progress", "0.00"),
-                    *(f"{told['crashed']:.0f}", f"{self.clocks[number]:.3f}"),
+                    *(f"{self.length:.2f}", f"{number / self.control_hz:.3f}", status, "0.00"),
+                    *(f"{told['crashed']:.0f}", f"{self.clocks[max(0, number - 1)]:.3f}"),
                 )
             )
 
@@ -150,13 +157,17 @@ class Laps:
     """Looks on while trials are driven, one in each world.
 
     Args:
-        task: Whose configuration has ``trace``.
+        task: Whose configuration has ``trace``; every episode begins where the present one does, at the start line.
     """
 
     def __init__(self, task: Racer) -> None:
         self._task = task
-        arrays = task.sensors["car"].arrays
+        car = task.sensors["car"]
+        arrays = car.arrays
         self._trace = wp.to_torch(arrays.trace)
+        with on_torch_stream(task.device):
+            car.note()
+        self._starts = torch.cat([self._trace.cpu(), torch.tensor([[0.0, -1.0]] * task.world_count)], 1)
         self._tracks = [task.circuit.tracks[number] for number in arrays.tracks.numpy().tolist()]
         self._noted: list[tuple[float, torch.Tensor, torch.Tensor]] = []
 
@@ -184,7 +195,9 @@ class Laps:
                 clocks[world].append(clock)
         hz = self._task.config.control_hz
         trials = [
-            Trial(torch.stack(rows), times, status, track.name, track.length, hz)
-            for rows, times, status, track in zip(steps, clocks, played.ends, self._tracks, strict=True)
+            Trial(start, torch.stack(rows), times, status, track.name, track.length, hz)
+            for start, rows, times, status, track in zip(
+                self._starts, steps, clocks, played.ends, self._tracks, strict=True
+            )
         ]
         return Race(trials, rules, {track.name: track.direction for track in self._tracks}, seed)

@@ -171,7 +171,11 @@ class Driving:
         """Where the cars are after a control step."""
         wp.launch(_follow, dim=self._count, inputs=[self.arrays], device=self._device)
         if self._traced:
-            wp.launch(_trace, dim=self._count, inputs=[self.arrays], device=self._device)
+            self.note()
+
+    def note(self) -> None:
+        """Write what is known of the cars now into ``arrays.trace``."""
+        wp.launch(_trace, dim=self._count, inputs=[self.arrays], device=self._device)
 
     def settle(self) -> None:
         """Where the cars are that were put down, or back."""

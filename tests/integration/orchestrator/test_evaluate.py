@@ -40,6 +40,8 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
                     {"iteration": iteration, "env_steps": 100 * iteration, "reward": reward, "episode_length": 5}
                 )
     add_run(store, "empty")
+    add_run(store, "fast-car", {**SPEC, "name": "fast-car", "train": {**SPEC["train"], "task": "Racer"}})
+    add_checkpoint(store, "fast-car", 9, task="Racer", train={"task": "Racer", "config": {"track": "oval"}})
     for iteration, mean in ((9, 21.0), (6, 29.0)):
         evaluated(store, "taught", f"{iteration:08d}-e1-0123abcd", mean)
     evaluated(store, "taught-b", "00000009-e1", 25.0)
@@ -79,6 +81,25 @@ REFUSED = {
     ("taught", "--set", "resource.cpus=1"): (2, "resource: unknown key; did you mean resources?"),
     ("taught", "--name", "a b"): (2, "name: expected letters"),
     ("taught", "--set", "resources.cpus=400"): (2, "lower nodes or resources"),
+    ("taught", "--race"): (
+        2,
+        "race: run taught trained Cartpole, which drives no laps; a race is for runs of a racer's",
+    ),
+    ("fast-car", "--trials", "3"): (2, "--trials: it is for races; add --race"),
+    ("fast-car", "-o", "there"): (2, "--output: it is for races; add --race"),
+    ("fast-car", "--race", "--episodes", "3"): (2, "--episodes: a race has --trials, each in a world of its own"),
+    ("fast-car", "--race", "--trials", "0"): (2, "race.trials: expected a value greater than or equal to 1, found 0"),
+    ("fast-car", "--race", "--penalty", "-1"): (
+        2,
+        "race.off_track_penalty: expected a value greater than or equal to 0",
+    ),
+    ("fast-car", "--race", "--set", "config.put_bakc=2.0"): (
+        2,
+        "race.config.put_bakc: RacerConfig has no such key; did you",
+    ),
+    ("fast-car", "--race", "--set", "config.put_back=20.0"): (2, "race.config.put_back: expected a value less than"),
+    ("fast-car", "--race", "--set", "race.traks=[oval]"): (2, "race.traks: unknown key; did you mean track?"),
+    ("fast-car", "--race", "--set", "nodes=2"): (2, "race: it runs on one node with at most one GPU"),
 }
 
 
@@ -182,3 +203,23 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
         done = call_muster("compare", *options, home=full.home)
         assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Serving, tmp_path: Path) -> None:
+    spec = tmp_path / "race.yaml"
+    spec.write_text(
+        '{"name": "final", "race": {"run": "fast-car", "trials": 5, "continuous": true, "track": ["oval"]}}'
+    )
+    done = call_muster("submit", str(spec), "--json", home=full.home)
+    assert done.returncode == 0, done.stderr
+    detail = full.detail(json.loads(done.stdout)["jobId"])
+    race = detail["spec"]["race"]
+    assert (race["trials"], race["continuous"], race["off_track_penalty"], race["seconds"]) == (5, True, 1.0, 1200.0)
+    shown = call_muster("show", detail["id"], home=full.home).stdout
+    assert "races" in shown and "fast-car" in shown
+
+
+def test_a_copy_of_step_logs_replaces_none(full: Serving, tmp_path: Path) -> None:
+    (tmp_path / "sim-trace").mkdir()
+    done = call_muster("evaluate", "fast-car", "--race", "-o", str(tmp_path), home=full.home)
+    assert done.returncode == 2 and "sim-trace exists; name another directory" in done.stderr

@@ -46,7 +46,7 @@ LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digi
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
 TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, LiftCubes, Quadruped, Racer, RacerPixels, RacerPixelsAndState"
 TOP = (
-    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, race, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
     "on_child_failure, timeout, stall_timeout"
 )
 
@@ -74,12 +74,16 @@ MISSING = {
     "- a\n": "job.yaml: expected a mapping of keys such as name, nodes, train; found a list",
     "text": "job.yaml: expected a mapping of keys such as name, nodes, train; found a text ('text')",
     "command: [x]\n": "job.yaml: name: is required",
-    "name: a\n": "job.yaml: expected exactly one of train, evaluate, export, record, render, command; found none",
+    "name: a\n": "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found none",
     f"{COMMAND}{TRAIN}\n": (
-        "job.yaml: expected exactly one of train, evaluate, export, record, render, command; found train and command"
+        "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
     ),
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": "job.yaml:2: train.task: is required",
     "name: a\nevaluate: {}\n": "job.yaml:2: evaluate.run: is required",
+    "name: a\nrace: {laps: 3}\n": "job.yaml:2: race.laps: unknown key; valid here: "
+    "run, checkpoint, trials, continuous, off_track_penalty, crash_penalty, max_resets, seconds, track, seed, config, keep (and 1 more)",
+    "name: a\nrace: {run: x, trials: 101}\n": "job.yaml:2: race.trials: expected a value less than or equal to 100, found 101",
+    "name: a\nnodes: 2\nrace: {run: x}\n": "job.yaml: race: it runs on one node with at most one GPU",
     f"{COMMAND}nodes: {{min: 3}}\n": "job.yaml:3: nodes.max: is required",
 }
 

@@ -13,8 +13,8 @@ from tests.unit.worker.racer.test_racer import OVAL, counted, known, racer, stra
 from worker.racer.geometry import place_at, project
 from worker.racer.resets import COUNTS
 from worker.racer.trace import COLUMNS
-from worker.tasks.configs.racer import ObstacleConfig
-from worker.tasks.racer import Racer
+from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerPixelsConfig
+from worker.tasks.racer import Racer, RacerPixels
 
 
 def continuous(worlds: int = 1, **fields: Any) -> Racer:
@@ -174,3 +174,15 @@ def test_without_it_a_mishap_ends_the_episode_and_is_counted_as_one() -> None:
     assert [traced(task, name) for name in COUNTS] == [0, 1, 0, 0, 0]
     assert "metric_resets" not in task.statistic_names
     assert not {name for name in task.state_tensors() if "counts" in name}
+
+
+def test_the_camera_of_a_car_that_was_put_back_sees_from_there() -> None:
+    front = FrontCameraConfig(width=32, height=24)
+    fields = {"track": "oval", "start": "line", "start_turned": (0.5, 0.5), "speed_factor": (1e-4, 1e-4)}
+    task = RacerPixels(RacerPixelsConfig(continuous=True, front=front, **fields), 1, seed=3)  # type: ignore[arg-type]
+    images = []
+    for _ in range(16):  # it stands, and turned to the left, until it is put back in the 15th step
+        task.step(straight(task))
+        images.append(task.groups["policy"].int().clone())
+    apart = [(images[number] - images[14]).abs().float().mean().item() for number in (13, 15)]
+    assert apart[1] < 0.1 < 5.0 < apart[0]
