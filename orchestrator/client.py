@@ -25,7 +25,7 @@ from orchestrator.home import local_url, muster_home
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
 
-_SUBMISSIONS = ("/submitjob", "/resume", "/clone")
+_SUBMISSIONS = ("/submitjob", "/resume", "/clone", "/races")
 """Paths of requests that must not be carried out twice."""
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
 """Seconds after each refusal for too many requests or connections; the last refusal is reported."""

@@ -187,6 +187,10 @@ class Store:
     def tracks(self) -> Path:
         return self.path / "tracks"
 
+    @property
+    def leagues(self) -> Path:
+        return self.path / "leagues"
+
     def runs(self, after: str = "", most: int | None = None) -> list[Run]:
         """The runs that exist, by name: those behind ``after``, at most so many."""
         try:

@@ -7,10 +7,11 @@ digest, the track's measures, and where it comes from. It appears by a rename th
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,10 @@ from shared_store.wording import nearest
 FILE = "track.npy"
 LARGEST = 1 << 20
 """Bytes of a track's file, here and where one is imported."""
+PRESETS = ("oval", "rounded-rectangle", "chicane")
+"""Tracks that lie in no store (:mod:`worker.racer.presets`)."""
+_DRAWN = re.compile(r"random:([0-9]{1,19})")
+"""A track that is drawn from a seed (:mod:`worker.racer.naming`)."""
 
 
 class TrackError(Exception):
@@ -75,12 +80,22 @@ def names(store: Store) -> list[str]:
     return sorted(name for name in entries if NAME.fullmatch(name))
 
 
-def find(store: Store, name: str) -> StoredTrack:
-    """The track of that name. Raises TrackError with the nearest one where there is none."""
+def is_made(name: str) -> bool:
+    """Whether a track of this name is a preset or drawn from a seed, so that it is in no store."""
+    drawn = _DRAWN.fullmatch(name)
+    return name in PRESETS or (drawn is not None and int(drawn[1]) < 2**63)
+
+
+def find(store: Store, name: str, others: Sequence[str] = ()) -> StoredTrack:
+    """The track of that name. Raises TrackError with the nearest one where there is none.
+
+    ``others``: what else the caller could have meant.
+    """
     known = names(store)
     if name not in known:
+        near = [*others, *known]
         raise TrackError(
-            f"track {name[:130]} does not exist; {nearest(name, known, '' if known else 'none is kept yet')}"
+            f"track {name[:130]} does not exist; {nearest(name, near, '' if near else 'none is kept yet')}"
         )
     return StoredTrack(store.tracks / name)
 

@@ -38,7 +38,7 @@ def list_models(request: Request) -> Any:
     """The newest version of each model that the caller may see, by name."""
     store = controller_of(request).store
     newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
-    return permissions.shown([_described(model) for model in newest if permissions.is_visible(_owner(model))])
+    return permissions.shown([_described(model) for model in newest if permissions.is_visible(owner_of_model(model))])
 
 
 @router.get("/models/{name}")
@@ -50,8 +50,8 @@ def read_model(
 ) -> Any:
     """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
     controller = controller_of(request)
-    model = _find(controller, name, version)
-    permissions.check(Operation.READ_MODEL, _owner(model))
+    model = find_model(controller, name, version)
+    permissions.check(Operation.READ_MODEL, owner_of_model(model))
     found = _described(model, verify)
     try:
         found["contract"] = model.contract().document()
@@ -78,7 +78,7 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     try:
         there = models.versions(controller.store, body.name)
         if there:
-            permissions.check(Operation.REGISTER_MODEL, _owner(there[-1]))
+            permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
         facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
         model = models.register(
             controller.store, body.name, run, checkpoint, facts, controller.peers.id, again=body.again
@@ -94,8 +94,8 @@ def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     return permissions.shown(_described(model))
 
 
-def _find(controller: Controller, name: str, version: int | None) -> Model:
-    """Raises ClientError."""
+def find_model(controller: Controller, name: str, version: int | None) -> Model:
+    """A version of a model, the newest where none is named. Raises ClientError."""
     try:
         return models.find(controller.store, name, version)
     except UnknownModel as error:
@@ -104,7 +104,7 @@ def _find(controller: Controller, name: str, version: int | None) -> Model:
         raise ClientError(str(error)) from None
 
 
-def _owner(model: Model) -> RunRecord:
+def owner_of_model(model: Model) -> RunRecord:
     """Whose a model is: of the queue of the run that it comes from; of one that is damaged, nobody's but of keys with all queues."""
     try:
         queue = model.facts().get("queue")

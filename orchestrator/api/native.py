@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 
 from orchestrator.admission import fit_in_queue, node_records
-from orchestrator.api import model_routes, permissions, rules, run_routes, runs, webhook_routes
+from orchestrator.api import league_routes, model_routes, permissions, rules, run_routes, runs, webhook_routes
 from orchestrator.api.batch import validate
 from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import controller_of, permitted_run, queue_names
@@ -47,6 +47,7 @@ from shared_store.logs import LogFollower, LogLine, timestamp
 router = APIRouter(prefix="/api")
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
+router.include_router(league_routes.router)
 router.include_router(webhook_routes.router)
 
 _LARGEST_PLAN = 4 << 20

@@ -1,7 +1,7 @@
 """Who may do what to what: every operation of the API is decided here, for every kind of key and every object.
 
 A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
-(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that registered it (a job definition), or to all queues (a
+(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a league), or to all queues (a
 queue itself, a compute environment, a scheduling policy).
 
 ================================  ===========================  ============================================================
@@ -13,6 +13,7 @@ run of no known queue             reads, writes                nothing
 job definition of its own         reads, writes, submits       reads, writes, submits
 another's, tagged for its queue   reads, writes, submits       reads, submits
 another's                         reads, writes, submits       reads, without the values of environment variables
+league                            reads, writes                reads, creates its own; disqualifies in its own
 what all queues share             reads, writes                reads
 ================================  ===========================  ============================================================
 
@@ -115,6 +116,15 @@ class Operation(StrEnum):
     REGISTER_MODEL = "POST /api/runs/{name}/models"
     LIST_MODELS = "GET /api/models"
     READ_MODEL = "GET /api/models/{name}"
+    LIST_LEAGUES = "GET /api/leagues"
+    CREATE_LEAGUE = "POST /api/leagues"
+    READ_LEAGUE = "GET /api/leagues/{name}"
+    READ_LEAGUE_TABLE = "GET /api/leagues/{name}/entries"
+    READ_ENTRY = "GET /api/leagues/{name}/entries/{number}"
+    RACE = "POST /api/leagues/{name}/races"
+    RERUN_ENTRY = "POST /api/leagues/{name}/entries/{number}/races"
+    ENTER_LEAGUE = "POST /api/leagues/{name}/entries"
+    DISQUALIFY = "POST /api/leagues/{name}/entries/{number}/disqualify"
     READ_WEBHOOKS = "GET /api/webhooks"
     TEST_WEBHOOK = "POST /api/webhooks/{name}/test"
 
@@ -135,11 +145,19 @@ class JobsOf:
 
 
 @dataclass(frozen=True)
+class LeagueOf:
+    """A league, and the key that created it."""
+
+    name: str
+    owner: str
+
+
+@dataclass(frozen=True)
 class Shared:
     """Something of all queues that has no row yet."""
 
 
-Object = Job | RunRecord | JobsOf | JobDefinition | JobQueue | ComputeEnvironment | SchedulingPolicy | Shared
+Object = Job | RunRecord | JobsOf | JobDefinition | JobQueue | ComputeEnvironment | SchedulingPolicy | LeagueOf | Shared
 
 
 def check(operation: Operation, *objects: Object) -> None:
@@ -209,6 +227,8 @@ def _allowed(identity: Identity, operation: Operation, thing: Object) -> bool:
     match thing:
         case Job() | RunRecord() | JobsOf():
             return thing.queue in queues
+        case LeagueOf():
+            return thing.owner == identity.name or operation.reads
         case JobDefinition():
             shared = thing.tags.get(QUEUES_TAG, "").split()
             tagged = "*" in shared or not queues.isdisjoint(shared)
@@ -225,6 +245,8 @@ def _whose(thing: Object) -> str:
             return f"run {thing.name} belongs to {f'job queue {thing.queue}' if thing.queue else 'no known job queue'}"
         case JobsOf():
             return f"it concerns job queue {thing.queue}"
+        case LeagueOf():
+            return f"league {thing.name} was created by {thing.owner}"
         case JobDefinition():
             return (
                 f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register one under another "

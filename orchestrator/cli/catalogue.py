@@ -97,6 +97,12 @@ ENTRIES = (
     ),
     Entry("tracks", "tracks", _SHARED, "Tracks of the racer: list, show, make, import. A track is never changed."),
     Entry(
+        "league",
+        "league",
+        _SHARED,
+        "Leagues of the racer: create, submit, table, verify and more. Nothing of one is ever changed.",
+    ),
+    Entry(
         "schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors; or that of the policy contract."
     ),
     Entry(

@@ -172,13 +172,19 @@ def verify(model: ModelArgument, store: StoreOption = None) -> None:
 
 def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
     """A model by ``NAME[@VERSION]``. Raises UsageError."""
+    name, version = split_model(reference)
+    with controller(store, None) as connect:
+        path = f"/api/models/{named(name)}"
+        found: dict[str, Any] = connect().get(path, seconds=300, version=version, **options)
+    return found
+
+
+def split_model(reference: str) -> tuple[str, int | None]:
+    """Name and version of ``NAME`` or ``NAME@VERSION``. Raises UsageError."""
     name, sign, version = reference.partition("@")
     if sign and not (version.isascii() and version.isdecimal() and 0 < len(version) < 10 and int(version) > 0):
         raise UsageError(f"{reference}: after @ stands a version, such as {name}@1")
-    with controller(store, None) as connect:
-        wanted = {"version": int(version)} if sign else {}
-        found: dict[str, Any] = connect().get(f"/api/models/{named(name)}", seconds=300, **wanted, **options)
-    return found
+    return name, int(version) if sign else None
 
 
 def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

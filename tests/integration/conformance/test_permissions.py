@@ -29,6 +29,8 @@ SHARED_WRITE = "+ + - - - - -"
 SHARED_READ = "+ + + + + + +"
 ALL_READ = "+ + - - + - -"
 """It tells of all queues at once."""
+OWN_LEAGUE = "+ + + + - - -"
+"""A league of one's own is created."""
 DEFINITION_READ = "+ + + h h h h"
 """Names and commands of definitions are everybody's to see, values only of one's own."""
 
@@ -86,6 +88,15 @@ TABLE = {
     Operation.REGISTER_MODEL: OWN_WRITE,
     Operation.LIST_MODELS: OWN_LIST,
     Operation.READ_MODEL: OWN_READ,
+    Operation.LIST_LEAGUES: SHARED_READ,
+    Operation.CREATE_LEAGUE: OWN_LEAGUE,
+    Operation.READ_LEAGUE: SHARED_READ,
+    Operation.READ_LEAGUE_TABLE: SHARED_READ,
+    Operation.READ_ENTRY: SHARED_READ,
+    Operation.RACE: OWN_WRITE,
+    Operation.RERUN_ENTRY: OWN_WRITE,
+    Operation.ENTER_LEAGUE: OWN_WRITE,
+    Operation.DISQUALIFY: OWN_WRITE,
     Operation.READ_WEBHOOKS: ALL_READ,
     Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
@@ -184,6 +195,15 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.REGISTER_MODEL, {"name": "x"}),
         of_ours(of.LIST_MODELS),
         of_ours(of.READ_MODEL),
+        of_ours(of.LIST_LEAGUES),
+        lambda key: world.native_call(key, of.CREATE_LEAGUE, {"name": world.fresh(), "track": ["oval"]}),
+        of_ours(of.READ_LEAGUE),
+        of_ours(of.READ_LEAGUE_TABLE),
+        of_ours(of.READ_ENTRY),
+        of_ours(of.RACE, {"model": world.run}),
+        of_ours(of.RERUN_ENTRY, {}),
+        of_ours(of.ENTER_LEAGUE, {"model": world.run, "job": world.job}),
+        of_ours(of.DISQUALIFY, {"reason": "x"}),
         of_ours(of.READ_WEBHOOKS),
         of_ours(of.TEST_WEBHOOK, {}),
     ]

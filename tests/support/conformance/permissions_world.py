@@ -14,11 +14,12 @@ from orchestrator.client import Client
 from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.keys import KeyStore
 from orchestrator.spec import validate
-from shared_store import models
+from shared_store import leagues, models
 from shared_store.bundles import seal
 from shared_store.checkpoints import Checkpoint
 from shared_store.layout import Store
 from tests.conftest import Serving
+from tests.support.shared_store.leagues import entry
 
 TOKEN = "a-token-for-tests-alone"
 KEYS = ("admin", "token", "robots", "lab", "reader", "robots-reader", "lab-reader")
@@ -53,6 +54,7 @@ class World:
         self.server.wait(self.job)
         self.stream = f"theirs/{self.job}/1/node-0"
         self.register_model()
+        self.create_league()
 
     def register_model(self) -> None:
         """A model of the run's name; its spec has the secret, as a run's has."""
@@ -64,6 +66,13 @@ class World:
         seal(bundle, {})
         checkpoint = Checkpoint(run.checkpoints / bundle.name, 1, 1)
         models.register(store, self.run, run, checkpoint, {"queue": "robots"})
+
+    def create_league(self) -> None:
+        """A league of the run's name with an entry of the model, both of the key ``robots``."""
+        self.clients["robots"].post("/api/leagues", {"name": self.run, "track": ["oval"]})
+        cup = leagues.find(Store(self.server.home / "store"), self.run)
+        model = {"name": self.run, "version": 1, "digest": "0" * 64, "task": "Racer"}
+        cup.enter(entry("robots", "key robots", model=model))
 
     def native(self, key: str, queue: str, **changes: Any) -> tuple[str, str]:
         """Submit a job from YAML; its id and its run."""
@@ -104,7 +113,7 @@ class World:
 
     def native_call(self, key: str, operation: Operation, body: dict[str, Any] | None = None) -> httpx.Response:
         method, _, path = operation.partition(" ")
-        path = path.format(reference=self.job, name=self.run)
+        path = path.format(reference=self.job, name=self.run, number=1)
         return self.http.request(
             method, self.url + path, json=body, headers={"Authorization": f"Bearer {self.tokens[key]}"}
         )

@@ -1,0 +1,325 @@
+"""``muster league`` through a real server: what is submitted, entered, refused and shown; the races themselves are written by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared_store import leagues, models
+from shared_store.bundles import seal
+from shared_store.checkpoints import Checkpoint
+from shared_store.evaluations import evaluation_name
+from shared_store.files import write_json
+from shared_store.layout import Store
+from shared_store.models import Model
+from tests.conftest import Serving, call_muster
+from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+from tests.support.shared_store.leagues import CONFIG, race, summary
+
+TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
+JOBS = 6
+
+
+class Paddock:
+    """A server with models of racers, jobs that have ended, whose races are written here, and no room for another job."""
+
+    def __init__(self, home: Path) -> None:
+        self.server = Serving(home, "--cpus", "1")
+        self.store = Store(home / "store")
+        add_run(self.store, "racer", {**SPEC, "name": "racer", "train": TRAIN})
+        for version, task in enumerate(("Racer", "Racer", "Cartpole", "my_tasks:Rocket"), 1):
+            checkpoint = add_checkpoint(self.store, "racer", 10 + version, task=task, train=TRAIN)
+            self.model(checkpoint, task)
+        self.jobs = [self.server.gang("pass") for _ in range(JOBS)]
+        for job in self.jobs:
+            assert self.server.wait(job)["status"] == "SUCCEEDED"
+        self.ended = time.time()
+        self.server.wait(self.server.gang("import time; time.sleep(3600)", cpus="1", name="blocker"), "RUNNING")
+
+    def model(self, checkpoint: Checkpoint, task: str) -> Model:
+        run = self.store.run("racer")
+        bundle = run.exports / checkpoint.name
+        bundle.mkdir(parents=True)
+        (bundle / "policy.onnx").write_bytes(b"weights")
+        seal(bundle, {"task": task, "train": TRAIN, "checkpoint_files": checkpoint.manifest["files"]})
+        return models.register(self.store, "fast", run, checkpoint, {"queue": "default"})
+
+    def raced(self, job: int, driven: dict[str, Any], version: int = 1, **changes: Any) -> str:
+        """Leave the race that a job would have left; the id of the job."""
+        named = self.jobs[job]
+        name = evaluation_name(f"{10 + version:08d}-e1", named)
+        found = {**summary(driven, seed=1, job=named), **changes}
+        write_json(self.store.run("racer").evaluations / f"{name}.json", found)
+        return named
+
+    def muster(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return call_muster("league", *arguments, home=self.server.home)
+
+    def done(self, *arguments: str) -> str:
+        ended = self.muster(*arguments)
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        return ended.stdout
+
+    def refused(self, *arguments: str) -> str:
+        ended = self.muster(*arguments)
+        assert ended.returncode in (1, 2) and len(ended.stderr.splitlines()) == 1, ended.stdout + ended.stderr
+        return ended.stderr
+
+    def races(self) -> list[dict[str, Any]]:
+        """The jobs of races."""
+        wanted = [{"name": "JOB_NAME", "values": ["race-*"]}]
+        found: list[dict[str, Any]] = self.server.client.batch("ListJobs", jobQueue="default", filters=wanted)[
+            "jobSummaryList"
+        ]
+        return found
+
+    def rows(self, league: str, *options: str) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = json.loads(self.done("table", league, "--json", *options))
+        return rows
+
+
+@pytest.fixture(scope="module")
+def paddock(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paddock]:
+    paddock = Paddock(tmp_path_factory.mktemp("home"))
+    yield paddock
+    paddock.server.close()
+
+
+def test_a_league_is_created_once_listed_and_shown(paddock: Paddock) -> None:
+    options = ("--track", "oval", "--track", "random:7", "--laps", "4", "--ranking", "best", "--continuous")
+    told = paddock.done("create", "grand", *options, "--off-track-penalty", "2", "--closes", "2999-01-01T00:00Z")
+    assert "grand: 4 laps on oval, random:7; open until 2999-01-01 00:00:00 UTC" in told
+    assert "put back at most 100 times in a lap; 2 s off the track, 1 s for a crash" in told
+    league = leagues.find(paddock.store, "grand").definition()
+    assert (league.track, league.rules.laps, league.rules.off_track_penalty) == (("oval", "random:7"), 4, 2.0)
+    assert league.closes == 32_472_144_000.0 and league.owner.startswith("user ")
+    assert "grand exists already, and a league is never changed" in paddock.refused(
+        "create", "grand", "--track", "oval"
+    )
+    (row,) = [each for each in paddock.done("list").splitlines() if each.startswith("grand ")]
+    assert row.split()[:6] == ["grand", "oval,", "random:7", "4", "best", "0"]
+    assert paddock.done("show", "grand") == told
+    assert paddock.done("table", "grand") == "grand has no entries yet; muster league submit grand MODEL\n"
+
+
+REFUSED = {
+    ("create", "x", "--track", "ovel"): "track ovel does not exist; did you mean oval?",
+    ("create", "a/b", "--track", "oval"): "league name 'a/b': use letters, digits",
+    ("create", "x"): "--track is missing",
+    (
+        "create",
+        "x",
+        "--track",
+        "oval",
+        "--ranking",
+        "totl",
+    ): "--ranking totl: there is no such ranking; did you mean total?",
+    ("create", "x", "--track", "oval", "--laps", "0"): "--laps: expected a value greater than or equal to 1",
+    ("create", "x", "--track", "oval", "--opens", "soon"): "--opens soon: expected a time such as 2026-12-24T18:00",
+    (
+        "create",
+        "x",
+        "--track",
+        "oval",
+        "--opens",
+        "2030-01-02",
+        "--closes",
+        "2030-01-01",
+    ): "would close before it opens",
+    ("show", "cpu"): "league cpu does not exist",
+    ("show", "cup", "7"): "league cup: entry 7 does not exist",
+    ("submit", "cup", "fats"): "model fats does not exist; did you mean fast?",
+    ("submit", "cup", "fast@9"): "model fast has no version 9; there are: 1, 2, 3, 4",
+    ("submit", "cup", "fast@x"): "fast@x: after @ stands a version, such as fast@1",
+    (
+        "submit",
+        "cup",
+        "fast@3",
+    ): "model fast@3 is of task Cartpole; a league takes models of the racer's installed tasks",
+    ("submit", "cup", "fast@4"): "model fast@4 is of task my_tasks:Rocket; a league takes models of the racer's",
+    ("submit", "cup", "fast@1", "--as", "\x1b[31m"): "use letters, digits, spaces",
+    ("submit", "cup", "fast@1", "--evaluation", "nothing"): "job nothing does not exist",
+    ("submit", "cup", "fast@1", "--evaluation", "blocker"): "is RUNNING: only a race that has SUCCEEDED is entered",
+    ("submit", "cup", "fast@1", "--evaluation", "x", "--detach"): "leave one of them out",
+    ("submit", "past", "fast@1"): "league past closed at 2020-01-01 00:00:00 UTC",
+    ("submit", "future", "fast@1"): "league future opens at 2999-01-01 00:00:00 UTC",
+    ("disqualify", "cup", "9", "--reason", "x"): "league cup: entry 9 does not exist",
+    ("disqualify", "cup", "9"): "--reason is missing",
+    ("table", "cup", "-o", "cup.pdf"): "the ending says what it is to be: .csv, .png",
+    ("tabel", "cup"): "did you mean table?",
+}
+
+
+@pytest.fixture(scope="module")
+def cups(paddock: Paddock) -> Paddock:
+    for options in (("cup",), ("past", "--closes", "2020-01-01T00:00Z"), ("future", "--opens", "2999-01-01T00:00Z")):
+        paddock.done("create", *options, "--track", "oval")
+    return paddock
+
+
+@pytest.mark.parametrize("arguments", REFUSED)
+def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, arguments: tuple[str, ...]) -> None:
+    before = cups.races()
+    assert REFUSED[arguments] in cups.refused(*arguments)
+    assert cups.races() == before
+    assert "x" not in leagues.names(cups.store)
+
+
+def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
+    cups.done("create", "long", "--track", "oval", "--laps", "5", "--continuous", "--seed", "11", "--seconds", "60")
+    told = cups.done("submit", "long", "fast@2", "--as", "ada", "--detach")
+    job = json.loads(call_muster("list", "--json", home=cups.server.home).stdout)[0]["jobId"]
+    assert told.splitlines() == [
+        f"submitted the race of fast@2 as {job}",
+        f"enter it when it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
+    ]
+    detail = cups.server.detail(job)
+    assert (detail["name"], detail["kind"], detail["queue"]) == ("race-long-fast-2", "race", "default")
+    section = detail["spec"]["race"]
+    assert (section["run"], section["checkpoint"], section["trials"], section["seed"]) == ("racer", 12, 5, 11)
+    assert (section["track"], section["continuous"], section["seconds"]) == (["oval"], True, 60.0)
+    assert section["config"] == leagues.CAR
+    assert "is RUNNABLE: only a race that has SUCCEEDED" in cups.refused(
+        "submit", "long", "fast@2", "--evaluation", job
+    )
+    cups.server.client.batch("TerminateJob", jobId=job, reason="seen")
+
+
+def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_path: Path) -> None:
+    cups.done("create", "spring", "--track", "oval")
+    slow, fast = cups.raced(0, race([14.0, 14.0, 14.5])), cups.raced(1, race([12.0, 12.5, 12.25], off_tracks=1), 2)
+    told = cups.done("submit", "spring", "fast@1", "--as", "ada", "--evaluation", slow)
+    assert told == "entry 1 of spring: ada with fast@1, 0:42.500, rank 1\n"
+    row = json.loads(cups.done("submit", "spring", "fast@2", "--as", "Bob B.", "--evaluation", fast[:8], "--json"))
+    assert (row["rank"], row["entry"], row["time"], row["off_tracks"]) == (1, 2, 36.75, 1)
+    again = cups.refused("submit", "spring", "fast@2", "--as", "Bob B.", "--evaluation", fast)
+    assert "league spring: entry 2 has this evaluation already" in again
+    picture, table = tmp_path / "spring.png", tmp_path / "spring.csv"
+    lines = cups.done("table", "spring", "-o", str(picture)).splitlines()
+    assert lines[1].split() == [
+        "1",
+        "2",
+        "Bob",
+        "B.",
+        "fast@2",
+        "0:36.750",
+        "0:12.000",
+        "3",
+        "of",
+        "3",
+        "1",
+        "0",
+        "0",
+        "ranked",
+    ]
+    assert lines[2].split()[:5] == ["2", "1", "ada", "fast@1", "0:42.500"] and picture.read_bytes()[:4] == b"\x89PNG"
+    assert "it exists; --overwrite replaces it" in cups.refused("table", "spring", "-o", str(picture))
+    cups.done("table", "spring", "-o", str(table))
+    with table.open() as file:
+        first, second = csv.DictReader(file)
+    assert (first["racer"], first["time"], second["rank"], second["model"]) == ("Bob B.", "36.75", "2", "fast@1")
+    assert (
+        cups.done("disqualify", "spring", "2", "--reason", "not a car")
+        == "entry 2 of spring is disqualified: not a car\n"
+    )
+    assert "entry 2 is disqualified already" in cups.refused("disqualify", "spring", "2", "--reason", "no")
+    rows = cups.rows("spring")
+    assert [(each["rank"], each["entry"], each["status"]) for each in rows] == [
+        (1, 1, "ranked"),
+        (None, 2, "disqualified"),
+    ]
+    shown = cups.done("show", "spring", "2")
+    assert "disqualified: not a car" in shown and "0:12.500" in shown and f"job {fast}" in shown
+    assert cups.done("verify", "spring").splitlines() == [
+        f"entry {number}: as it was entered, and so is its model" for number in (1, 2)
+    ]
+
+
+def test_an_evaluation_that_is_not_of_the_league_s_race_is_not_entered(cups: Paddock) -> None:
+    cups.done("create", "strict", "--track", "oval")
+
+    def refused(job: str, model: str = "fast@1") -> str:
+        return cups.refused("submit", "strict", model, "--evaluation", job)
+
+    job = cups.raced(2, race([12.0, 12.0, 12.0]))
+    assert "it is of checkpoint 00000011-e1, the model of 00000012-e1" in refused(job, "fast@2")
+    for driven, changes, said in (
+        (race([12.0] * 3), {"config": {**CONFIG, "speed_lag": 0.0}}, "its config.speed_lag is 0.0, the league's 0.2"),
+        (race([12.0] * 3), {"seed": 5}, "its seed is 5, the league's 1"),
+        (race([12.0] * 3, continuous=True), {}, "its rules have continuous True, the league's False"),
+        (race([12.0] * 2), {}, "its rules have laps 2, the league's 3"),
+        (
+            {"rules": race([12.0] * 3)["rules"], "trials": [{}] * 3},
+            {},
+            "race.trials.0: expected trial 1 with its status",
+        ),
+        (race([12.0] * 3), {"race": None}, "it is no race"),
+    ):
+        assert said in refused(cups.raced(2, driven, **changes))
+    assert "has left no evaluation of run racer" in refused(cups.jobs[5])
+    assert cups.rows("strict") == []
+
+
+def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_closed(cups: Paddock) -> None:
+    body = {"track": ["oval"], "closes": cups.ended}
+    cups.server.client.post("/api/leagues", {"name": "ended", **body})
+    job = cups.raced(3, race([12.0, 12.0, 12.0]))
+    assert "league ended closed at" in cups.refused("submit", "ended", "fast@1")
+    assert "rank 1" in cups.done("submit", "ended", "fast@1", "--evaluation", job)
+    cups.server.client.post("/api/leagues", {"name": "missed", **body, "closes": cups.ended - 3600})
+    assert f"and job test ({job[:8]}) was not submitted in between" in cups.refused(
+        "submit", "missed", "fast@1", "--evaluation", job
+    )
+
+
+def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
+    cups.done("create", "honest", "--track", "oval")
+    for job in (0, 1):
+        cups.raced(job, race([12.0 + job] * 3), job + 1)
+        cups.done("submit", "honest", f"fast@{job + 1}", "--as", f"r{job}", "--evaluation", cups.jobs[job])
+    path = leagues.find(cups.store, "honest").path / "entries" / "1" / "entry.json"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes().replace(b"12.0", b"10.0"))
+    rows = cups.rows("honest")
+    assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
+    verified = cups.muster("verify", "honest")
+    assert verified.returncode == 1 and "entry 1: league honest: entry 1 is altered" in verified.stdout
+    listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
+    assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
+    assert "entry 2: as it was entered" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+
+    onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
+    onnx.chmod(0o644)
+    onnx.write_bytes(b"Weights")
+    verified = cups.muster("verify", "honest", "2", "--rerun")
+    assert verified.returncode == 1 and "entry 2: model fast@2 was altered: " in verified.stdout
+    before = cups.races()
+    assert "model fast@2 was altered: bundle " in cups.refused("submit", "honest", "fast@2")
+    onnx.write_bytes(b"weights")
+    weights = cups.store.run("racer").checkpoints / "00000012-e1" / "learner.pt"
+    weights.write_bytes(b"Weights")
+    assert "the content of learner.pt was altered" in cups.refused("submit", "honest", "fast@2")
+    weights.write_bytes(b"weights")
+    os.rename(weights.parent, weights.parent.with_name("away"))
+    said = "checkpoint 00000012-e1 of run racer, which a race loads, is gone; register one that is there"
+    assert said in cups.refused("submit", "honest", "fast@2")
+    verified = cups.muster("verify", "honest", "2", "--rerun")
+    assert verified.returncode == 1 and f"entry 2: model fast@2: {said}" in verified.stdout
+    os.rename(weights.parent.with_name("away"), weights.parent)
+    assert cups.races() == before, "nothing was started"
+
+    rules = leagues.find(cups.store, "honest").path / "definition" / "league.json"
+    rules.chmod(0o644)
+    rules.write_bytes(rules.read_bytes().replace(b'"seed": 1', b'"seed": 2'))
+    for ask in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
+        assert "league honest is altered" in cups.refused(*ask)
+    (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
+    assert "league honest is altered" in told["problem"] and "league honest is altered" in cups.done("list")
