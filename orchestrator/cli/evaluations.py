@@ -14,6 +14,7 @@ from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_th
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.evaluating import evaluation_document
+from orchestrator.kept_files import with_files
 from orchestrator.spec import Spec, override, validate
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500
@@ -87,7 +88,9 @@ def _spec(
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
     document = evaluation_document(run, trained, section, name)
     worlds = [f"evaluate.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
-    return validate(override(document, [*worlds, *elsewhere]), f"evaluation of {run}")
+    source = f"evaluation of {run}"
+    changed = override(document, [*worlds, *elsewhere])
+    return validate(with_files(changed, source, task=(trained.get("train") or {}).get("task")), source)
 
 
 def _told(client: Client, job: str) -> int:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import newton
+import torch
+import warp as wp
 
 from shared_store.layout import Store
 from worker.racer import terms as racing
@@ -16,12 +18,14 @@ from worker.racer.car import Cars
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
 from worker.racer.naming import resolve
+from worker.racer.race import Race
+from worker.racer.rewards.kept import reward_file
 from worker.racer.scenery import CAR, add_scenery
 from worker.racer.track import Track
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.camera import CameraSensor
 from worker.tasks import terms
-from worker.tasks.configs.racer import RacerConfig, RacerPixelsAndStateConfig, RacerPixelsConfig
+from worker.tasks.configs.racer import FrontCameraConfig, RacerConfig, RacerPixelsAndStateConfig, RacerPixelsConfig
 from worker.tasks.declaration import (
     Action,
     Choice,
@@ -61,8 +65,39 @@ class Racer(DeclaredTask):
             raise ValueError(f"config.track: {error}") from error
         except Refused as error:
             raise ValueError(f"config.{error}") from error
+        self.race = self.race_of(config)
         super().build(builder)
         add_scenery(builder, self.circuit)
+
+    def race_of(self, config: RacerConfig) -> Race | None:
+        """What a learner's reward function is told, where there is one. Raises ValueError where the guard refuses it."""
+        if config.reward_function is None:
+            return None
+        try:
+            reward = reward_file(config.reward_function)
+        except Refused as error:
+            raise ValueError(f"config.reward_function: {error}") from error
+        race = Race.of(self.circuit, reward, getattr(config, "front", FrontCameraConfig()), getattr(self, "device", ""))
+        self.waits_for_host = race.function is None
+        return race
+
+    def _prepare(self) -> None:
+        super()._prepare()
+        if self.race:
+            self.sensors["race"].follow(self.sensors["car"].arrays)
+
+    def _begin(self) -> None:
+        super()._begin()
+        if self.race:
+            self.sensors["race"].reward.forget_failures()
+
+    def failures(self) -> list[str]:
+        """The calls of a learner's reward function that gave no reward so far, the most frequent first."""
+        found = self.sensors["race"].reward.failures() if self.race else {}
+        first = self.first_world
+        return [
+            f"{told} ({each.count} times, first in world {first + each.car})" for told, each in found.items()
+        ]
 
     def move(self) -> None:
         """Drive every car for one control step: the bicycle's rule, and no physics."""
@@ -105,10 +140,12 @@ class Racer(DeclaredTask):
         return self.road_terms(config)
 
     def rewards_of(self, config: RacerConfig) -> Mapping[str, Reward]:
-        """What the car earns, by the names of ``config.rewards``. A reward function of a learner's own takes its place here.
+        """What the car earns, by the names of ``config.rewards``: what a learner's reward function gives, where there is one.
 
-        Such a term has the parameters ``world`` and ``car: CarArrays``, which has all that DeepRacer's reward functions are told.
+        A term of one's own has the parameters ``world`` and ``car: CarArrays``, which has all that DeepRacer's reward functions are told.
         """
+        if self.race:
+            return {"reward": Reward(self.race.function or from_workers)}
         return {
             "progress": Reward(racing.progress_made),
             "off_track": Reward(racing.left_road),
@@ -124,7 +161,7 @@ class Racer(DeclaredTask):
             config.steering_lag,
             config.substeps,
         )
-        return {"car": cars}
+        return {"car": cars, **({"race": self.race} if self.race else {})}
 
     def road_terms(self, config: RacerConfig) -> Mapping[str, Observation]:
         """The road and the car in numbers."""
@@ -185,6 +222,16 @@ class RacerPixelsAndState(RacerPixels):
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """Numbers and image in groups of their own; the critic sees the road."""
         return {"policy": self.own_terms(), "front": Image("front"), "critic": self.road_terms(config)}
+
+
+def from_workers(task: Racer) -> torch.Tensor:
+    """What a reward function gives that is not compiled, NaN where it failed, shape ``(worlds,)``; waits for the device.
+
+    Raises:
+        RewardFailed: A call does not return, floods its output or ends its process.
+    """
+    rewards: torch.Tensor = wp.to_torch(task.sensors["race"].reward.rewards())
+    return rewards
 
 
 def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:

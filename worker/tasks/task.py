@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, ClassVar, Self
 
@@ -79,8 +79,10 @@ class Task:
     """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels.
 
     A pair of numbers becomes a ``wp.vec2``."""
-    reward_terms: ClassVar[tuple[str, ...]]
-    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
+    reward_terms: tuple[str, ...]
+    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's ``rewards``; of the class, the default ones."""
+    waits_for_host: bool = False
+    """Whether :meth:`step` reads anything back to the host: then no graph can hold it."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
     action_names: tuple[str, ...]
@@ -119,6 +121,7 @@ class Task:
     ) -> None:
         check_arguments(type(self), config, world_count, seed, first_world)
         self.config = config
+        self.reward_terms = tuple(config.rewards)
         self.world_count = world_count
         self.device = "cuda:0" if device == "cuda" else device
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
@@ -174,6 +177,7 @@ class Task:
         """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError where nothing fits."""
         task = cls.__new__(cls)
         task.config = config
+        task.reward_terms = tuple(config.rewards)
         task.template = task._template()
         return task
 
@@ -320,6 +324,10 @@ class Task:
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
+
+    def failures(self) -> Sequence[str]:
+        """What went wrong so far in functions that the task was given, such as a learner's reward, a line each; waits for the device."""
+        return ()
 
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
