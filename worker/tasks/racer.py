@@ -91,13 +91,26 @@ class Racer(DeclaredTask):
         if self.race:
             self.sensors["race"].reward.forget_failures()
 
-    def failures(self) -> list[str]:
-        """The calls of a learner's reward function that gave no reward so far, the most frequent first."""
+    def notes(self) -> list[str]:
+        """Where a learner's reward function runs, and why."""
+        if self.race is None:
+            return []
+        if not self.race.reason:
+            return [f"{self.race.reward.file}: compiled to the device", *self.race.notes]
+        graph = "; a step is no part of a CUDA graph" if self.device.startswith("cuda") else ""
+        return [f"{self.race.reason}{graph}"]
+
+    def failures(self) -> dict[str, tuple[int, int]]:
+        """The calls of a learner's reward function that gave no reward."""
         found = self.sensors["race"].reward.failures() if self.race else {}
-        first = self.first_world
-        return [
-            f"{told} ({each.count} times, first in world {first + each.car})" for told, each in found.items()
-        ]
+        return {told: (each.count, self.first_world + each.car) for told, each in found.items()}
+
+    def read_mishap(self, code: int) -> tuple[int, str] | None:
+        """As :meth:`Task.read_mishap`, with what the reward function says of it."""
+        found = super().read_mishap(code)
+        if found is None or "reward" not in found[1]:
+            return found
+        return found[0], ": ".join((found[1], *list(self.failures())[:1]))
 
     def move(self) -> None:
         """Drive every car for one control step: the bicycle's rule, and no physics."""

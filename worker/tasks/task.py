@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, ClassVar, Self
 
@@ -32,9 +32,10 @@ from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface, deviations
 from worker.tasks.saved import check_state, completed
+from worker.tasks.telling import Telling
 
 
-class Task:
+class Task(Telling):
     """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
 
     A subclass names its configuration, terms and kernels and builds one world; everything else is here. Every tensor
@@ -81,8 +82,6 @@ class Task:
     A pair of numbers becomes a ``wp.vec2``."""
     reward_terms: tuple[str, ...]
     """Names of the reward terms, in the order of the kernel's indices: that of the configuration's ``rewards``; of the class, the default ones."""
-    waits_for_host: bool = False
-    """Whether :meth:`step` reads anything back to the host: then no graph can hold it."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
     action_names: tuple[str, ...]
@@ -324,10 +323,6 @@ class Task:
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
-
-    def failures(self) -> Sequence[str]:
-        """What went wrong so far in functions that the task was given, such as a learner's reward, a line each; waits for the device."""
-        return ()
 
     def _noise(self) -> list[float]:
         """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""

@@ -11,8 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from worker.learning.ppo.settings import PPOConfig
 from shared_store.file_fields import kept_file
+from worker.learning.ppo.settings import PPOConfig
 from worker.racer.actions import ActionSpace, action_space, read_metadata
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import MOST_OBJECTS
@@ -93,9 +93,7 @@ class RacerConfig(TaskConfig):
     """What a ``model_metadata.json`` holds, or the path of one; steering in degrees, speed in m/s."""
     reward_function: Annotated[
         Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
-    ] = field(
-        default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy"))
-    )
+    ] = field(default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy")))
     """Path of a file with ``def reward_function(params)``, which takes the place of all other rewards."""
     speed_lag: Amount = 0.2
     """Time constant with which the speed follows what is asked [s]."""
