@@ -47,6 +47,11 @@ class Racer(DeclaredTask):
     config_type = RacerConfig
     solver_options: ClassVar[dict[str, object]] = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if self.race:
+            self.sensors["race"].reward.forget_failures()  # of the step that was tried out
+
     def robot(self, config: RacerConfig) -> Robot:
         """The car."""
         return Robot(CAR, passive=True)
@@ -85,11 +90,6 @@ class Racer(DeclaredTask):
         super()._prepare()
         if self.race:
             self.sensors["race"].follow(self.sensors["car"].arrays)
-
-    def _begin(self) -> None:
-        super()._begin()
-        if self.race:
-            self.sensors["race"].reward.forget_failures()
 
     def notes(self) -> list[str]:
         """Where a learner's reward function runs, and why."""

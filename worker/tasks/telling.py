@@ -16,7 +16,7 @@ class Telling:
         return ()
 
     def failures(self) -> Mapping[str, tuple[int, int]]:
-        """What went wrong in them since the task was built or restarted; waits for the device.
+        """What went wrong in them since the task was built; waits for the device.
 
         Returns:
             By a line that says what: how often, and in which world first, counted over all ranks; the most frequent first.
