@@ -246,5 +246,7 @@ def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
         ValueError, match=r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
     ):
         Racer(RacerConfig(reward_function=str(file)), 1)
-    with pytest.raises(ValueError, match=r"obstacles: a reward function is told of at most 10 objects, and there are 11"):
+    with pytest.raises(
+        ValueError, match=r"obstacles: a reward function is told of at most 10 objects, and there are 11"
+    ):
         RacerConfig(reward_function=str(file), obstacles=(ObstacleConfig(1.0),) * 11)
