@@ -22,6 +22,7 @@ from worker.racer.race import Race
 from worker.racer.rewards.kept import reward_file
 from worker.racer.scenery import CAR, add_scenery
 from worker.racer.track import Track
+from worker.simulation.capture import on_torch_stream
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.camera import CameraSensor
 from worker.tasks import terms
@@ -50,7 +51,8 @@ class Racer(DeclaredTask):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         if self.race:
-            self.sensors["race"].reward.forget_failures()  # of the step that was tried out
+            with on_torch_stream(self.device):
+                self.sensors["race"].reward.forget_failures()  # of the step that was tried out
 
     def robot(self, config: RacerConfig) -> Robot:
         """The car."""
@@ -102,7 +104,10 @@ class Racer(DeclaredTask):
 
     def failures(self) -> dict[str, tuple[int, int]]:
         """The calls of a learner's reward function that gave no reward."""
-        found = self.sensors["race"].reward.failures() if self.race else {}
+        if self.race is None:
+            return {}
+        with on_torch_stream(self.device):
+            found = self.sensors["race"].reward.failures()
         return {told: (each.count, self.first_world + each.car) for told, each in found.items()}
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
@@ -243,7 +248,8 @@ def from_workers(task: Racer) -> torch.Tensor:
     Raises:
         RewardFailed: A call does not return, floods its output or ends its process.
     """
-    rewards: torch.Tensor = wp.to_torch(task.sensors["race"].reward.rewards())
+    with on_torch_stream(task.device):
+        rewards: torch.Tensor = wp.to_torch(task.sensors["race"].reward.rewards())
     return rewards
 
 
