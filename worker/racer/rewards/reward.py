@@ -123,7 +123,6 @@ checked = functools.lru_cache(maxsize=64)(check_source)
 """The guard, asked once in a process for each function."""
 
 
-@functools.lru_cache(maxsize=64)
 def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, str, tuple[str, ...]]:
     """A reward function that the guard let pass, compiled.
 
