@@ -276,6 +276,7 @@ class Loop:
                 self._say(f"warning: iteration {iteration}: {said}")
                 self._failures.tell()
             return
+        self._failures.tell()
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
         if found[self.gang.rank]:
