@@ -299,13 +299,13 @@ def validate(
         # a misspelt key comes before the one that is missing for it: it has a line, and a nearest name
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
         path = tuple(part for part in path_of(first) if isinstance(part, str | int))
-        raise SpecError(f"{_place(path, source, lines)}{_explain(first, path)}{more}") from None
+        raise SpecError(f"{place_of(path, source, lines)}{_explain(first, path)}{more}") from None
     problem = _not_finite(value)
     if not problem and spec.train:
         problem = _of_another_algorithm(spec.train) or (_problem_of(spec.train) if merged else None)
     if problem:
         path, words = problem
-        raise SpecError(f"{_place(path, source, lines)}{words}")
+        raise SpecError(f"{place_of(path, source, lines)}{words}")
     return spec
 
 
@@ -412,7 +412,7 @@ def _keys_at(path: tuple[str | int, ...]) -> list[str]:
     return list(model.model_fields)
 
 
-def _place(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
+def place_of(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
     """File, line and key of an error, with what stands between them and its words."""
     line = _line_of(path, lines or {})
     where = "--set" if line == 0 else f"{source}:{line}" if line else source

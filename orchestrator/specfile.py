@@ -8,14 +8,15 @@ from typing import Any
 
 from orchestrator import strict_yaml
 from orchestrator.errors import SpecError
+from orchestrator.kept_files import with_files
 from orchestrator.spec import Spec, override, validate
 
 
 def load(path: str, assignments: list[str] | None = None) -> Spec:
-    """The spec in the file ``path`` with ``--set`` assignments applied.
+    """The spec in the file ``path`` with ``--set`` assignments applied, and the files that its task's configuration names read.
 
     Raises:
-        SpecError: The file can't be read, is not YAML, or is not a valid spec; one line with file, line and key.
+        SpecError: A file can't be read, is not YAML, or is not a valid spec; one line with file, line and key.
     """
     document, lines = read(path)
     if assignments and isinstance(document, dict):
@@ -24,6 +25,8 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
         # what --set changed stands on no line of the file
         lines = {key: line for key, line in lines.items() if not any(key[: len(each)] == each for each in changed)}
         lines |= dict.fromkeys(changed, 0)
+    if isinstance(document, dict):
+        document = with_files(document, path, lines)
     return validate(document, path, lines)
 
 

@@ -72,6 +72,8 @@ def main(kind: str = "evaluate") -> int:
         return task
 
     task = build(0)
+    if gang.is_main and (notes := task.notes()):
+        print("\n".join(notes), flush=True)
     # a GPU adds in no fixed order: there one batch is faster, and blocks would make no two evaluations equal
     policies = load_policies(checkpoint, gang.device, dealt.count if gang.device == "cpu" else 1)
     policy = Blocks(policies, size) if gang.device == "cpu" else policies[0]
@@ -121,13 +123,20 @@ def _laps(task: Any) -> Laps:
 
 def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, seed: int) -> Iterator[Task]:
     """The worlds of each round: those of the global indices ``round * total`` and on, whatever the rounds before did to them."""
+    from worker.learning.failures import Failures
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
     yield task
     for number in range(1, count):
         if task.config.randomize.draws_worlds:  # when they are built
+            Failures(task, say).tell()
             task = build(number * total)
         else:
             task.restart(seed, task.first_world + total)
         yield task
+    Failures(task, say).tell()
 
 
 def _circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.errors import UsageError
+from orchestrator.kept_files import changes_with_files
 
 _EXAMPLES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
 muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2"""
@@ -51,7 +52,7 @@ def clone(
             "name": name,
             "checkpoint": checkpoint,
             "nodes": nodes,
-            "set": [*(set_ or []), *on_queue(set_, elsewhere)],
+            "set": [*changes_with_files(client, run, set_), *on_queue(set_, elsewhere)],
             "directory": os.getcwd(),
         }
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)

@@ -17,6 +17,7 @@ from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.errors import ServerError, UsageError
 from orchestrator.evaluating import evaluation_document
+from orchestrator.kept_files import with_files
 from orchestrator.spec import Spec, override, validate
 from shared_store.races import SIM_TRACE
 
@@ -149,7 +150,9 @@ def _spec(
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
     document = evaluation_document(run, trained, section, name, kind)
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
-    return validate(override(document, [*worlds, *elsewhere]), f"evaluation of {run}")
+    source = f"{'race' if kind == 'race' else 'evaluation'} of {run}"
+    changed = override(document, [*worlds, *elsewhere])
+    return validate(with_files(changed, source, task=(trained.get("train") or {}).get("task")), source)
 
 
 def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:

@@ -22,6 +22,7 @@ from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.exchange import SIGNALS, Exchange
+from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
@@ -40,6 +41,7 @@ from worker.learning.setup import (
 )
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
+from worker.learning.totals import figure
 from worker.learning.training import Training
 from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.config import value_at
@@ -92,10 +94,12 @@ class Loop:
         self._told_captured = False
         self._stopwatch = Stopwatch(gang.device)
         self._stall_seconds = 0.0
-        captured = gang.device if self.algorithm.captures_rollout else "cpu"
+        captures = self.algorithm.captures_rollout and not self.task.waits_for_host
+        captured = gang.device if captures else "cpu"
         self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
         self._exchange = Exchange(gang, self.task)
         self.reporter, self.fence, self.beacon = Reporter(self.gate), Fence(job.run, job.epoch), Beacon()
+        self._failures = Failures(self.task, lambda line: self.reporter.do(_print, line))
         self.state.saver.start()
         end_startup()
 
@@ -123,7 +127,7 @@ class Loop:
         progress = self.state.progress
         report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
         attending = Attending(self.job.run, self.task, self.gate) if self.gang.is_main else None
-        self._say(self._beginning())
+        self._say("\n".join([*self.task.notes(), self._beginning()]))
         self._stopwatch.begin()
         try:
             while progress.iteration < self.training.iterations:
@@ -270,7 +274,9 @@ class Loop:
             if self._warnings <= WARNINGS:
                 said += "; from now on only counted" if self._warnings == WARNINGS else ""
                 self._say(f"warning: iteration {iteration}: {said}")
+                self._failures.tell()
             return
+        self._failures.tell()
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
         if found[self.gang.rank]:
@@ -354,7 +360,7 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{name: _figure(name, value, finished, lengths) for name, value in known.items()},
+            **{name: figure(name, value, finished, lengths) for name, value in known.items()},
         }
 
     def _finish(self) -> None:
@@ -368,6 +374,7 @@ class Loop:
                 "training is done, but its last checkpoint could not be saved; free space in the store and start again"
             )
         self.beacon.tell(done=True)
+        self._failures.tell(again=True)
         self._say(f"evaluating checkpoint {name}")
         worlds = self.held_out_worlds()
         glance = self._glance(worlds)
@@ -439,12 +446,3 @@ def straggler(seconds: list[float]) -> dict[str, float]:
     slowest = max(range(len(seconds)), key=seconds.__getitem__)
     usual = statistics.median(seconds)
     return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
-
-
-def _figure(name: str, total: float, episodes: float, steps: float) -> float | None:
-    """A reward term as its mean over the finished episodes, a metric over their steps; a count as it is."""
-    if name.startswith("reward_"):
-        return total / episodes if episodes else None
-    if name.startswith("metric_"):
-        return total / steps if steps else None
-    return total

@@ -201,6 +201,8 @@ class TaskConfig(_Common):
     too, where a declaration makes it an image. Jobs are checked against these names when they are submitted."""
     races: ClassVar[bool] = False
     """Whether an episode is a lap of a race, as a job's ``race`` has it run."""
+    other_rewards: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    """Reward terms, with their weights, that take the place of the default ones where :attr:`has_other_rewards`."""
 
     @classmethod
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
@@ -217,6 +219,11 @@ class TaskConfig(_Common):
         return configured(cls, overrides)
 
     @property
+    def has_other_rewards(self) -> bool:
+        """Whether :attr:`other_rewards` are the task's reward terms; no, by default."""
+        return False
+
+    @property
     def observation_groups(self) -> Mapping[str, bool]:
         """The task's observation groups, and of each whether it is of images."""
         return {"policy": getattr(self, "camera", None) is not None, "critic": False, **self.further_groups}
@@ -225,7 +232,7 @@ class TaskConfig(_Common):
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         """JSON Schema of ``train.config``: the names of the terms, without what stands in sections of its own."""
         document: dict[str, Any] = handler.resolve_ref_schema(handler(core_schema))
-        properties, known = document["properties"], default_rewards(cls)
+        properties, known = document["properties"], {**default_rewards(cls), **cls.other_rewards}
         for name in training_sections():
             properties.pop(name, None)
         points = TypeAdapter(Points).json_schema()
@@ -242,6 +249,10 @@ class TaskConfig(_Common):
         for item in fields(_Common):
             object.__setattr__(self, item.name, getattr(checked, item.name))
         known = default_rewards(type(self))
+        if self.has_other_rewards:
+            if self.rewards == known:  # nobody gave any
+                object.__setattr__(self, "rewards", self.other_rewards)
+            known = self.other_rewards
         for name in self.rewards:
             if name not in known:
                 raise Refused(

@@ -332,7 +332,8 @@ class DeclaredTask(Task):
         if not self._torch_terms.any:
             self._judge(mode)
             return
-        self._torch_terms.judge()
+        if mode == STEP:  # a reset judges nothing
+            self._torch_terms.judge()
         self._judge_alone(mode)
         if self._torch_terms.observe_any:
             self._torch_terms.observe()

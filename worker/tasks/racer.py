@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import newton
+import torch
+import warp as wp
 
 from shared_store.layout import Store
 from worker.racer import resets
@@ -17,12 +19,15 @@ from worker.racer.car import Cars
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
 from worker.racer.naming import resolve
+from worker.racer.reward_inputs import RewardInputs
+from worker.racer.rewards.kept import reward_file
 from worker.racer.scenery import CAR, add_scenery
 from worker.racer.track import Track
+from worker.simulation.capture import on_torch_stream
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.camera import CameraSensor
 from worker.tasks import terms
-from worker.tasks.configs.racer import RacerConfig, RacerPixelsAndStateConfig, RacerPixelsConfig
+from worker.tasks.configs.racer import FrontCameraConfig, RacerConfig, RacerPixelsAndStateConfig, RacerPixelsConfig
 from worker.tasks.declaration import (
     Action,
     Choice,
@@ -44,6 +49,12 @@ class Racer(DeclaredTask):
     config_type = RacerConfig
     solver_options: ClassVar[dict[str, object]] = {"disable_contacts": True, "njmax": 1, "nconmax": 0}
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if self.race:
+            with on_torch_stream(self.device):
+                self.sensors["race"].reward.forget_failures()  # of the step that was tried out
+
     def robot(self, config: RacerConfig) -> Robot:
         """The car."""
         return Robot(CAR, passive=True)
@@ -62,8 +73,50 @@ class Racer(DeclaredTask):
             raise ValueError(f"config.track: {error}") from error
         except Refused as error:
             raise ValueError(f"config.{error}") from error
+        self.race = self.race_of(config)
         super().build(builder)
         add_scenery(builder, self.circuit)
+
+    def race_of(self, config: RacerConfig) -> RewardInputs | None:
+        """What a learner's reward function is told, where there is one. Raises ValueError where the guard refuses it."""
+        if config.reward_function is None:
+            return None
+        try:
+            reward = reward_file(config.reward_function)
+        except Refused as error:
+            raise ValueError(f"config.reward_function: {error}") from error
+        race = RewardInputs.of(self.circuit, reward, getattr(config, "front", FrontCameraConfig()), getattr(self, "device", ""))
+        self.waits_for_host = race.function is None
+        return race
+
+    def _prepare(self) -> None:
+        super()._prepare()
+        if self.race:
+            self.sensors["race"].follow(self.sensors["car"].arrays)
+
+    def notes(self) -> list[str]:
+        """Where a learner's reward function runs, and why."""
+        if self.race is None:
+            return []
+        if not self.race.reason:
+            return [f"{self.race.reward.file}: compiled to the device", *self.race.notes]
+        graph = "; a step is no part of a CUDA graph" if self.device.startswith("cuda") else ""
+        return [f"{self.race.reason}{graph}"]
+
+    def failures(self) -> dict[str, tuple[int, int]]:
+        """The calls of a learner's reward function that gave no reward."""
+        if self.race is None:
+            return {}
+        with on_torch_stream(self.device):
+            found = self.sensors["race"].reward.failures()
+        return {told: (each.count, self.first_world + each.car) for told, each in found.items()}
+
+    def read_mishap(self, code: int) -> tuple[int, str] | None:
+        """As :meth:`Task.read_mishap`, with what the reward function says of it."""
+        found = super().read_mishap(code)
+        if found is None or "reward" not in found[1]:
+            return found
+        return found[0], ": ".join((found[1], *list(self.failures())[:1]))
 
     def move(self) -> None:
         """Drive every car for one control step: the bicycle's rule, and no physics."""
@@ -111,10 +164,12 @@ class Racer(DeclaredTask):
         return self.road_terms(config)
 
     def rewards_of(self, config: RacerConfig) -> Mapping[str, Reward]:
-        """What the car earns, by the names of ``config.rewards``. A reward function of a learner's own takes its place here.
+        """What the car earns, by the names of ``config.rewards``: what a learner's reward function gives, where there is one.
 
-        Such a term has the parameters ``world`` and ``car: CarArrays``, which has all that DeepRacer's reward functions are told.
+        A term of one's own has the parameters ``world`` and ``car: CarArrays``, which has all that DeepRacer's reward functions are told.
         """
+        if self.race:
+            return {"reward": Reward(self.race.function or from_workers)}
         return {
             "progress": Reward(racing.progress_made),
             "off_track": Reward(racing.left_road),
@@ -135,7 +190,7 @@ class Racer(DeclaredTask):
             config.stuck_steps,
             config.trace,
         )
-        return {"car": cars}
+        return {"car": cars, **({"race": self.race} if self.race else {})}
 
     def road_terms(self, config: RacerConfig) -> Mapping[str, Observation]:
         """The road and the car in numbers."""
@@ -196,6 +251,17 @@ class RacerPixelsAndState(RacerPixels):
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """Numbers and image in groups of their own; the critic sees the road."""
         return {"policy": self.own_terms(), "front": Image("front"), "critic": self.road_terms(config)}
+
+
+def from_workers(task: Racer) -> torch.Tensor:
+    """What a reward function gives that is not compiled, NaN where it failed, shape ``(worlds,)``; waits for the device.
+
+    Raises:
+        RewardFailed: A call does not return, floods its output or ends its process.
+    """
+    with on_torch_stream(task.device):
+        rewards: torch.Tensor = wp.to_torch(task.sensors["race"].reward.rewards())
+    return rewards
 
 
 def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:

@@ -32,9 +32,10 @@ from worker.tasks.config import TaskConfig, default_rewards, value_at
 from worker.tasks.ended import Ended
 from worker.tasks.interface import Interface, deviations
 from worker.tasks.saved import check_state, completed
+from worker.tasks.telling import Telling
 
 
-class Task:
+class Task(Telling):
     """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
 
     A subclass names its configuration, terms and kernels and builds one world; everything else is here. Every tensor
@@ -79,8 +80,8 @@ class Task:
     """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels.
 
     A pair of numbers becomes a ``wp.vec2``."""
-    reward_terms: ClassVar[tuple[str, ...]]
-    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's default ``rewards``."""
+    reward_terms: tuple[str, ...]
+    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's ``rewards``; of the class, the default ones."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
     action_names: tuple[str, ...]
@@ -119,6 +120,7 @@ class Task:
     ) -> None:
         check_arguments(type(self), config, world_count, seed, first_world)
         self.config = config
+        self.reward_terms = tuple(config.rewards)
         self.world_count = world_count
         self.device = "cuda:0" if device == "cuda" else device
         self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
@@ -174,6 +176,7 @@ class Task:
         """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError where nothing fits."""
         task = cls.__new__(cls)
         task.config = config
+        task.reward_terms = tuple(config.rewards)
         task.template = task._template()
         return task
 

@@ -12,6 +12,7 @@ import torch
 
 from worker.learning.ppo.settings import PPOConfig
 from worker.tasks.config import Randomization
+from worker.tasks.telling import Telling
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class PointConfig:
     ppo: PointPPO = field(default_factory=PointPPO)
 
 
-class Point:
+class Point(Telling):
     """Push a point to the middle: 2 observations (place, velocity), 1 action."""
 
     config_type = PointConfig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,30 +52,15 @@ class RewardFunction:
         compiled: bool = True,
         processes: int | None = None,
     ) -> None:
-        if problem := check_source(source, file):
+        if problem := checked(source, file):
             raise RewardRefused(problem)
         self.file = file
         self.function: Any = None
         self.reason = "" if compiled else "Python workers were asked for"
         self.notes: tuple[str, ...] = ()
+        self._kernel: Any = None
         if compiled:
-            try:
-                translated = translate(source)
-            except Outside as outside:
-                self.reason = f"{file}: {outside}"
-            else:
-                self.function, self.notes = warp_function(translated.snippet), translated.notes
-        if self.function is not None:
-            wp.init()  # a module's load does not do it
-            (self._kernel,) = kernels([self.function], self.function.key.replace(".", "_"))
-            try:
-                self._kernel.module.load(device)
-            except Exception as error:  # Warp has no type for what a compiler refuses
-                if "build failed" not in str(error):
-                    raise
-                self.function, self.notes = None, ()
-                told = one_line(error)
-                self.reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"
+            self.function, self._kernel, self.reason, self.notes = compiled_function(source, file, device)
         self.race = race_arrays(worlds, tracks, device)
         self._rewards = wp.zeros(worlds, dtype=wp.float32, device=device)
         self._workers: Workers | None = None
@@ -121,7 +107,48 @@ class RewardFunction:
             found = {f"{self.file}: {told}": failure for told, failure in errors.items()}
         return dict(sorted(found.items(), key=lambda item: -item[1].count))
 
+    def forget_failures(self) -> None:
+        """Begin to count failures anew."""
+        self.race.errors.zero_()
+        if self._workers is not None:
+            self._workers.failures.clear()
+
     def close(self) -> None:
         """End the Python workers."""
         if self._workers is not None:
             self._workers.close()
+
+
+checked = functools.lru_cache(maxsize=64)(check_source)
+"""The guard, asked once in a process for each function."""
+
+
+def compiled_function(source: str, file: str, device: str) -> tuple[Any, Any, str, tuple[str, ...]]:
+    """A reward function that the guard let pass, compiled.
+
+    Args:
+        source: Text of its file.
+        file: Name of the file, in messages.
+        device: For which it is compiled, such as ``cuda:0``; empty: it is translated alone.
+
+    Returns:
+        The Warp function and the kernel that calls it for all cars, both None where it can't be compiled; why it can't, one line; what
+        the compiled function leaves out, a line each.
+    """
+    try:
+        translated = translate(source)
+    except Outside as outside:
+        return None, None, f"{file}: {outside}", ()
+    function = warp_function(translated.snippet)
+    wp.init()  # a module's load does not do it
+    (kernel,) = kernels([function], function.key.replace(".", "_"))
+    try:
+        if device:
+            kernel.module.load(device)
+    except Exception as error:  # Warp has no type for what a compiler refuses
+        if "build failed" not in str(error):
+            raise
+        told = one_line(error)
+        reason = f"{file}: the compiler refused its translation, a mistake of Muster's to report ({told}): it runs in Python workers"
+        return None, None, reason, ()
+    return function, kernel, "", translated.notes

@@ -11,8 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from shared_store.file_fields import kept_file
 from worker.learning.ppo.settings import PPOConfig
 from worker.racer.actions import ActionSpace, action_space, read_metadata
+from worker.racer.rewards.kept import RewardFile
+from worker.racer.rewards.parameters import MOST_OBJECTS
 from worker.tasks.config import (
     FACTORS,
     STRICT,
@@ -72,6 +75,7 @@ class RacerConfig(TaskConfig):
     """
 
     races: ClassVar[bool] = True
+    other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
     control_hz: Positive = 15.0
     """Control steps per simulated second [Hz]."""
     substeps: Annotated[int, Field(ge=1, le=64)] = 4
@@ -84,9 +88,14 @@ class RacerConfig(TaskConfig):
         default_factory=lambda: {
             "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
             "action_space_type": "continuous",
-        }
+        },
+        metadata=kept_file("json"),
     )
     """What a ``model_metadata.json`` holds, or the path of one; steering in degrees, speed in m/s."""
+    reward_function: Annotated[
+        Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
+    ] = field(default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy")))
+    """Path of a file with ``def reward_function(params)``, which takes the place of all other rewards."""
     speed_lag: Amount = 0.2
     """Time constant with which the speed follows what is asked [s]."""
     steering_lag: Amount = 0.05
@@ -134,7 +143,9 @@ class RacerConfig(TaskConfig):
 
     - ``progress``: how far the car came on, in percent of the track: a whole lap is 100;
     - ``off_track``: leaving the road, once;
-    - ``crashed``: touching an obstacle, once."""
+    - ``crashed``: touching an obstacle, once;
+
+    or, where there is a ``reward_function``, of the one term ``reward``: what it returns."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=32, hidden_sizes=(64, 64), epochs=5, minibatches=4, learning_rate=1.0e-3, entropy_coef=0.002
@@ -155,6 +166,14 @@ class RacerConfig(TaskConfig):
                 action_space(self.action_space)
             except Refused as error:
                 raise Refused(("action_space", *error.path), error.words) from None
+        if self.has_other_rewards and len(self.obstacles) > MOST_OBJECTS:
+            words = f"a reward function is told of at most {MOST_OBJECTS} objects, and there are {len(self.obstacles)}"
+            raise Refused(("obstacles",), words)
+
+    @property
+    def has_other_rewards(self) -> bool:
+        """Whether a reward function takes the place of the rewards."""
+        return self.reward_function is not None
 
     @property
     def tracks(self) -> tuple[str, ...]:

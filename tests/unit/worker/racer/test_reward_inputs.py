@@ -1,0 +1,252 @@
+"""A learner's reward function in the racer's tasks: what it is told, what the car earns, and what happens where it fails."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from worker.racer.geometry import on_road, project
+from worker.racer.rewards import parameters
+from worker.racer.rewards.problems import RewardFailed
+from worker.tasks.configs.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
+from worker.tasks.racer import Racer, RacerPixels
+
+BOXES = (ObstacleConfig(1.5, "inner"), ObstacleConfig(6.0, "outer"), ObstacleConfig(9.0, "center"))
+STEER = """
+def reward_function(params):
+    behind, ahead = params["closest_waypoints"]
+    total = params["heading"] / 180 + params["waypoints"][ahead][0] - params["waypoints"][behind][1]
+    for distance in params["objects_distance"]:
+        if distance > params["projection_distance"]:
+            total += 0.1 * params["objects_distance_from_center"][params["closest_objects"][1]]
+    return total + params["speed"] * params["steps"]
+"""
+FAILING = "def reward_function(params):\n    return 1.0 / (params['steps'] - 7)\n"
+
+
+def racer(text: str, worlds: int = 1, **fields: Any) -> Racer:
+    return Racer(RacerConfig(reward_function=RewardFile("reward.py", text), **fields), worlds, seed=3)
+
+
+def known(task: Racer, name: str) -> np.ndarray:
+    found: np.ndarray = getattr(task.sensors["car"].arrays, name).numpy().copy()
+    return found
+
+
+def told(task: Racer, world: int) -> dict[str, Any]:
+    """``params`` of a car's function in the last step."""
+    race = task.sensors["race"].arrays
+    numbers = race.numbers.numpy()[world].tolist()
+    objects = race.objects.numpy()[world, : int(numbers[parameters.OBJECT_COUNT])].tolist()
+    track = int(numbers[parameters.TRACK])
+    waypoints = race.waypoints.numpy()[track, : race.counts.numpy()[track]]
+    return parameters.parameters_of(numbers, objects, [(float(x), float(y)) for x, y in waypoints])
+
+
+@pytest.fixture(scope="module")
+def driven() -> Racer:
+    """Cars on two tracks in both directions, some of them off the road."""
+    return racer(
+        STEER,
+        24,
+        track=("oval", "random:4"),
+        obstacles=BOXES,
+        start="random",
+        start_sideways=(-0.4, 0.4),
+        start_turned=(-0.5, 0.5),
+        alternate_direction=True,
+    )
+
+
+def test_a_function_is_told_what_the_tracks_geometry_says(driven: Racer) -> None:
+    random, seen = torch.Generator().manual_seed(4), dict.fromkeys(("reversed", "off", "crashed", "left"), 0)
+    for step in range(60):
+        poses, tracks, backwards = (known(driven, name) for name in ("poses", "tracks", "backwards"))
+        driven.step(torch.rand(24, 2, generator=random) * 2 - 1)
+        if step % 6:
+            continue
+        ended = driven.dones.numpy()
+        poses, commands = known(driven, "poses"), known(driven, "commands")
+        for world in range(24):
+            params = told(driven, world)
+            if ended[world]:  # its car was placed afresh since
+                seen["off"] += params["is_offtrack"]
+                seen["crashed"] += params["is_crashed"]
+                assert (params["progress"] < 100 and not params["all_wheels_on_track"]) or params["is_crashed"]
+                continue
+            track, way, (x, y, heading) = driven.circuit.tracks[tracks[world]], bool(backwards[world]), poses[world]
+            forward, left = (
+                np.array([math.cos(heading), math.sin(heading)]),
+                np.array([-math.sin(heading), math.cos(heading)]),
+            )
+            front = np.array([x, y]) + 0.14 * forward
+            found = project(track, front, way)
+            wheels = [[x, y] + a * forward + b * left for a in (0.082, -0.082) for b in (0.08, -0.08)]
+            on = int(on_road(track, np.array(wheels)).sum())
+            steps = int(known(driven, "steps")[world])
+            boxes = driven.circuit.obstacle_poses[tracks[world]]
+            beside = project(track, boxes[:, :2], way)
+            ways = [track.length - box.distance if way else box.distance for box in BOXES]
+            gaps = [(each - float(found.along[0])) % track.length for each in ways]
+            expected = {
+                "all_wheels_on_track": on == 4,
+                "x": front[0],
+                "y": front[1],
+                "heading": math.degrees(heading),
+                "distance_from_center": found.distance[0],
+                "is_left_of_center": bool(found.left[0]),
+                "is_reversed": way,
+                "is_crashed": False,
+                "is_offtrack": False,
+                "progress": 100 * max(0.0, float(known(driven, "travelled")[world])) / track.length,
+                "steps": steps,
+                "speed": commands[world][1],
+                "steering_angle": math.degrees(commands[world][0]),
+                "track_length": track.length,
+                "track_width": found.width[0],
+                "closest_waypoints": [int(found.before[0]), int(found.after[0])],
+                "closest_objects": [int(np.argmax(gaps)), int(np.argmin(gaps))],
+                "projection_distance": found.along[0],
+                "sim_time": steps / 15,
+                "objects_distance": ways,
+                "objects_heading": [math.degrees(box[2]) for box in boxes],
+                "objects_speed": [0.0] * 3,
+                "objects_distance_from_center": beside.distance.tolist(),
+            }
+            for name, value in expected.items():
+                assert params[name] == pytest.approx(value, abs=2e-3, rel=1e-4), (name, world, step)
+            assert np.allclose(params["objects_location"], boxes[:, :2], atol=1e-5)
+            assert params["objects_left_of_center"][:2] == beside.left.tolist()[:2]  # the third stands on the line
+            assert np.allclose(params["waypoints"], np.vstack((track.center, track.center[:1])), atol=1e-5)
+            assert set(params) == set(expected) | {
+                "objects_location", "objects_left_of_center", "waypoints", "object_in_camera",
+            }  # fmt: skip
+            seen["reversed"] += way
+            seen["left"] += params["is_left_of_center"]
+    assert all(seen.values()), seen
+
+
+@pytest.mark.parametrize(
+    ("distance", "lane", "pitch", "sees"),
+    [
+        (2.0, "center", 0.262, True),
+        (12.0, "center", 0.262, False),  # on the other side of the oval, behind the car
+        (2.0, "center", 1.4, False),  # the camera looks at the road before the car
+    ],
+)
+def test_an_object_is_in_the_camera_where_a_corner_of_it_is_in_the_image(
+    distance: float, lane: Any, pitch: float, sees: bool
+) -> None:
+    fields = {"obstacles": (ObstacleConfig(distance, lane),), "start": "line", "track": "oval"}
+    front = FrontCameraConfig(width=8, height=6, pitch=pitch)
+    reward = RewardFile("reward.py", STEER)
+    task = RacerPixels(RacerPixelsConfig(reward_function=reward, front=front, **fields), 1, seed=3)
+    task.step(torch.zeros(1, 2))
+    assert told(task, 0)["object_in_camera"] is sees
+
+
+def test_compiled_and_called_a_function_earns_the_same(driven: Racer) -> None:
+    config = driven.config
+    assert driven.notes() == ["reward.py: compiled to the device"] and not driven.waits_for_host
+    called = Racer(
+        RacerConfig(
+            **{
+                name: getattr(config, name)
+                for name in ("track", "obstacles", "start", "start_sideways", "start_turned")
+            },
+            alternate_direction=True,
+            reward_function=RewardFile(
+                "reward.py", STEER.replace("    total =", "    kept = []\n    kept.append(1)\n    total =")
+            ),
+        ),
+        24,
+        seed=3,
+    )
+    assert called.waits_for_host and called.notes() == [
+        "reward.py: line 5: a list that grows: such functions run in Python workers"
+    ]
+    driven.restart(3, 0)
+    called.restart(3, 0)
+    random = torch.Generator().manual_seed(8)
+    for _ in range(40):
+        actions = torch.rand(24, 2, generator=random) * 2 - 1
+        for task in (driven, called):
+            task.step(actions)
+        torch.testing.assert_close(driven.rewards, called.rewards, rtol=2e-6, atol=1e-6)
+        assert torch.equal(driven.observations, called.observations) and torch.equal(driven.dones, called.dones)
+    assert driven.dones.any() or driven.statistics[0] > 0
+
+
+def test_a_compiled_function_goes_on_bit_for_bit(driven: Racer) -> None:
+    random = torch.Generator().manual_seed(5)
+    actions = [torch.rand(24, 2, generator=random) * 2 - 1 for _ in range(20)]
+    for each in actions[:10]:
+        driven.step(each)
+    saved = driven.state_dict()
+    after = []
+    for each in actions[10:]:
+        driven.step(each)
+        after.append(driven.rewards.clone())
+    driven.restart(7, 0)
+    driven.restart(3, 0)
+    driven.load_state_dict(saved)
+    for each, rewards in zip(actions[10:], after, strict=True):
+        driven.step(each)
+        assert torch.equal(driven.rewards, rewards)
+
+
+def test_the_function_is_the_one_term_and_has_a_weight() -> None:
+    task = racer("def reward_function(params):\n    return 2\n", rewards={"reward": 1.5})
+    assert task.reward_terms == ("reward",) and "reward_reward" in task.statistic_names
+    task.step(torch.zeros(1, 2))
+    assert task.rewards.item() == 3.0
+    assert Racer.reward_terms == ("progress", "off_track", "crashed")
+    with pytest.raises(ValueError, match=r"rewards\.progress: .* has no term 'progress'; there are reward"):
+        RacerConfig(reward_function=task.config.reward_function, rewards={"progress": 1.0})
+
+
+@pytest.mark.parametrize("prefix", ["", "kept = []\n"])
+def test_a_world_whose_function_fails_begins_afresh_and_is_counted(prefix: str) -> None:
+    text = prefix + (FAILING.replace("    return", "    kept.append(1)\n    return") if prefix else FAILING)
+    task = racer(text, 2, track="oval", start="line")
+    assert task.failures() == {}
+    for step in range(1, 9):
+        task.step(torch.zeros(2, 2))
+        assert task.dones.all().item() == (step == 7) and task.rewards.isfinite().all()
+    (line, found), *others = task.failures().items()
+    assert line.startswith("reward.py:") and "ZeroDivisionError" in line and found == (2, 0) and not others
+    assert task.statistics[task.statistic_names.index("nan_worlds")] == 2
+    mishap = task.read_mishap(int(task.mishap))
+    assert mishap == (0, f"its reward was not finite: {line}")
+
+
+def test_a_function_that_never_returns_ends_the_task_with_one_line() -> None:
+    body = "    kept.append(1)\n    while params['steps'] == 3:\n        pass\n    return 1.0\n"
+    task = racer(f"kept = []\ndef reward_function(params):\n{body}", 2, start="line")
+    for _ in range(2):
+        task.step(torch.zeros(2, 2))
+    with pytest.raises(RewardFailed, match=r"^reward\.py:[45]: car 0: the function did not return within 2 s$"):
+        task.step(torch.zeros(2, 2))
+    with pytest.raises(RewardFailed, match="have ended"):
+        task.step(torch.zeros(2, 2))
+
+
+def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
+    missing = RacerConfig(reward_function=str(tmp_path / "no.py"))
+    with pytest.raises(ValueError, match=r"^config\.reward_function: .*no\.py: .*can't be read: No such file"):
+        Racer(missing, 1)
+    file = tmp_path / "mine.py"
+    file.write_text("def reward_function(params):\n    return None\n")
+    with pytest.raises(
+        ValueError, match=r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
+    ):
+        Racer(RacerConfig(reward_function=str(file)), 1)
+    with pytest.raises(
+        ValueError, match=r"obstacles: a reward function is told of at most 10 objects, and there are 11"
+    ):
+        RacerConfig(reward_function=str(file), obstacles=(ObstacleConfig(1.0),) * 11)

@@ -1,0 +1,34 @@
+"""The log's lines on what went wrong in functions that a task was given, such as a learner's reward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from shared_store.wording import counted
+
+if TYPE_CHECKING:
+    from worker.tasks.telling import Telling
+
+MOST = 10
+"""Lines at once."""
+
+
+class Failures:
+    """Tells each failure once, and all of them at the end. Every rank tells its own.
+
+    Args:
+        task: Whose functions.
+        say: Writes a line to the log.
+    """
+
+    def __init__(self, task: Telling, say: Callable[[str], None]) -> None:
+        self._task, self._say = task, say
+        self._known: set[str] = set()
+
+    def tell(self, *, again: bool = False) -> None:
+        """Tell those that are new, or all ``again``; waits for the device."""
+        found = [item for item in self._task.failures().items() if again or item[0] not in self._known]
+        for told, (count, world) in found[:MOST]:
+            self._known.add(told)
+            self._say(f"warning: {told} ({counted(count, 'call')} so far, first in world {world})")
