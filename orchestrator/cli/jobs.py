@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator import specfile
-from orchestrator.cli.progress import best_told, evaluated, follow
+from orchestrator.cli.progress import best_told, evaluated, follow, shown_metrics
 from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
@@ -220,7 +220,8 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
-        facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
+        shown = shown_metrics(progress).replace("  ", ", ")
+        facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))

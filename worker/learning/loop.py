@@ -26,7 +26,7 @@ from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.report import Report, Stopwatch
+from worker.learning.report import Report, Stopwatch, figures_of, shown_of
 from worker.learning.reporter import Fence, Gate, Reporter
 from worker.learning.setup import (
     build_algorithm,
@@ -354,7 +354,8 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{name: _figure(name, value, finished, lengths) for name, value in known.items()},
+            **(figures := figures_of(known, finished, lengths, self.task.final_metrics)),
+            **shown_of(figures, self.task.shown_metrics),
         }
 
     def _finish(self) -> None:
@@ -439,12 +440,3 @@ def straggler(seconds: list[float]) -> dict[str, float]:
     slowest = max(range(len(seconds)), key=seconds.__getitem__)
     usual = statistics.median(seconds)
     return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
-
-
-def _figure(name: str, total: float, episodes: float, steps: float) -> float | None:
-    """A reward term as its mean over the finished episodes, a metric over their steps; a count as it is."""
-    if name.startswith("reward_"):
-        return total / episodes if episodes else None
-    if name.startswith("metric_"):
-        return total / steps if steps else None
-    return total

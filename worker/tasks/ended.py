@@ -22,12 +22,14 @@ class Ended:
     """The last episode of each world that ended: live views, valid in every world where one has.
 
     Attributes:
-        sums: Return, steps, the weighted sum of each reward term, the sum of each metric, shape ``(worlds, 2 + terms)``, float32.
+        sums: Return, steps, the weighted sum of each reward term, the sum of each metric (of those in ``final`` the last value), shape
+            ``(worlds, 2 + terms)``, float32.
         causes: Index into ``names`` of what ended it, shape ``(worlds,)``, int32. Of several terminations in one step it is the first.
         judged: Whether it was a success as the task declares it, shape ``(worlds,)``, bool; meaningless where ``success`` is None.
         names: What can end an episode: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
             the terminations of a declared task.
         columns: Names of the columns of ``sums`` behind the first two.
+        final: Those of the metrics of which the last step counts.
         success: The metric or termination that makes a success; None: that only the clock ended it.
         says_success: Whether success means anything: of a task without terminations that declares none it does not.
     """
@@ -37,6 +39,7 @@ class Ended:
     judged: torch.Tensor
     names: Sequence[str]
     columns: Sequence[str]
+    final: Sequence[str]
     success: str | None
     says_success: bool
 
@@ -52,17 +55,19 @@ class Ended:
             buffer("successes", (count,), wp.bool),
             [CLOCK, "physics_failed", "terminated", *(name for name in ends if name != CLOCK)],
             [*rewards, *task.metric_names],
+            task.final_metrics,
             task.success,
             task.success is not None or ends != [CLOCK],
         )
 
     @property
     def terms(self) -> torch.Tensor:
-        """Of each reward term its weighted sum, of each metric its mean over the steps, shape ``(worlds, terms)``, named by ``columns``."""
+        """Of each reward term its weighted sum, of each metric its mean over the steps or its last value, shape ``(worlds, terms)``, named
+        by ``columns``."""
         steps = self.sums[:, int(STEPS)].clamp(min=1.0)
-        rewards = sum(name.startswith("reward_") for name in self.columns)
-        first = int(TERMS) + rewards
-        return torch.cat([self.sums[:, int(TERMS) : first], self.sums[:, first:] / steps[:, None]], 1)
+        means = [name.startswith("metric_") and name not in self.final for name in self.columns]
+        sums = self.sums[:, int(TERMS) :].unbind(1)
+        return torch.stack([each / steps if mean else each for each, mean in zip(sums, means, strict=True)], 1)
 
     @property
     def meaning(self) -> str:

@@ -13,6 +13,7 @@ from shared_store.layout import Store
 from worker.racer import terms as racing
 from worker.racer.actions import ActionSpace
 from worker.racer.car import Cars
+from worker.racer.car_arrays import progress_of
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
 from worker.racer.naming import resolve
@@ -95,7 +96,10 @@ class Racer(DeclaredTask):
                     steering_offset=config.steering_offset,
                 )
             },
-            metrics={"progress": Metric(racing.final_progress), "lap_time": Metric(racing.lap_time)},
+            metrics={
+                "progress": Metric(progress_of, at_end=True, shown="%"),
+                "lap_time": Metric(racing.lap_time, at_end=True),
+            },
             success="lap_complete",
             sensors=self.sensors_of(config),
         )

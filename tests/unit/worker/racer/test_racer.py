@@ -60,9 +60,9 @@ def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
     assert counted(task, "termination_lap_complete") == 2
     assert rewards.numpy() == pytest.approx(100.0, abs=1.0)  # percent, and the rest of the last step
     assert 0.9 * OVAL.length < 1.25 * steps / 15 < OVAL.length  # 1.25 m/s, with curves cut
-    length = counted(task, "episode_length")
-    assert counted(task, "metric_progress") / length == pytest.approx(100.0, rel=1e-4)
-    assert counted(task, "metric_lap_time") / length == pytest.approx(steps / 15, rel=1e-4)
+    assert counted(task, "metric_progress") == 2 * 100.0
+    assert counted(task, "metric_lap_time") == pytest.approx(2 * steps / 15, rel=1e-6)
+    assert task.ended.terms[:, task.ended.columns.index("metric_progress")].tolist() == [100.0, 100.0]
 
 
 def test_what_is_known_of_a_car_is_what_the_tracks_geometry_says() -> None:
