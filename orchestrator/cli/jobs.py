@@ -89,6 +89,7 @@ def submit(
 ) -> None:
     """Submit a job to a running controller."""
     loaded = specfile.load(spec, set_)
+    tell(loaded)
     with Client.connect() as client:
         if engine is not None:
             loaded = on_engine(client, loaded, engine, spec)
@@ -104,6 +105,12 @@ def submit(
                 echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def tell(spec: Spec) -> None:
+    """Say on standard error what a spec has to say."""
+    for note in spec.notes:
+        echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
@@ -221,7 +228,9 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
         shown = shown_metrics(progress).replace("  ", ", ")
-        facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
+        facts["progress"] = (
+            f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
+        )
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))

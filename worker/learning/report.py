@@ -99,7 +99,8 @@ class Report:
         if record["iteration"] == self._rated_at and (warning := self._long(record)):
             print(warning, flush=True)
         finite = {
-            key: value if not isinstance(value, float) or math.isfinite(value) else None for key, value in record.items()
+            key: value if not isinstance(value, float) or math.isfinite(value) else None
+            for key, value in record.items()
         }
         try:
             self._metrics.write({**finite, "time": time.time()})
@@ -142,9 +143,7 @@ def figures_of(
         for name in totals
         if name.startswith(("reward_", "metric_"))
     }
-    return {
-        name: total if name not in by else total / by[name] if by[name] else None for name, total in totals.items()
-    }
+    return {name: total if name not in by else total / by[name] if by[name] else None for name, total in totals.items()}
 
 
 def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) -> dict[str, dict[str, str]]:
@@ -153,7 +152,8 @@ def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) ->
         return {}
     return {
         "shown": {
-            name.removeprefix("metric_"): f"{_text(figures[name], '.1f')} {unit}".strip() for name, unit in metrics.items()
+            name.removeprefix("metric_"): f"{_text(figures[name], '.1f')} {unit}".strip()
+            for name, unit in metrics.items()
         }
     }
 

@@ -29,9 +29,9 @@ class Ended:
         names: What can end an episode: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
             the terminations of a declared task.
         columns: Names of the columns of ``sums`` behind the first two.
-        final: Those of the metrics of which the last step counts.
         success: The metric or termination that makes a success; None: that only the clock ended it.
         says_success: Whether success means anything: of a task without terminations that declares none it does not.
+        final: The metrics of which the last step counts.
     """
 
     sums: torch.Tensor
@@ -39,9 +39,9 @@ class Ended:
     judged: torch.Tensor
     names: Sequence[str]
     columns: Sequence[str]
-    final: Sequence[str]
     success: str | None
     says_success: bool
+    final: Sequence[str] = ()
 
     @classmethod
     def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> Ended:
@@ -55,9 +55,9 @@ class Ended:
             buffer("successes", (count,), wp.bool),
             [CLOCK, "physics_failed", "terminated", *(name for name in ends if name != CLOCK)],
             [*rewards, *task.metric_names],
-            task.final_metrics,
             task.success,
             task.success is not None or ends != [CLOCK],
+            task.final_metrics,
         )
 
     @property
@@ -65,9 +65,11 @@ class Ended:
         """Of each reward term its weighted sum, of each metric its mean over the steps or its last value, shape ``(worlds, terms)``, named
         by ``columns``."""
         steps = self.sums[:, int(STEPS)].clamp(min=1.0)
-        means = [name.startswith("metric_") and name not in self.final for name in self.columns]
-        sums = self.sums[:, int(TERMS) :].unbind(1)
-        return torch.stack([each / steps if mean else each for each, mean in zip(sums, means, strict=True)], 1)
+        terms = self.sums[:, int(TERMS) :].clone()
+        for column, name in enumerate(self.columns):
+            if name.startswith("metric_") and name not in self.final:
+                terms[:, column] /= steps
+        return terms
 
     @property
     def meaning(self) -> str:

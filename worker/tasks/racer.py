@@ -16,6 +16,7 @@ from worker.racer.car import Cars
 from worker.racer.car_arrays import progress_of
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
+from worker.racer.lidar import lidar_sees
 from worker.racer.naming import resolve
 from worker.racer.scenery import CAR, add_scenery
 from worker.racer.track import Track
@@ -58,6 +59,7 @@ class Racer(DeclaredTask):
         try:
             self.circuit = circuit_of(tracks_of(config), config.obstacles)
             self.actions_of_car = config.actions()
+            self.lidar = config.lidar_of(self.actions_of_car)
         except BadTrack as error:
             raise ValueError(f"config.track: {error}") from error
         except Refused as error:
@@ -106,7 +108,7 @@ class Racer(DeclaredTask):
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """What the policy sees."""
-        return self.road_terms(config)
+        return {**self.road_terms(config), **self.lidar_term()}
 
     def rewards_of(self, config: RacerConfig) -> Mapping[str, Reward]:
         """What the car earns, by the names of ``config.rewards``. A reward function of a learner's own takes its place here.
@@ -145,6 +147,23 @@ class Racer(DeclaredTask):
             names = ("obstacle_ahead", "obstacle_left")
             seen["obstacle"] = Observation(racing.obstacle_ahead, names=names, unit="m")
         return seen
+
+    def lidar_term(self) -> Mapping[str, Observation]:
+        """What the lidar sees, where the car has one."""
+        if (lidar := self.lidar) is None:
+            return {}
+        seen = Observation(
+            lidar_sees,
+            size=lidar.size,
+            sectors=lidar.sectors,
+            rays=lidar.rays,
+            levels=lidar.levels,
+            field=lidar.field,
+            least=lidar.least,
+            reach=lidar.range,
+            unit="1" if lidar.levels else "m",
+        )
+        return {"lidar": seen}
 
     def own_terms(self) -> Mapping[str, Observation]:
         """What a car knows of itself."""
@@ -188,7 +207,11 @@ class RacerPixelsAndState(RacerPixels):
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """Numbers and image in groups of their own; the critic sees the road."""
-        return {"policy": self.own_terms(), "front": Image("front"), "critic": self.road_terms(config)}
+        return {
+            "policy": {**self.own_terms(), **self.lidar_term()},
+            "front": Image("front"),
+            "critic": self.road_terms(config),
+        }
 
 
 def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
