@@ -26,6 +26,8 @@ LIDARS = {
 """DeepRacer's lidars, and what each is of the settings of a task's ``lidar``."""
 SENSORS = {CAMERA: True, **dict.fromkeys(LIDARS, True), "STEREO_CAMERAS": False, "LEFT_CAMERA": False}
 """DeepRacer's sensors, and whether the simulated car has them."""
+ALGORITHMS = {"ppo": "clipped_ppo", "sac": "sac"}
+"""DeepRacer's names of algorithms."""
 LARGEST = 1 << 20
 """Bytes of a file."""
 
@@ -45,6 +47,23 @@ class ActionSpace:
     speed: tuple[float, float]
     choices: tuple[tuple[float, float], ...] = ()
     lidar: str | None = None
+
+    def metadata(self, sensors: Sequence[str], algorithm: str) -> dict[str, Any]:
+        """What a ``model_metadata.json`` says of a policy with these actions.
+
+        Args:
+            sensors: By DeepRacer's names.
+            algorithm: Name of the algorithm that has learnt it; one that DeepRacer does not know is left out.
+        """
+        ends = {"steering_angle": self.steering, "speed": self.speed}
+        actions = [{"steering_angle": steering, "speed": speed} for steering, speed in self.choices]
+        return {
+            "action_space": actions or {name: {"low": low, "high": high} for name, (low, high) in ends.items()},
+            "action_space_type": "discrete" if actions else "continuous",
+            "sensor": list(sensors),
+            **({"training_algorithm": ALGORITHMS[algorithm]} if algorithm in ALGORITHMS else {}),
+            "version": "5",
+        }
 
     @property
     def radians(self) -> list[tuple[float, float]]:

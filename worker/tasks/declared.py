@@ -147,6 +147,14 @@ class DeclaredTask(Task):
             motors = {name: getattr(attributes, name).numpy()[:count].tolist() for name in names}
         return contract(self.plan, self.worlds.solver.mj_model, motors)
 
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        """JSON documents that a bundle of a policy has besides, by the names of their files.
+
+        Args:
+            algorithm: Name of the algorithm that has learnt it.
+        """
+        return {}
+
     def _prepare(self) -> None:
         """Everything on the device that the kernels take."""
         plan, device, count = self.plan, self.device, self.world_count

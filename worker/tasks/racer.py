@@ -11,7 +11,7 @@ import newton
 
 from shared_store.layout import Store
 from worker.racer import terms as racing
-from worker.racer.actions import ActionSpace
+from worker.racer.actions import CAMERA, ActionSpace
 from worker.racer.car import Cars
 from worker.racer.car_arrays import progress_of
 from worker.racer.checks import BadTrack
@@ -105,6 +105,13 @@ class Racer(DeclaredTask):
             success="lap_complete",
             sensors=self.sensors_of(config),
         )
+
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        """``model_metadata.json``, as DeepRacer has it."""
+        sensors = [CAMERA] if hasattr(self.config, "front") else []
+        if self.lidar is not None:
+            sensors.append(("LIDAR", "SECTOR_LIDAR", "DISCRETIZED_SECTOR_LIDAR")[min(self.lidar.levels, 2)])
+        return {"model_metadata.json": self.actions_of_car.metadata(sensors, algorithm)}
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """What the policy sees."""

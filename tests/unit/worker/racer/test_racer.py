@@ -237,7 +237,7 @@ REFUSED = {
     ),
     "no such sensor": (
         {"action_space": {**DISCRETE, "sensor": ["STEREO_CAMERAS"]}},
-        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA",
+        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR",
     ),
     "a key too many": (
         {"action_space": {"action_space": [{"steering": 0, "speed": 1}] * 2}},
