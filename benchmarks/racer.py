@@ -33,6 +33,7 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.peers.inside.clock import versions
 from benchmarks.training import CUDA, build, device_name, rate, wait
 from shared_store.layout import Run
+from worker.errors import UserError
 from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
@@ -94,7 +95,7 @@ class RacingLoop(Loop):
         found = {"episodes": record["episodes"], "laps": record["termination_lap_complete"]}
         self.curve.append(at | found | {"progress": record["metric_progress"], "reward": record["reward"]})
         over = seconds >= self._limit or record["iteration"] >= self._last
-        if seconds >= self._next or over:
+        if not self.stop.requested and (seconds >= self._next or over):
             wait()
             self._judge(at)
             wait()
@@ -146,8 +147,9 @@ def measure(options: argparse.Namespace, store: Path, clip: Path) -> dict[str, A
     section = merged(section, options.train)
     worlds = options.worlds or section["worlds"]
     iterations = options.iterations or section["iterations"]
-    for name in ("task", "worlds", "seed", "iterations"):
+    for name in ("task", "worlds", "seed"):
         section.pop(name, None)
+    section["iterations"] = iterations + 100  # it is left before, and ends without an evaluation of its own
     loop = build(options.task, worlds, store, options.seed, loop_type=RacingLoop, **section)
     assert isinstance(loop, RacingLoop)
     share = type(loop.share).of(0, 1, options.judged)
@@ -337,7 +339,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         watch = Watch(options.loaded_anyway)
         with tempfile.TemporaryDirectory() as store:
             clip = Path(store) / "clip.gif"
-            row = measure(options, Path(store), clip)
+            try:
+                row = measure(options, Path(store), clip)
+            except UserError as error:
+                parser.error(str(error))
             (options.out / f"{stem(row)}.gif").write_bytes(clip.read_bytes())
         row |= watch.check(f"while {options.task} learnt to drive")
         (options.out / f"{stem(row)}.json").write_text(json.dumps(row))
