@@ -24,7 +24,7 @@ run: $(READY)
 
 # faster laps: make race ITERATIONS=300
 race: $(READY)
-	run=$$($(BIN)/muster run job_specs/racer.yaml --set train.iterations=$(or $(ITERATIONS),100) | tee /dev/stderr | sed -n 's/^  run: *//p') && \
+	run=$$($(BIN)/muster run job_specs/racer.yaml --set train.iterations=$(or $(ITERATIONS),100) | tee /dev/stderr | sed -n '/^SUCCEEDED/,$$s/^  run: *//p') && test -n "$$run" && \
 	$(BIN)/muster evaluate $$run --episodes 64 && \
 	$(BIN)/muster render $$run -o race.gif --overwrite --worlds 1 --seconds 12 --size 320x240 && \
 	echo "run $$run; its reward plot is above, its film: $(CURDIR)/race.gif"

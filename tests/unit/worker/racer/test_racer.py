@@ -12,6 +12,7 @@ import torch
 from shared_store.layout import Store
 from worker.errors import UserError
 from worker.learning.job import configure
+from worker.learning.report import figures_of, shown_of
 from worker.racer.generator import make_random
 from worker.racer.geometry import on_road, place_at, project
 from worker.racer.naming import keep
@@ -333,3 +334,35 @@ def test_an_image_and_numbers_are_groups_of_their_own() -> None:
     sketch = RacerPixelsAndState.sketch(RacerPixelsAndState.config_type())
     assert sketch.observation_names == ("speed", "steering") and sketch.plan.images == {"front": "front"}
     assert len(sketch.plan.groups["critic"]) == 6
+
+
+def test_a_bundle_has_the_actions_and_the_sensors_as_deepracer_names_them() -> None:
+    task = racer(action_space={**DISCRETE, "sensor": ["SECTOR_LIDAR"]})
+    found = task.bundle_documents("ppo")["model_metadata.json"]
+    assert found == {
+        "action_space": FIVE,
+        "action_space_type": "discrete",
+        "sensor": ["SECTOR_LIDAR"],
+        "training_algorithm": "clipped_ppo",
+        "version": "5",
+    }
+    again = racer(action_space=found)  # it is an action space for the next training, too
+    assert again.actions_of_car == task.actions_of_car
+    usual = racer().bundle_documents("mine:Algorithm")["model_metadata.json"]
+    assert usual == {
+        "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
+        "action_space_type": "continuous",
+        "sensor": [],
+        "version": "5",
+    }
+
+
+def test_a_training_of_a_racer_shows_the_mean_progress_of_its_episodes() -> None:
+    task = racer(2, track="oval")
+    assert task.shown_metrics == {"metric_progress": "%"}
+    # a lap of 300 steps and an exit after 20 steps and a tenth of the track: 55 %, not what 320 steps in the mean would say
+    figures = figures_of({"metric_progress": 110.0, "metric_other": 32.0}, 2, 320, task.final_metrics)
+    assert figures == {"metric_progress": 55.0, "metric_other": 0.1}
+    assert shown_of(figures, task.shown_metrics) == {"shown": {"progress": "55.0 %"}}
+    none = figures_of({"metric_progress": 0.0}, 0, 0, task.final_metrics)
+    assert shown_of(none, task.shown_metrics) == {"shown": {"progress": "- %"}}
