@@ -32,7 +32,7 @@ def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.P
     """The document with the content of the JSON file that ``train.hyperparameters`` names. Raises SpecError."""
     train = document.get("train") if isinstance(document, dict) else None
     named = train.get("hyperparameters") if isinstance(train, dict) else None
-    if not isinstance(named, str):
+    if not isinstance(train, dict) or not isinstance(named, str):
         return document
     key = ("train", "hyperparameters")
     where = f"{path}:{lines[key]}" if lines.get(key) else "--set"
