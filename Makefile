@@ -1,4 +1,5 @@
 # make run    train the cart-pole on three nodes of this machine (the first time: environment and kernels too)
+# make race             train a car until it drives laps, evaluate it, film it: minutes on two cores
 # make test   lint and the tests of three tiers, which also run alone: make unit, make integration, make training
 # make long             trainings that are killed, stretched and cut off, and trainings that learn something
 # make robots           robots, sensors, terrain, randomisation, terms and cameras against MuJoCo's own engine
@@ -16,10 +17,17 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test unit integration training long robots services engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
+.PHONY: run race test unit integration training long robots services engines kernels lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-resume bench-engines bench-startup bits fuzz torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
+
+# faster laps: make race ITERATIONS=300
+race: $(READY)
+	run=$$($(BIN)/muster run job_specs/racer.yaml --set train.iterations=$(or $(ITERATIONS),100) | tee /dev/stderr | sed -n '/^SUCCEEDED/,$$s/^  run: *//p') && test -n "$$run" && \
+	$(BIN)/muster evaluate $$run --episodes 64 && \
+	$(BIN)/muster render $$run -o race.gif --overwrite --worlds 1 --seconds 12 --size 320x240 && \
+	echo "run $$run; its reward plot is above, its film: $(CURDIR)/race.gif"
 
 # two files at a time, in the order of the tiers in tests/conftest.py
 PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=40

@@ -46,7 +46,15 @@ DEFAULT_CPU = {"Cartpole": [64, 1024], "Ant": [64], "Humanoid": [32], "Quadruped
 SWEEP = [2048, 8192, 32768, 65536]
 
 
-def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9, **train: Any) -> Loop:
+def build(
+    task: str,
+    worlds: int,
+    store: Path,
+    seed: int = 0,
+    every: int = 10**9,
+    loop_type: type[Loop] = Loop,
+    **train: Any,
+) -> Loop:
     """The real training loop, on a store of its own; it saves every so many iterations, by default never."""
     placement = Placement.from_env(os.environ)
     name = task.rpartition(":")[2]  # of a task by its path
@@ -57,7 +65,7 @@ def build(task: str, worlds: int, store: Path, seed: int = 0, every: int = 10**9
         run.create({"run": run.name, "spec": spec})
         raise_epoch(run, 1)
     job = Job(spec, Store(store), run, 1, 1, "bench", section=section)
-    return Loop(Training.of(job, find_task(task)), connect(placement), StopRequest())
+    return loop_type(Training.of(job, find_task(task)), connect(placement), StopRequest())
 
 
 def device_name() -> str:

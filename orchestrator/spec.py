@@ -16,6 +16,7 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     Field,
+    PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
@@ -38,7 +39,7 @@ from orchestrator.spec_values import (
     TaskName,
 )
 from shared_store.races import DEFAULTS, TRIALS
-from shared_store.wording import explain, kind_of, nearest, path_of
+from shared_store.wording import Refused, explain, kind_of, nearest, path_of
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
 """What a job can do: exactly one of these keys is in a spec."""
@@ -71,6 +72,11 @@ class _Train(Section):
     )
     settings: dict[str, Any] = Field(default_factory=dict, description="of an algorithm of your own")
     config: dict[str, Any] = Field(default_factory=dict, description="overrides of the task's own configuration")
+    hyperparameters: dict[str, Any] | str | None = Field(
+        default=None,
+        exclude=True,
+        description="settings under the names of DeepRacer, of a racer's task, or a JSON file of them; they become settings of ppo or sac",
+    )
 
     @property
     def section(self) -> str:
@@ -226,6 +232,7 @@ class Spec(Section):
     on_child_failure: Literal["restart", "fail", "ignore"] = "restart"
     timeout: Annotated[Duration, Field(ge=60)] | None = Field(default=None, description="of each attempt, such as 2h")
 
+    _notes: tuple[str, ...] = PrivateAttr(default=())
     stall_timeout: Annotated[Duration, Field(gt=0)] = Field(
         default=300.0, description="of one training iteration; a rank that takes longer is stuck, such as 5m"
     )
@@ -262,6 +269,11 @@ class Spec(Section):
         return self
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What to tell whoever submits it."""
+        return self._notes
+
+    @property
     def kind(self) -> str:
         """Which of :data:`KINDS` this job is."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
@@ -292,6 +304,10 @@ def validate(
     if not isinstance(value, dict):
         raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {kind_of(value)}")
     try:
+        value, notes = _plain(value)
+    except Refused as error:
+        raise SpecError(f"{place_of(error.path, source, lines)}{error.words}") from None
+    try:
         spec = Spec.model_validate(value)
     except ValidationError as error:
         problems = error.errors(include_url=False)
@@ -306,7 +322,26 @@ def validate(
     if problem:
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
+    spec._notes = tuple(notes)
     return spec
+
+
+def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The document with plain settings in the place of ``train.hyperparameters``, and what is to be said of them. Raises Refused."""
+    train = document.get("train")
+    if not isinstance(train, dict) or train.get("hyperparameters") is None:
+        return document, []
+    where, task = ("train", "hyperparameters"), train.get("task")
+    kind = task_config(task) if isinstance(task, str) else None
+    if kind is None or not hasattr(kind, "plain_settings"):
+        raise Refused(where, f"task {shown(task)} is not installed, so they are not known; give train.ppo or train.sac")
+    if isinstance(train["hyperparameters"], str):
+        raise Refused(where, "a file is read for a job YAML alone; write its settings out")
+    try:
+        plain, notes = kind.plain_settings(train)
+    except Refused as error:
+        raise Refused(("train", *error.path), error.words) from None
+    return {**document, "train": plain}, notes
 
 
 _Problem = tuple[tuple[str | int, ...], str]

@@ -10,6 +10,7 @@ from orchestrator import strict_yaml
 from orchestrator.errors import SpecError
 from orchestrator.kept_files import with_files
 from orchestrator.spec import Spec, override, validate
+from shared_store.files import DamagedFile, read_json
 
 
 def load(path: str, assignments: list[str] | None = None) -> Spec:
@@ -27,7 +28,26 @@ def load(path: str, assignments: list[str] | None = None) -> Spec:
         lines |= dict.fromkeys(changed, 0)
     if isinstance(document, dict):
         document = with_files(document, path, lines)
-    return validate(document, path, lines)
+    return validate(_with_hyperparameters(document, path, lines), path, lines)
+
+
+def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:
+    """The document with the content of the JSON file that ``train.hyperparameters`` names. Raises SpecError."""
+    train = document.get("train") if isinstance(document, dict) else None
+    named = train.get("hyperparameters") if isinstance(train, dict) else None
+    if not isinstance(train, dict) or not isinstance(named, str):
+        return document
+    key = ("train", "hyperparameters")
+    where = f"{path}:{lines[key]}" if lines.get(key) else "--set"
+    try:
+        content = read_json(Path(named), strict_yaml.MOST_CHARACTERS)
+    except DamagedFile as error:
+        raise SpecError(f"{where}: {'.'.join(key)}: {error}") from None
+    except OSError as error:
+        raise SpecError(f"{where}: {'.'.join(key)}: {named}: {error.strerror}") from None
+    if content is None:
+        raise SpecError(f"{where}: {'.'.join(key)}: {named}: there is no such file in {Path.cwd()}")
+    return {**document, "train": {**train, "hyperparameters": content}}
 
 
 def read(path: str) -> tuple[Any, Mapping[strict_yaml.Path, int]]:

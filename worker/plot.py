@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 
 from shared_store.files import write_atomic
@@ -11,7 +12,7 @@ from shared_store.metrics import read_metrics
 
 
 def plot_reward(run: Run, path: Path | None = None) -> Path:
-    """Draw mean return and mean episode length over environment steps; returns where (``metrics/reward.png`` by default).
+    """Draw mean return, and the metric that the task shows or the mean episode length, over environment steps; returns where (``metrics/reward.png`` by default).
 
     Raises ValueError where the run has no finished episode yet.
     """
@@ -33,9 +34,16 @@ def plot_reward(run: Run, path: Path | None = None) -> Path:
     axes.set(title=run.name, xlabel="environment steps")
     axes.set_ylabel("mean return of finished episodes", color="tab:blue")
     axes.grid(alpha=0.3)
-    lengths = axes.twinx()
-    lengths.plot(steps, [record["episode_length"] for record in records], color="tab:orange", linewidth=1)
-    lengths.set_ylabel("mean episode length [steps]", color="tab:orange")
+    # beside the return what the task wants to be seen, else how long episodes are
+    name = next((name for record in records for name in record.get("shown", {})), None)
+    label = "mean episode length [steps]"
+    if name is not None:
+        unit = next(record["shown"][name].partition(" ")[2] for record in records if name in record.get("shown", {}))
+        label = f"mean {name}" + f" [{unit}]" * bool(unit)
+    values = [record.get(f"metric_{name}" if name else "episode_length") for record in records]
+    others = axes.twinx()
+    others.plot(steps, [math.nan if value is None else value for value in values], color="tab:orange", linewidth=1)
+    others.set_ylabel(label, color="tab:orange")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     write_atomic(path, buffer.getvalue())

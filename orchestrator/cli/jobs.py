@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from orchestrator import specfile
-from orchestrator.cli.progress import best_told, evaluated, follow
+from orchestrator.cli.progress import best_told, evaluated, follow, shown_metrics
 from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.definition import compile_definition, compile_submission
@@ -95,6 +95,7 @@ def submit(
 ) -> None:
     """Submit a job to a running controller."""
     loaded = specfile.load(spec, set_)
+    tell(loaded)
     with Client.connect() as client:
         if engine is not None:
             loaded = on_engine(client, loaded, engine, spec)
@@ -110,6 +111,12 @@ def submit(
                 echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
         if follow_:
             raise typer.Exit(follow(client, submitted["jobId"]))
+
+
+def tell(spec: Spec) -> None:
+    """Say on standard error what a spec has to say."""
+    for note in spec.notes:
+        echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
@@ -226,7 +233,10 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
     if progress := detail["progress"]:
         total = ((detail["spec"] or {}).get("train") or {}).get("iterations", "?")
-        facts["progress"] = f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}"
+        shown = shown_metrics(progress).replace("  ", ", ")
+        facts["progress"] = (
+            f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
+        )
     if evaluation := results.get("evaluation"):
         facts["evaluation"] = evaluated(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))

@@ -127,9 +127,15 @@ def _describe(record: dict[str, Any]) -> dict[str, str]:
 
     return {
         "reward": number("reward", ".2f"),
-        "length": number("episode_length", ".1f"),
+        "length": number("episode_length", ".1f") + shown_metrics(record),
         "rate": number("steps_per_second", ",.0f"),
     }
+
+
+def shown_metrics(record: Mapping[str, Any]) -> str:
+    """The metrics that a task wants to be seen, such as ``  progress 83.1 %``."""
+    shown = record.get("shown")
+    return "".join(f"  {one_line(f'{name} {text}')}" for name, text in shown.items()) if isinstance(shown, dict) else ""
 
 
 class Activity:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from orchestrator import specfile
-from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec
+from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec, tell
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
@@ -53,6 +53,7 @@ def run(
     Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
     loaded = specfile.load(spec, set_)
+    tell(loaded)
     for name in engine or ():
         check_engine(name)
     with controller(store, cpus, engine or ()) as connect:

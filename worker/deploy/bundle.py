@@ -8,6 +8,7 @@
 ``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
 ``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.leapp_description`)
 ``robot/``          the robot's model, where its licence allows a copy
+``*.json``          what the task says besides, such as the racer's ``model_metadata.json``
 ``README.md``       what is what, and licences
 ``manifest.json``   where the policy comes from, versions, and the SHA-256 of every other file
 ==================  ==========================================================================================================
@@ -23,7 +24,7 @@ import platform
 import shutil
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -41,6 +42,7 @@ from worker.deploy import parity, rollouts
 from worker.deploy.leapp_description import LEAPP, leapp_description
 from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
+from worker.tasks.declared import DeclaredTask
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy, Policy
@@ -176,7 +178,10 @@ def _publish(
         write_json(hidden / REPORT, report)
         (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
         robot = add_robot(task, hidden)
-        (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot))
+        documents = task.bundle_documents(facts["algorithm"]) if isinstance(task, DeclaredTask) else {}
+        for name, document in documents.items():
+            write_json(hidden / name, document)
+        (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))
         seal(
             hidden,
             {
@@ -219,7 +224,9 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _readme(run: Run, checkpoint: Checkpoint, contract: Contract, robot: Mapping[str, Any] | None) -> str:
+def _readme(
+    run: Run, checkpoint: Checkpoint, contract: Contract, robot: Mapping[str, Any] | None, documents: Sequence[str]
+) -> str:
     """For a person who finds the bundle."""
     if robot is None:
         about = "The task does not say which file its robot comes from."
@@ -228,6 +235,7 @@ def _readme(run: Run, checkpoint: Checkpoint, contract: Contract, robot: Mapping
     else:
         package = f", of {robot['package']}" if "package" in robot else ""
         about = f"The robot's model is not in the bundle. Its source: `{robot['source']}`{package}; licence: {robot['licence']}."
+    further = "".join(f"- `{name}`: what the task says besides.\n" for name in documents)
     return f"""# Policy of task {contract.task}
 
 From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iteration}. Made by Muster {__version__}.
@@ -238,7 +246,7 @@ From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iterati
   runs the policy should repeat them to within {parity.TOLERANCE:g}.
 - `report.json`: how the files were compared with the trained policy, and how both did on the same simulated worlds.
 - `leapp.yaml`: the inputs and outputs of `policy.onnx` for NVIDIA's LEAPP. Units, scales and offsets are in `contract.json` alone.
-- `manifest.json`: where the policy comes from, versions, and the SHA-256 of every file.
+{further}- `manifest.json`: where the policy comes from, versions, and the SHA-256 of every file.
 
 ## Licences
 

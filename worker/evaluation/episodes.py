@@ -40,7 +40,7 @@ class Episodes:
     Attributes:
         rows: Shape ``(episodes, 5 + terms)``, float64, on the CPU: return, length [steps], whether the clock ended it, index of its cause
             in ``causes``, whether it was a success, and the terms.
-        terms: Names of the terms: ``reward_NAME`` is the weighted sum over the episode, ``metric_NAME`` the mean over its steps.
+        terms: Names of the terms: ``reward_NAME`` is the weighted sum over the episode, ``metric_NAME`` the mean over its steps, or the last value.
         causes: What can end an episode, by name.
         success: What a success is, in words; None where the task does not say.
     """

@@ -17,7 +17,7 @@ def write_table(
     """Write the episodes, whole or not at all. The same episodes are the same bytes. Raises OSError.
 
     Columns: ``episode`` (its number), ``seed`` (of the worlds; none of those of a training), ``return``, ``length`` [steps], ``success``,
-    ``cause``, and of each term ``reward_NAME`` (weighted sum) or ``metric_NAME`` (mean over the steps).
+    ``cause``, and of each term ``reward_NAME`` (weighted sum) or ``metric_NAME`` (mean over the steps, or the last value).
 
     Args:
         path: Of the file.

@@ -27,7 +27,7 @@ from worker.learning.faults import die, kill_at
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup
 from worker.learning.randomness import held_out_seed, seed_generators
-from worker.learning.report import Report, Stopwatch
+from worker.learning.report import Report, Stopwatch, figures_of, shown_of
 from worker.learning.reporter import Fence, Gate, Reporter
 from worker.learning.setup import (
     build_algorithm,
@@ -41,7 +41,6 @@ from worker.learning.setup import (
 )
 from worker.learning.state import TrainingState
 from worker.learning.teacher import give_teacher
-from worker.learning.totals import figure
 from worker.learning.training import Training
 from worker.tasks.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.config import value_at
@@ -360,7 +359,8 @@ class Loop:
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
                 for name, points in self.config.curriculum.items()
             },
-            **{name: figure(name, value, finished, lengths) for name, value in known.items()},
+            **(figures := figures_of(known, finished, lengths, self.task.final_metrics)),
+            **shown_of(figures, self.task.shown_metrics),
         }
 
     def _finish(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -83,7 +84,7 @@ class Report:
             str(job.run.metrics), purge_step=resumed_from + 1, filename_suffix=f".e{job.epoch}", flush_secs=10
         )
 
-    def iteration(self, record: dict[str, float | int | None]) -> None:
+    def iteration(self, record: dict[str, Any]) -> None:
         """Print and store one iteration's ``record``."""
         width = len(str(self._iterations))
         mishaps = "".join(
@@ -91,13 +92,16 @@ class Report:
         )
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
-            f"length {_text(record['episode_length'], '.1f')}  steps/s {record['steps_per_second']:.0f}  "
+            f"length {_text(record['episode_length'], '.1f')}  {_shown(record)}steps/s {record['steps_per_second']:.0f}  "
             f"{_learnt(record)}{mishaps}{_slow(record)}",
             flush=True,
         )
         if record["iteration"] == self._rated_at and (warning := self._long(record)):
             print(warning, flush=True)
-        finite = {key: value if value is None or math.isfinite(value) else None for key, value in record.items()}
+        finite = {
+            key: value if not isinstance(value, float) or math.isfinite(value) else None
+            for key, value in record.items()
+        }
         try:
             self._metrics.write({**finite, "time": time.time()})
             for name, value in scalars(finite).items():
@@ -126,6 +130,36 @@ class Report:
             self._events.close()
         except OSError as error:
             print(f"warning: metrics can't be written ({error})", flush=True)
+
+
+def figures_of(
+    totals: Mapping[str, float], episodes: float, steps: float, final: Sequence[str]
+) -> dict[str, float | None]:
+    """What a record has of a task's statistics: a reward term and a ``final`` metric as the mean over the finished episodes, another
+    metric over their steps, a count as it is. None where no episode has finished.
+    """
+    by = {
+        name: episodes if name.startswith("reward_") or name in final else steps
+        for name in totals
+        if name.startswith(("reward_", "metric_"))
+    }
+    return {name: total if name not in by else total / by[name] if by[name] else None for name, total in totals.items()}
+
+
+def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """What a record has for people who follow the training: ``metrics``, of each its unit, in words; nothing where there are none."""
+    if not metrics:
+        return {}
+    return {
+        "shown": {
+            name.removeprefix("metric_"): f"{_text(figures[name], '.1f')} {unit}".strip()
+            for name, unit in metrics.items()
+        }
+    }
+
+
+def _shown(record: Mapping[str, Any]) -> str:
+    return "".join(f"{name} {text}  " for name, text in record.get("shown", {}).items())
 
 
 def _learnt(record: dict[str, float | int | None]) -> str:

@@ -34,12 +34,3 @@ class Totals:
         for name, size in layout.items():
             found[name], start = numbers[start : start + size], start + size
         return found
-
-
-def figure(name: str, total: float, episodes: float, steps: float) -> float | None:
-    """A reward term as its mean over the finished episodes, a metric over their steps; a count as it is."""
-    if name.startswith("reward_"):
-        return total / episodes if episodes else None
-    if name.startswith("metric_"):
-        return total / steps if steps else None
-    return total

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,17 @@ CHOICES = (2, 30)
 """Fewest and most actions of a discrete space."""
 SPEED = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
 """Least and greatest speed of each type of space [m/s]."""
-SENSORS = {
-    "FRONT_FACING_CAMERA": True,
-    "SECTOR_LIDAR": False,
-    "DISCRETIZED_SECTOR_LIDAR": False,
-    "LIDAR": False,
-    "STEREO_CAMERAS": False,
-    "LEFT_CAMERA": False,
+CAMERA = "FRONT_FACING_CAMERA"
+LIDARS = {
+    "LIDAR": {"sectors": 64, "rays": 1, "levels": 0},
+    "SECTOR_LIDAR": {"sectors": 8, "rays": 8, "levels": 1},
+    "DISCRETIZED_SECTOR_LIDAR": {"sectors": 8, "rays": 8, "levels": 8},
 }
+"""DeepRacer's lidars, and what each is of the settings of a task's ``lidar``."""
+SENSORS = {CAMERA: True, **dict.fromkeys(LIDARS, True), "STEREO_CAMERAS": False, "LEFT_CAMERA": False}
 """DeepRacer's sensors, and whether the simulated car has them."""
+ALGORITHMS = {"ppo": "clipped_ppo", "sac": "sac"}
+"""DeepRacer's names of algorithms."""
 LARGEST = 1 << 20
 """Bytes of a file."""
 
@@ -38,11 +40,30 @@ class ActionSpace:
         steering: Least and greatest steering angle [degrees].
         speed: Least and greatest speed [m/s].
         choices: Steering angle [degrees] and speed [m/s] of each action, in order; empty where the space is continuous.
+        lidar: Name of the lidar among the sensors; None: there is none.
     """
 
     steering: tuple[float, float]
     speed: tuple[float, float]
     choices: tuple[tuple[float, float], ...] = ()
+    lidar: str | None = None
+
+    def metadata(self, sensors: Sequence[str], algorithm: str) -> dict[str, Any]:
+        """What a ``model_metadata.json`` says of a policy with these actions.
+
+        Args:
+            sensors: By DeepRacer's names.
+            algorithm: Name of the algorithm that has learnt it; one that DeepRacer does not know is left out.
+        """
+        ends = {"steering_angle": self.steering, "speed": self.speed}
+        actions = [{"steering_angle": steering, "speed": speed} for steering, speed in self.choices]
+        return {
+            "action_space": actions or {name: {"low": low, "high": high} for name, (low, high) in ends.items()},
+            "action_space_type": "discrete" if actions else "continuous",
+            "sensor": list(sensors),
+            **({"training_algorithm": ALGORITHMS[algorithm]} if algorithm in ALGORITHMS else {}),
+            "version": "5",
+        }
 
     @property
     def radians(self) -> list[tuple[float, float]]:
@@ -89,7 +110,7 @@ def action_space(content: Any) -> ActionSpace:
     """
     if not isinstance(content, Mapping):
         raise Refused((), f"expected a mapping with action_space and action_space_type, found {shown(content)}")
-    _check_sensors(content.get("sensor", ["FRONT_FACING_CAMERA"]))
+    lidar = _lidar_of(content.get("sensor", [CAMERA]))
     if "action_space" not in content:
         raise Refused((), f"action_space is missing; {nearest('action_space', list(map(str, content)))}")
     space = content["action_space"]
@@ -102,10 +123,11 @@ def action_space(content: Any) -> ActionSpace:
         raise Refused(
             ("action_space_type",), f"it is {kind}, and action_space is {found if space else 'empty'}; they must fit"
         )
-    return _continuous(space) if kind == "continuous" else _discrete(space)
+    return replace(_continuous(space) if kind == "continuous" else _discrete(space), lidar=lidar)
 
 
-def _check_sensors(sensors: Any) -> None:
+def _lidar_of(sensors: Any) -> str | None:
+    """The lidar among the sensors, all of which are checked."""
     if isinstance(sensors, str) or not isinstance(sensors, Sequence):
         raise Refused(("sensor",), f"expected a list such as [FRONT_FACING_CAMERA], found {shown(sensors)}")
     for number, sensor in enumerate(sensors):
@@ -113,6 +135,10 @@ def _check_sensors(sensors: Any) -> None:
             there = [name for name, has in SENSORS.items() if has]
             what = "the simulated car does not have" if sensor in SENSORS else "DeepRacer knows no sensor"
             raise Refused(("sensor", number), f"{what} {shown(sensor)}; use {', '.join(there)}")
+    lidars = [sensor for sensor in sensors if sensor in LIDARS]
+    if len(lidars) > 1:
+        raise Refused(("sensor",), f"a car has one lidar, and there are {' and '.join(lidars)}")
+    return lidars[0] if lidars else None
 
 
 def _discrete(space: Any) -> ActionSpace:

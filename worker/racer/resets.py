@@ -148,19 +148,13 @@ def forget_mishaps(world: int, car: CarArrays):
 
 @wp.func
 def happened(world: int, car: CarArrays, column: int) -> float:
-    """A count of the episode, by its column in :data:`COUNTS`, such that its mean over the steps of the episode is that at its end."""
-    now = car.put[world]
-    if column != RESETS:
-        now = car.mishaps[world] == column + 1
-    value = float(car.counts[world, column])
-    if now:
-        value = value + float(car.steps[world] - 1)
-    return value
+    """A count of the episode so far, by its column in :data:`COUNTS`."""
+    return float(car.counts[world, column])
 
 
 @wp.func
 def penalty(world: int, car: CarArrays, off_track: float, crash: float) -> float:
-    """Penalties of the episode [s], as :func:`happened`.
+    """Penalties of the episode so far [s].
 
     Args:
         off_track: For each time that the car left the road [s].

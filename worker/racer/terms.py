@@ -132,21 +132,17 @@ def reversed_course(world: int, car: CarArrays, steps: int) -> bool:
 
 @wp.func
 def final_progress(world: int, car: CarArrays) -> float:
-    """Progress [%], such that its mean over the steps of an episode is that at the episode's end."""
-    steps = float(car.steps[world])
+    """How much of a lap the car has driven since the episode began [%], less what it loses by being put back."""
     length = car.road.length[car.tracks[world]]
-    before = 100.0 * wp.clamp((car.travelled[world] - car.moved[world]) / length, 0.0, 1.0)
-    now = 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / length, 0.0, 1.0)
-    return steps * now - (steps - 1.0) * before
+    return 100.0 * wp.clamp((car.travelled[world] - car.set_back[world]) / length, 0.0, 1.0)
 
 
 @wp.func
 def lap_time(world: int, car: CarArrays, seconds: float) -> float:
-    """How long a lap took [s], such that its mean over the steps of an episode is that; 0 of an episode without a complete lap."""
+    """How long a lap took [s]; 0 of one that is not complete."""
     time = float(0.0)
     if progress_of(world, car) >= 100.0:
-        steps = float(car.steps[world])
-        time = steps * steps * seconds
+        time = float(car.steps[world]) * seconds
     return time
 
 

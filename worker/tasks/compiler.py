@@ -220,7 +220,8 @@ def rewards(source: Source) -> list[str]:
         else:
             # one that is not finite would spoil the figure of all worlds
             column = f"episodes.sums[world, TERMS + {number}]"
-            lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {column} + total_{number}"]
+            kept = f"total_{number}" if getattr(bound.term, "at_end", False) else f"{column} + total_{number}"
+            lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {kept}"]
     if source.plan.success is not None:
         lines += [f"episodes.successes[world] = {source.plan.success}"]
     return ["if valid:", *indent(lines)] if bounds else []

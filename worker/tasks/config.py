@@ -218,6 +218,21 @@ class TaskConfig(_Common):
         """The configuration with a job's ``train.config``. Raises Refused."""
         return configured(cls, overrides)
 
+    @classmethod
+    def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+        """A job's ``train`` section with plain settings in the place of its ``hyperparameters``, which a task may know by other names.
+
+        Args:
+            train: As a YAML has it: its other keys are not checked yet.
+
+        Returns:
+            The section, and a line for each of them that is not meant, or not done, exactly so.
+
+        Raises:
+            Refused: A hyperparameter can't be used, or the task knows none.
+        """
+        raise Refused(("hyperparameters",), f"{cls.__name__} has none; settings of PPO stand under train.ppo")
+
     @property
     def has_other_rewards(self) -> bool:
         """Whether :attr:`other_rewards` are the task's reward terms; no, by default."""

@@ -80,7 +80,18 @@ class Reward(Term):
 
 
 class Metric(Term):
-    """A float, summed over its elements, that is logged and rewards nothing: its mean over the steps of the episodes that ended."""
+    """A float, summed over its elements, that is logged and rewards nothing: its mean over the steps of the episodes that ended.
+
+    Args:
+        function: As for :class:`Term`.
+        at_end: It is the mean over the episodes that ended, of each what its last step says.
+        shown: Its unit, such as ``"%"``, where it is to be seen in a training's progress; None: it is not.
+        **options: As for :class:`Term`.
+    """
+
+    def __init__(self, function: Any, *, at_end: bool = False, shown: str | None = None, **options: Any) -> None:
+        super().__init__(function, **options)
+        self.at_end, self.shown = at_end, shown
 
 
 class Termination(Term):

@@ -130,7 +130,10 @@ class DeclaredTask(Task):
         self.observation_names, self.action_names = plan.names, plan.actions
         self.discrete = isinstance(self.declaration.actions, Choice)
         self.memory_size, self.lasting_size = plan.binder.memory, plan.binder.lasting
-        self.metric_names = tuple(f"metric_{name}" for name in self.declaration.metrics)
+        metrics = {f"metric_{name}": term for name, term in self.declaration.metrics.items()}
+        self.metric_names = tuple(metrics)
+        self.final_metrics = tuple(name for name, term in metrics.items() if term.at_end)
+        self.shown_metrics = {name: term.shown for name, term in metrics.items() if term.shown is not None}
         self.success = self.declaration.success
         self.termination_names = tuple(f"termination_{name}" for name in (*self.declaration.terminations, "time_out"))
 
@@ -143,6 +146,14 @@ class DeclaredTask(Task):
             names = ("explicit", "stiffness", "damping", "effort_limit")
             motors = {name: getattr(attributes, name).numpy()[:count].tolist() for name in names}
         return contract(self.plan, self.worlds.solver.mj_model, motors)
+
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        """JSON documents that a bundle of a policy has besides, by the names of their files.
+
+        Args:
+            algorithm: Name of the algorithm that has learnt it.
+        """
+        return {}
 
     def _prepare(self) -> None:
         """Everything on the device that the kernels take."""

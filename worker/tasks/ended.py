@@ -22,7 +22,8 @@ class Ended:
     """The last episode of each world that ended: live views, valid in every world where one has.
 
     Attributes:
-        sums: Return, steps, the weighted sum of each reward term, the sum of each metric, shape ``(worlds, 2 + terms)``, float32.
+        sums: Return, steps, the weighted sum of each reward term, the sum of each metric (of those in ``final`` the last value), shape
+            ``(worlds, 2 + terms)``, float32.
         causes: Index into ``names`` of what ended it, shape ``(worlds,)``, int32. Of several terminations in one step it is the first.
         judged: Whether it was a success as the task declares it, shape ``(worlds,)``, bool; meaningless where ``success`` is None.
         names: What can end an episode: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
@@ -30,6 +31,7 @@ class Ended:
         columns: Names of the columns of ``sums`` behind the first two.
         success: The metric or termination that makes a success; None: that only the clock ended it.
         says_success: Whether success means anything: of a task without terminations that declares none it does not.
+        final: The metrics of which the last step counts.
     """
 
     sums: torch.Tensor
@@ -39,6 +41,7 @@ class Ended:
     columns: Sequence[str]
     success: str | None
     says_success: bool
+    final: Sequence[str] = ()
 
     @classmethod
     def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> Ended:
@@ -54,15 +57,19 @@ class Ended:
             [*rewards, *task.metric_names],
             task.success,
             task.success is not None or ends != [CLOCK],
+            task.final_metrics,
         )
 
     @property
     def terms(self) -> torch.Tensor:
-        """Of each reward term its weighted sum, of each metric its mean over the steps, shape ``(worlds, terms)``, named by ``columns``."""
+        """Of each reward term its weighted sum, of each metric its mean over the steps or its last value, shape ``(worlds, terms)``, named
+        by ``columns``."""
         steps = self.sums[:, int(STEPS)].clamp(min=1.0)
-        rewards = sum(name.startswith("reward_") for name in self.columns)
-        first = int(TERMS) + rewards
-        return torch.cat([self.sums[:, int(TERMS) : first], self.sums[:, first:] / steps[:, None]], 1)
+        terms = self.sums[:, int(TERMS) :].clone()
+        for column, name in enumerate(self.columns):
+            if name.startswith("metric_") and name not in self.final:
+                terms[:, column] /= steps
+        return terms
 
     @property
     def meaning(self) -> str:

@@ -14,10 +14,11 @@ import warp as wp
 from shared_store.layout import Store
 from worker.racer import resets
 from worker.racer import terms as racing
-from worker.racer.actions import ActionSpace
+from worker.racer.actions import CAMERA, ActionSpace
 from worker.racer.car import Cars
 from worker.racer.checks import BadTrack
 from worker.racer.circuit import circuit_of
+from worker.racer.lidar import lidar_sees
 from worker.racer.naming import resolve
 from worker.racer.reward_inputs import RewardInputs
 from worker.racer.rewards.kept import reward_file
@@ -69,6 +70,7 @@ class Racer(DeclaredTask):
         try:
             self.circuit = circuit_of(tracks_of(config), config.obstacles)
             self.actions_of_car = config.actions()
+            self.lidar = config.lidar_of(self.actions_of_car)
         except BadTrack as error:
             raise ValueError(f"config.track: {error}") from error
         except Refused as error:
@@ -85,7 +87,9 @@ class Racer(DeclaredTask):
             reward = reward_file(config.reward_function)
         except Refused as error:
             raise ValueError(f"config.reward_function: {error}") from error
-        race = RewardInputs.of(self.circuit, reward, getattr(config, "front", FrontCameraConfig()), getattr(self, "device", ""))
+        race = RewardInputs.of(
+            self.circuit, reward, getattr(config, "front", FrontCameraConfig()), getattr(self, "device", "")
+        )
         self.waits_for_host = race.function is None
         return race
 
@@ -151,17 +155,24 @@ class Racer(DeclaredTask):
                 **resetting(config),
             },
             metrics={
-                "progress": Metric(racing.final_progress),
-                "lap_time": Metric(racing.lap_time),
+                "progress": Metric(racing.final_progress, at_end=True, shown="%"),
+                "lap_time": Metric(racing.lap_time, at_end=True),
                 **mishap_metrics(config),
             },
             success="lap_complete",
             sensors=self.sensors_of(config),
         )
 
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        """``model_metadata.json``, as DeepRacer has it."""
+        sensors = [CAMERA] if hasattr(self.config, "front") else []
+        if self.lidar is not None:
+            sensors.append(("LIDAR", "SECTOR_LIDAR", "DISCRETIZED_SECTOR_LIDAR")[min(self.lidar.levels, 2)])
+        return {"model_metadata.json": self.actions_of_car.metadata(sensors, algorithm)}
+
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """What the policy sees."""
-        return self.road_terms(config)
+        return {**self.road_terms(config), **self.lidar_term()}
 
     def rewards_of(self, config: RacerConfig) -> Mapping[str, Reward]:
         """What the car earns, by the names of ``config.rewards``: what a learner's reward function gives, where there is one.
@@ -208,6 +219,23 @@ class Racer(DeclaredTask):
             seen["obstacle"] = Observation(racing.obstacle_ahead, names=names, unit="m")
         return seen
 
+    def lidar_term(self) -> Mapping[str, Observation]:
+        """What the lidar sees, where the car has one."""
+        if (lidar := self.lidar) is None:
+            return {}
+        seen = Observation(
+            lidar_sees,
+            size=lidar.size,
+            sectors=lidar.sectors,
+            rays=lidar.rays,
+            levels=lidar.levels,
+            field=lidar.field,
+            least=lidar.least,
+            reach=lidar.range,
+            unit="1" if lidar.levels else "m",
+        )
+        return {"lidar": seen}
+
     def own_terms(self) -> Mapping[str, Observation]:
         """What a car knows of itself."""
         return {
@@ -250,7 +278,11 @@ class RacerPixelsAndState(RacerPixels):
 
     def observations_of(self, config: RacerConfig) -> Mapping[str, Any]:
         """Numbers and image in groups of their own; the critic sees the road."""
-        return {"policy": self.own_terms(), "front": Image("front"), "critic": self.road_terms(config)}
+        return {
+            "policy": {**self.own_terms(), **self.lidar_term()},
+            "front": Image("front"),
+            "critic": self.road_terms(config),
+        }
 
 
 def from_workers(task: Racer) -> torch.Tensor:
@@ -289,8 +321,8 @@ def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
     if not config.continuous:
         return {}
     penalties = {"off_track": config.off_track_penalty, "crash": config.crash_penalty}
-    counts = {name: Metric(resets.happened, column=number) for number, name in enumerate(resets.COUNTS)}
-    return {**counts, "penalty": Metric(resets.penalty, **penalties)}
+    counts = {name: Metric(resets.happened, at_end=True, column=number) for number, name in enumerate(resets.COUNTS)}
+    return {**counts, "penalty": Metric(resets.penalty, at_end=True, **penalties)}
 
 
 def tracks_of(config: RacerConfig) -> list[Track]:

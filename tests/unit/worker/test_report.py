@@ -7,9 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from orchestrator.cli.progress import shown_metrics
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
+from shared_store.metrics import read_metrics, scalars
 from worker.learning.report import Report
+from worker.plot import plot_reward
 
 
 def said(
@@ -56,3 +59,30 @@ def test_a_training_that_ends_today_or_has_a_gpu_says_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float, device: str
 ) -> None:
     assert said(tmp_path, capsys, seconds, device) == []
+
+
+def test_what_a_task_wants_to_be_seen_is_in_the_line_in_the_record_and_in_the_plot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Store(tmp_path).open().run("r")
+    run.create({})
+    raise_epoch(run, 1)
+    report = Report(
+        SimpleNamespace(job=SimpleNamespace(run=run, epoch=1, section={}), iterations=2),  # type: ignore[arg-type]
+        0,
+        "cuda:0",
+    )
+    usual = {"episode_length": 33.0, "steps_per_second": 100.0, "iteration_seconds": 1.0}
+    for iteration, progress in ((1, None), (2, 42.0)):
+        shown = {"progress": "- %" if progress is None else "42.0 %"}
+        record = {"iteration": iteration, "env_steps": 10 * iteration, "reward": 1.5, "metric_progress": progress}
+        report.iteration({**usual, **record, "shown": shown})
+    report.close()
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("iteration 1/2  reward 1.50  length 33.0  progress - %  steps/s 100")
+    assert second.startswith("iteration 2/2  reward 1.50  length 33.0  progress 42.0 %  steps/s 100")
+    last = read_metrics(run)[-1]
+    assert last["shown"] == {"progress": "42.0 %"} and "shown" not in scalars(last)
+    assert plot_reward(run).read_bytes().startswith(b"\x89PNG")
+    assert shown_metrics(last) == "  progress 42.0 %" and shown_metrics({}) == ""
+    assert shown_metrics({"shown": {"a\nb": "\x1b[31m1"}}).count("\n") == 0

@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass
 
 from shared_store.file_fields import kept_file
 from worker.learning.ppo.settings import PPOConfig
-from worker.racer.actions import ActionSpace, action_space, read_metadata
+from worker.racer.actions import LIDARS, ActionSpace, action_space, read_metadata
+from worker.racer.hyperparameters import plain_settings
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import MOST_OBJECTS
 from worker.tasks.config import (
@@ -41,6 +42,38 @@ class ObstacleConfig:
     """From the start line along the centre line, in the order of the waypoints [m]."""
     lane: Literal["inner", "center", "outer"] = "outer"
     """In the middle of the half at the inner or the outer border, or on the centre line."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class LidarConfig:
+    """A lidar on the car's middle, which sees obstacles and nothing of the road.
+
+    Raises:
+        ValueError: Its range ends before it begins.
+    """
+
+    sectors: Annotated[int, Field(ge=1, le=128)] = 8
+    """Parts of the field, from the right to the left; each sees the nearest obstacle in it."""
+    rays: Annotated[int, Field(ge=1, le=64)] = 8
+    """Of each sector, in equal angles from each other."""
+    levels: Annotated[int, Field(ge=0, le=64)] = 0
+    """0: a sector is the distance to that obstacle [m]; else so many numbers, one of which is 1: that of its part of the range. 1: whether
+    there is one at all."""
+    field: Annotated[float, Field(gt=0, le=2 * math.pi)] = 5.236
+    """Angle that it sees, half of it to each side of the car's heading [rad]; 5.236 are 300 degrees."""
+    least: Amount = 0.15
+    """A nearer obstacle is as one here [m]."""
+    range: Positive = 1.0
+    """A farther obstacle is not seen [m]; where there is none, a distance is this."""
+
+    def __post_init__(self) -> None:
+        if self.least >= self.range:
+            raise Refused(("least",), f"expected less than range ({self.range:g}), found {self.least:g}")
+
+    @property
+    def size(self) -> int:
+        """Of its observation."""
+        return self.sectors * max(1, self.levels)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -120,6 +153,8 @@ class RacerConfig(TaskConfig):
         tuple[Annotated[ObstacleConfig, from_mapping(ObstacleConfig)], ...], Field(strict=False, max_length=64)
     ] = ()
     """Boxes on every track."""
+    lidar: Annotated[LidarConfig | None, from_mapping(LidarConfig)] = None
+    """Where the policy sees obstacles by a lidar; a lidar among the action space's sensors is one, too."""
     stuck_steps: Count = 15
     """Control steps in a row of standing, or of coming back, that end an episode."""
     continuous: bool = False
@@ -166,6 +201,7 @@ class RacerConfig(TaskConfig):
                 action_space(self.action_space)
             except Refused as error:
                 raise Refused(("action_space", *error.path), error.words) from None
+            self.lidar_of(self.actions())
         if self.has_other_rewards and len(self.obstacles) > MOST_OBJECTS:
             words = f"a reward function is told of at most {MOST_OBJECTS} objects, and there are {len(self.obstacles)}"
             raise Refused(("obstacles",), words)
@@ -174,6 +210,26 @@ class RacerConfig(TaskConfig):
     def has_other_rewards(self) -> bool:
         """Whether a reward function takes the place of the rewards."""
         return self.reward_function is not None
+
+    def lidar_of(self, space: ActionSpace) -> LidarConfig | None:
+        """The lidar: ``lidar``, or what the sensor of an action space is.
+
+        Raises:
+            Refused: There are both, or the task sees nothing but images.
+        """
+        if self.lidar is not None and space.lidar is not None:
+            raise Refused(("lidar",), f"the action space has the sensor {space.lidar}, too; leave one of them out")
+        if self.lidar is None and space.lidar is None:
+            return None
+        if self.further_groups.get("policy"):
+            where = ("lidar",) if self.lidar else ("action_space", "sensor")
+            raise Refused(where, "the policy of this task sees an image alone; use task RacerPixelsAndState")
+        return self.lidar or LidarConfig(**LIDARS[str(space.lidar)])
+
+    @classmethod
+    def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+        """As :meth:`TaskConfig.plain_settings`, of DeepRacer's hyperparameters."""
+        return plain_settings(train, cls())
 
     @property
     def tracks(self) -> tuple[str, ...]:

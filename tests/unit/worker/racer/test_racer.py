@@ -12,6 +12,7 @@ import torch
 from shared_store.layout import Store
 from worker.errors import UserError
 from worker.learning.job import configure
+from worker.learning.report import figures_of, shown_of
 from worker.racer.generator import make_random
 from worker.racer.geometry import on_road, place_at, project
 from worker.racer.naming import keep
@@ -60,9 +61,9 @@ def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
     assert counted(task, "termination_lap_complete") == 2
     assert rewards.numpy() == pytest.approx(100.0, abs=1.0)  # percent, and the rest of the last step
     assert 0.9 * OVAL.length < 1.25 * steps / 15 < OVAL.length  # 1.25 m/s, with curves cut
-    length = counted(task, "episode_length")
-    assert counted(task, "metric_progress") / length == pytest.approx(100.0, rel=1e-4)
-    assert counted(task, "metric_lap_time") / length == pytest.approx(steps / 15, rel=1e-4)
+    assert counted(task, "metric_progress") == 2 * 100.0
+    assert counted(task, "metric_lap_time") == pytest.approx(2 * steps / 15, rel=1e-6)
+    assert task.ended.terms[:, task.ended.columns.index("metric_progress")].tolist() == [100.0, 100.0]
 
 
 def test_what_is_known_of_a_car_is_what_the_tracks_geometry_says() -> None:
@@ -237,7 +238,7 @@ REFUSED = {
     ),
     "no such sensor": (
         {"action_space": {**DISCRETE, "sensor": ["STEREO_CAMERAS"]}},
-        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA",
+        "config.action_space.sensor.0: the simulated car does not have 'STEREO_CAMERAS'; use FRONT_FACING_CAMERA, LIDAR, SECTOR_LIDAR, DISCRETIZED_SECTOR_LIDAR",
     ),
     "a key too many": (
         {"action_space": {"action_space": [{"steering": 0, "speed": 1}] * 2}},
@@ -339,3 +340,35 @@ def test_a_policy_means_the_same_on_another_track_and_by_other_rules() -> None:
     here = racer(track="oval")
     there = racer(track=("chicane", "random:3"), continuous=True, trace=True, speed_lag=0.1)
     assert policy_contract(here, "Racer") == policy_contract(there, "Racer")
+
+
+def test_a_bundle_has_the_actions_and_the_sensors_as_deepracer_names_them() -> None:
+    task = racer(action_space={**DISCRETE, "sensor": ["SECTOR_LIDAR"]})
+    found = task.bundle_documents("ppo")["model_metadata.json"]
+    assert found == {
+        "action_space": FIVE,
+        "action_space_type": "discrete",
+        "sensor": ["SECTOR_LIDAR"],
+        "training_algorithm": "clipped_ppo",
+        "version": "5",
+    }
+    again = racer(action_space=found)  # it is an action space for the next training, too
+    assert again.actions_of_car == task.actions_of_car
+    usual = racer().bundle_documents("mine:Algorithm")["model_metadata.json"]
+    assert usual == {
+        "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 2.0}},
+        "action_space_type": "continuous",
+        "sensor": [],
+        "version": "5",
+    }
+
+
+def test_a_training_of_a_racer_shows_the_mean_progress_of_its_episodes() -> None:
+    task = racer(2, track="oval")
+    assert task.shown_metrics == {"metric_progress": "%"}
+    # a lap of 300 steps and an exit after 20 steps and a tenth of the track: 55 %, not what 320 steps in the mean would say
+    figures = figures_of({"metric_progress": 110.0, "metric_other": 32.0}, 2, 320, task.final_metrics)
+    assert figures == {"metric_progress": 55.0, "metric_other": 0.1}
+    assert shown_of(figures, task.shown_metrics) == {"shown": {"progress": "55.0 %"}}
+    none = figures_of({"metric_progress": 0.0}, 0, 0, task.final_metrics)
+    assert shown_of(none, task.shown_metrics) == {"shown": {"progress": "- %"}}

@@ -1,0 +1,156 @@
+"""DeepRacer's hyperparameters in a job's YAML: which settings they become, what is said of them, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.definition import compile_definition
+from orchestrator.errors import SpecError
+from orchestrator.spec import Spec, validate
+from orchestrator.spec_schema import schema
+from orchestrator.specfile import load
+
+USUAL = {
+    **{"batch_size": 64, "beta_entropy": 0.01, "discount_factor": 0.99, "e_greedy_value": 0.05, "epsilon_steps": 10000},
+    **{"exploration_type": "categorical", "loss_type": "huber", "lr": 0.0003, "num_episodes_between_training": 20},
+    **{
+        "num_epochs": 5,
+        "stack_size": 1,
+        "term_cond_avg_score": 350.0,
+        "term_cond_max_episodes": 1000,
+        "sac_alpha": 0.2,
+    },
+}
+"""A file as DeepRacer has it when nothing was changed."""
+
+
+def job(hyperparameters: Any, task: str = "Racer", **train: Any) -> Spec:
+    section = {"task": task, "worlds": 128, "iterations": 2, "hyperparameters": hyperparameters, **train}
+    return validate({"name": "racer", "train": section}, "racer.yaml")
+
+
+def refused(hyperparameters: Any, task: str = "Racer", **train: Any) -> str:
+    with pytest.raises(SpecError) as found:
+        job(hyperparameters, task, **train)
+    return str(found.value).removeprefix("racer.yaml: train.hyperparameters")
+
+
+def test_a_usual_file_becomes_settings_of_ppo() -> None:
+    spec = job(USUAL)
+    assert spec.train is not None
+    assert spec.train.given() == {
+        **{"epochs": 5, "learning_rate": 0.0003, "schedule": "fixed", "gamma": 0.99, "entropy_coef": 0.01},
+        # 20 episodes of 200 steps are 4,000 steps, 31.25 of each of 128 cars: 32, in eights
+        "steps": 32,
+        # 4,096 steps in parts of 64 were 64 parts, more than the steps of a world
+        "minibatches": 32,
+    }
+    said = {note.split()[0]: note for note in spec.notes}
+    assert said["hyperparameters.batch_size"].endswith(
+        "64: a minibatch of each rank has 128 steps, since it has equally many of each world"
+    )
+    unused = {"e_greedy_value", "epsilon_steps", "term_cond_avg_score", "term_cond_max_episodes", "sac_alpha"}
+    close = {"batch_size", "loss_type", "num_episodes_between_training"}
+    assert said.keys() == {f"hyperparameters.{name}" for name in unused | close}
+
+
+def test_a_usual_file_becomes_settings_of_sac() -> None:
+    spec = job(USUAL, algorithm="sac")
+    assert spec.train is not None
+    rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
+    assert spec.train.given() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
+
+
+@pytest.mark.parametrize(
+    ("worlds", "episodes", "batch", "steps", "minibatches"),
+    [
+        (16, 1, 512, 16, 1),  # 200 steps are 12.5 of each car, and 16 at least; 256 steps have no part of 512
+        (16, 10, 128, 128, 16),  # 2,000 steps are 125 of each; 2,048 / 128
+        (4096, 100, 512, 16, 16),  # 20,000 steps are 4.9 of each
+        (1, 100, 64, 256, 4),  # 20,000 are more than 256
+    ],
+)
+def test_an_iteration_is_about_as_long_as_that_many_episodes(
+    worlds: int, episodes: int, batch: int, steps: int, minibatches: int
+) -> None:
+    spec = job({"batch_size": batch, "num_episodes_between_training": episodes}, worlds=worlds)
+    assert spec.train is not None and spec.train.given() == {"steps": steps, "minibatches": minibatches}
+
+
+def test_a_stack_is_the_frames_of_the_camera() -> None:
+    spec = job({"stack_size": 3}, "RacerPixels", config={"front": {"width": 64}})
+    assert spec.train is not None and spec.train.config == {"front": {"width": 64, "frames": 3}}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"lr": 1}, ".lr: expected a number from 1e-08 to 0.001, found 1"),
+        ({"lr": "fast"}, ".lr: expected a number from 1e-08 to 0.001, found 'fast'"),
+        ({"lr": None}, ".lr: expected a number from 1e-08 to 0.001, found None"),
+        ({"lrr": 1e-4}, ".lrr: DeepRacer has no such hyperparameter; did you mean lr?"),
+        ({"batch_size": 63}, ".batch_size: expected one of 32, 64, 128, 256, 512, found 63"),
+        ({"num_epochs": 2}, ".num_epochs: expected a whole number from 3 to 10, found 2"),
+        ({"num_epochs": 5.5}, ".num_epochs: expected a whole number from 3 to 10, found 5.5"),
+        ({"discount_factor": True}, ".discount_factor: expected a number from 0 to 1, found True"),
+        ({"loss_type": "mse"}, ".loss_type: expected one of huber, mean squared error, found 'mse'"),
+        (
+            {"exploration_type": "e-greedy"},
+            ".exploration_type: ppo and sac draw actions from the policy itself; use categorical",
+        ),
+        (
+            {"stack_size": 2},
+            ".stack_size: it stacks images, and the task sees none; use task RacerPixels, or 1",
+        ),
+        ([1], ": "),
+        ("hyperparameters.json", ": a file is read for a job YAML alone; write its settings out"),
+    ],
+)
+def test_one_that_can_not_be_used_is_refused_in_one_line(given: Any, words: str) -> None:
+    found = refused(given)
+    assert found.startswith(words) and "\n" not in found
+
+
+def test_what_is_given_as_a_setting_too_is_refused() -> None:
+    assert refused({"lr": 1e-4}, ppo={"learning_rate": 1e-3}) == (
+        ".lr: it is train.ppo.learning_rate here, which is given, too; leave one of them out"
+    )
+    spec = job({"lr": 1e-4}, ppo={"clip": 0.1})
+    assert spec.train is not None
+    assert spec.train.given() == {"clip": 0.1, "learning_rate": 1e-4, "schedule": "fixed"}
+
+
+def test_tasks_and_algorithms_that_know_none_refuse_them() -> None:
+    assert refused({"lr": 1e-4}, "Ant") == ": AntConfig has none; settings of PPO stand under train.ppo"
+    assert refused({"lr": 1e-4}, "mine:Task").startswith(": task 'mine:Task' is not installed, so they are not known")
+    assert refused({"lr": 1e-4}, algorithm="rsl_rl").startswith(": they are settings of ppo and sac")
+
+
+def test_a_file_of_them_is_read_at_the_submission_and_is_not_needed_again(tmp_path: Path) -> None:
+    file, yaml = tmp_path / "hyperparameters.json", tmp_path / "racer.yaml"
+    file.write_text(json.dumps({"lr": "0.0002", "loss_type": "mean_squared_error"}))
+    yaml.write_text(f"name: racer\ntrain:\n  task: Racer\n  worlds: 8\n  iterations: 1\n  hyperparameters: {file}\n")
+    spec = load(str(yaml))
+    assert spec.train is not None and spec.train.given() == {"learning_rate": 0.0002, "schedule": "fixed"}
+    assert spec.notes == ()
+    assert "hyperparameters" not in json.dumps(compile_definition(spec, str(tmp_path)))
+    for content, words in (
+        ("[", f"racer.yaml:6: train.hyperparameters: {file}: not JSON"),
+        ("[1]", f"racer.yaml:6: train.hyperparameters: {file}: not a JSON object"),
+        ('{"lr": 2}', "racer.yaml:6: train.hyperparameters.lr: expected a number from 1e-08 to 0.001, found 2"),
+        (None, f"racer.yaml:6: train.hyperparameters: {file}: there is no such file"),
+    ):
+        file.unlink()
+        if content is not None:
+            file.write_text(content)
+        with pytest.raises(SpecError) as found:
+            load(str(yaml))
+        assert words in str(found.value) and "\n" not in str(found.value)
+
+
+def test_editors_know_the_key() -> None:
+    assert "hyperparameters" in schema()["$defs"]["Train"]["properties"]
