@@ -178,7 +178,7 @@ def _publish(
         write_json(hidden / REPORT, report)
         (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
         robot = add_robot(task, hidden)
-        documents = task.bundle_documents(facts["algorithm"]) if isinstance(task, DeclaredTask) else {}
+        documents = task.bundle_documents(facts.get("algorithm", "")) if isinstance(task, DeclaredTask) else {}
         for name, document in documents.items():
             write_json(hidden / name, document)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import torch
 
@@ -44,6 +45,8 @@ class Point(Telling):
 
     config_type = PointConfig
     statistic_names = ("episodes", "episode_return", "episode_length", "reward_place", "squared_return")
+    final_metrics = ()
+    shown_metrics = MappingProxyType[str, str]({})
     action_size, discrete, observation_shape = 1, False, (2,)
     action_names = ("push",)
     observation_names = ("place", "velocity")
