@@ -97,6 +97,8 @@ class Rollout:
             for _ in range(most):
                 self.task.step(self.policy.act(observations))
                 self.policy.reset(self.task.dones)
+                if torch.cuda.is_available() and self.task.device != "cpu":
+                    torch.cuda.synchronize(self.task.device)  # a reading does not wait for the step
                 yield reading.take()
         finally:
             tap.close()

@@ -160,3 +160,19 @@ def test_copies_of_a_state_that_grows_and_shrinks_are_right() -> None:
         copied = copies.take(state)
         copies.wait()
         assert torch.equal(copied["replay"], state["replay"].cpu()) and int(copied["place"]) == length
+
+
+@pytest.mark.parametrize("case", ["Cartpole", "a camera on a car"])
+def test_each_control_step_of_a_rollout_is_one_row_however_late_the_device_is(tmp_path: Path, case: str) -> None:
+    from benchmarks.training import build
+    from worker.telemetry.rollout import Rollout
+
+    task, train = CASES[case]
+    training = build(task, 32, tmp_path, iterations=1, **train)
+    training.train()
+    rollout = Rollout.of(training.job.run, None, 1)
+    work = torch.zeros(4096, 4096, device="cuda")
+    for number, rows in enumerate(rollout.steps(20)):
+        assert (rows.first, rows.lost, len(rows)) == (number, 0, 1)
+        for _ in range(20):  # the device is behind the host
+            work @ work
