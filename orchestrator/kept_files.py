@@ -14,7 +14,8 @@ from typing import Any
 from orchestrator.client import Client, named
 from orchestrator.errors import SpecError
 from orchestrator.settings import task_config
-from orchestrator.spec import override, place_of
+from orchestrator.spec import override
+from orchestrator.spec_values import place_of
 from shared_store.file_fields import KeptFile, kept_files
 from shared_store.settings import setting_at
 

@@ -37,6 +37,7 @@ from orchestrator.spec_values import (
     Secrets,
     Section,
     TaskName,
+    place_of,
 )
 from shared_store.races import DEFAULTS, TRIALS
 from shared_store.wording import Refused, explain, kind_of, nearest, path_of
@@ -445,18 +446,3 @@ def _keys_at(path: tuple[str | int, ...]) -> list[str]:
             return []
         model = section
     return list(model.model_fields)
-
-
-def place_of(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
-    """File, line and key of an error, with what stands between them and its words."""
-    line = _line_of(path, lines or {})
-    where = "--set" if line == 0 else f"{source}:{line}" if line else source
-    key = ".".join(str(part) for part in path)
-    return f"{where}: {key}: " if key else f"{where}: "
-
-
-def _line_of(path: tuple[str | int, ...], lines: Mapping[tuple[str | int, ...], int]) -> int | None:
-    for end in range(len(path), 0, -1):
-        if path[:end] in lines:
-            return lines[path[:end]]
-    return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Annotated
 
@@ -121,3 +122,18 @@ TaskName = Annotated[str, AfterValidator(_task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
 Secrets = Annotated[dict[str, str], AfterValidator(_secrets)]
 Argument = Annotated[str, AfterValidator(_argument)]
+
+
+def place_of(path: tuple[str | int, ...], source: str, lines: Mapping[tuple[str | int, ...], int] | None) -> str:
+    """File, line and key of an error, with what stands between them and its words."""
+    line = _line_of(path, lines or {})
+    where = "--set" if line == 0 else f"{source}:{line}" if line else source
+    key = ".".join(str(part) for part in path)
+    return f"{where}: {key}: " if key else f"{where}: "
+
+
+def _line_of(path: tuple[str | int, ...], lines: Mapping[tuple[str | int, ...], int]) -> int | None:
+    for end in range(len(path), 0, -1):
+        if path[:end] in lines:
+            return lines[path[:end]]
+    return None

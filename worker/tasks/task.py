@@ -96,10 +96,6 @@ class Task(Telling):
     """Whether the worlds stand on a ground plane."""
     metric_names: tuple[str, ...] = ()
     """Names of what is logged besides the rewards, as a mean over the steps; of declared tasks."""
-    final_metrics: tuple[str, ...] = ()
-    """Those of them of which an episode's last step counts."""
-    shown_metrics: Mapping[str, str] = {}
-    """Those of them that a training's progress shows, and their units."""
     termination_names: tuple[str, ...] = ()
     """Names of what ends episodes, which are counted; of declared tasks."""
     success: str | None = None

@@ -1,4 +1,4 @@
-"""What a task tells of functions that it was given, such as a learner's reward: where they run, and what went wrong in them."""
+"""What a task tells of its metrics, and of functions that it was given, such as a learner's reward: where they run, and what failed in them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 
 
 class Telling:
-    """A task that was given none; a task that takes such functions overrides this."""
+    """A task that shows no metric and was given no function; others override this."""
+
+    final_metrics: tuple[str, ...] = ()
+    """Metrics of which an episode's last step counts."""
+    shown_metrics: Mapping[str, str] = {}
+    """Metrics that a training's progress shows, and their units."""
 
     waits_for_host: bool = False
     """Whether a step reads anything back to the host: then no graph can hold it."""
