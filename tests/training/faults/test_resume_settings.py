@@ -79,7 +79,8 @@ REFUSED: dict[str, Any] = {
 
 def test_every_setting_is_in_one_of_the_two_tables(unchanged: Loop) -> None:
     refused = {"task", "algorithm", "seed", "config", "worlds"}  # test_refusals.py
-    assert Train.model_fields.keys() == {*refused, "iterations", "settings", *ALGORITHMS}
+    become_settings = {"hyperparameters"}  # of an algorithm, when the job is submitted
+    assert Train.model_fields.keys() == {*refused, *become_settings, "iterations", "settings", *ALGORITHMS}
     assert unchanged.training.iterations == 4, "the run was started with 2"
     names = {item.name for item in dataclasses.fields(PPOConfig)}
     assert names == {*APPLIED, *REFUSED, "weight_decay"}, "which is AdamW's; a run of Adam can't become one of it"
