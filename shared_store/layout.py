@@ -199,3 +199,18 @@ class Store:
             return []
         named = (self.run(name) for name in entries if NAME.fullmatch(name))
         return list(islice((run for run in named if os.path.lexists(run.path / "run.json")), most))
+
+
+def names_in(directory: Path) -> list[str]:
+    """What bears a valid name in a directory of the store, sorted; nothing where the directory does not exist.
+
+    Raises:
+        DamagedFile: The directory is a link.
+        OSError: It can't be read.
+    """
+    refuse_links(directory, 1)
+    try:
+        entries = os.listdir(directory)
+    except FileNotFoundError:
+        return []
+    return sorted(name for name in entries if NAME.fullmatch(name))

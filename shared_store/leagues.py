@@ -24,7 +24,7 @@ from shared_store import bundles, tracks
 from shared_store.bundles import DamagedBundle
 from shared_store.documents import DocumentError, parse
 from shared_store.files import DamagedFile, read_json, refuse_links, write_json
-from shared_store.layout import NAME, Store
+from shared_store.layout import NAME, Store, names_in
 from shared_store.races import race_changes, rules_of
 from shared_store.standings import BadRace, Contender, Ranking, read_race
 from shared_store.wording import counted, nearest, shown
@@ -305,13 +305,9 @@ class StoredLeague:
 def names(store: Store) -> list[str]:
     """Names of all leagues. Raises LeagueError for a link where the directory should be."""
     try:
-        refuse_links(store.leagues, 1)
-        entries = os.listdir(store.leagues)
-    except FileNotFoundError:
-        return []
+        return names_in(store.leagues)
     except (DamagedFile, OSError) as error:
         raise LeagueError(str(error)) from None
-    return sorted(name for name in entries if NAME.fullmatch(name))
 
 
 def find(store: Store, name: str) -> StoredLeague:

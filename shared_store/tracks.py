@@ -6,7 +6,6 @@ digest, the track's measures, and where it comes from. It appears by a rename th
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import time
@@ -19,7 +18,7 @@ from typing import Any
 from shared_store import bundles
 from shared_store.bundles import DamagedBundle
 from shared_store.files import DamagedFile, open_regular, refuse_links
-from shared_store.layout import NAME, Store
+from shared_store.layout import NAME, Store, names_in
 from shared_store.wording import nearest
 
 FILE = "track.npy"
@@ -71,13 +70,9 @@ class StoredTrack:
 def names(store: Store) -> list[str]:
     """Names of all tracks. Raises TrackError for a link where the directory should be."""
     try:
-        refuse_links(store.tracks, 1)
-        entries = os.listdir(store.tracks)
-    except FileNotFoundError:
-        return []
+        return names_in(store.tracks)
     except (DamagedFile, OSError) as error:
         raise TrackError(str(error)) from None
-    return sorted(name for name in entries if NAME.fullmatch(name))
 
 
 def is_made(name: str) -> bool:
