@@ -32,7 +32,9 @@ race: $(READY)
 # two files at a time, in the order of the tiers in tests/conftest.py
 PYTEST := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=40
 
-test: lint kernels
+# each of the first two keeps one core busy
+test: $(READY)
+	$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
 	$(PYTEST) -m "not cluster and not robots and not long"
 
 unit: $(READY)

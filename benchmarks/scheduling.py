@@ -8,20 +8,23 @@ import statistics
 import sys
 import time
 
-from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling import FairShare, NodeShape, Pool, Queue, Running, Shape, Snapshot, Waiting, decide
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.resources import Resources
+from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, Running, Snapshot, Waiting
 
 HOSTS, GPUS = 16, 8
 NOW = 1_800_000_000_000
 """Time of the pass [ms]."""
 COUNTS = (100, 1_000, 10_000, 100_000)
-ONE = Shape((NodeShape(12, 1, 32768),), 1, 0)
+ONE = Shape((Resources(12, 1, 32768),), 1, 0)
 
 
 def mixed_shapes() -> list[Shape]:
     """Twenty gangs of 1 to 5 nodes with 1 to 8 GPUs each."""
     each = [(nodes, gpus) for nodes in (1, 2, 3, 4, 5) for gpus in (1, 2, 4, 8)]
-    return [Shape((NodeShape(12 * gpus, gpus, 32768 * gpus),) * nodes, nodes, 0) for nodes, gpus in each]
+    return [Shape((Resources(12 * gpus, gpus, 32768 * gpus),) * nodes, nodes, 0) for nodes, gpus in each]
 
 
 def cluster() -> tuple[list[Host], list[Running]]:
@@ -34,7 +37,7 @@ def cluster() -> tuple[list[Host], list[Running]]:
             queue="default",
             share=f"share{(i + int(gpu)) % 50}",
             priority=0,
-            pool="all",
+            compute_environment="all",
             placements=(Placement(host.name, (gpu,), 12, 32768),),
             started_at=NOW - 1000 * (i * GPUS + int(gpu)),
             timeout=86400,
@@ -67,7 +70,9 @@ def snapshot(count: int, shapes: list[Shape], policy: FairShare | None) -> Snaps
     hosts, running = cluster()
     queue = Queue("default", 1, ("all",), policy, ())
     usage = {("default", f"share{i}"): 1000.0 * i for i in range(50)}
-    return Snapshot(NOW, hosts, {"all": Pool("all", True, None, None)}, {"default": queue}, waiting, running, usage)
+    return Snapshot(
+        NOW, hosts, {"all": ComputeEnvironment("all", True, None, None)}, {"default": queue}, waiting, running, usage
+    )
 
 
 def measure(each: Snapshot, repeats: int) -> float:
@@ -95,11 +100,11 @@ def main() -> None:
     for name, shapes, policy in cases:
         times = [measure(snapshot(count, shapes, policy), 15 if count <= 10_000 else 7) for count in COUNTS]
         print(f"| {name} | {' | '.join(f'{each:.1f}' for each in times)} |")
-    board = decide(snapshot(10_000, mixed_shapes(), fair)).board
-    order = board.order("default")
+    report = decide(snapshot(10_000, mixed_shapes(), fair)).report
+    order = report.order("default")
     begin = time.perf_counter()
     for job in order:
-        board.reason(job)
+        report.reason(job)
     print(f"\nThe reasons of 10,000 jobs, where all are asked for: {1000 * (time.perf_counter() - begin):.0f} ms.")
 
 

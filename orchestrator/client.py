@@ -18,9 +18,9 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 
-from orchestrator.errors import ApiError as ApiError
-from orchestrator.errors import NotServing, NoUrl
-from orchestrator.errors import Unreachable as Unreachable
+from orchestrator.domain.errors import ApiError as ApiError
+from orchestrator.domain.errors import NotServing, NoUrl
+from orchestrator.domain.errors import Unreachable as Unreachable
 from orchestrator.home import local_url, muster_home
 
 EXAMPLE_URL = "http://127.0.0.1:8080"

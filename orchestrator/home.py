@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from orchestrator.errors import ServerError
+from orchestrator.domain.errors import ServerError
 
 _OURS = re.compile(
     r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"

@@ -20,7 +20,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.alias_generators import to_camel
 
-from orchestrator.errors import ServerError, UsageError
+from orchestrator.domain.errors import ServerError, UsageError
 from shared_store.files import sync_directory
 from shared_store.layout import NAME
 

@@ -16,28 +16,28 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator.api.app import BROWSER_HEADERS, create_app
-from orchestrator.api.auth import Access, is_loopback
-from orchestrator.api.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
-from orchestrator.api.limits import RATE, RateLimit
-from orchestrator.automatic import AutomaticEvaluations
-from orchestrator.bus import Bus
-from orchestrator.controller import Controller
-from orchestrator.database import Database, DatabaseError
-from orchestrator.deliveries import Deliveries
-from orchestrator.disk import DEFAULT, MinFree
-from orchestrator.engines import make_engine
-from orchestrator.engines.base import EngineError
-from orchestrator.engines.local_gangs import running_gangs
-from orchestrator.engines.several import Several
-from orchestrator.errors import ServerError, UsageError
+from orchestrator.api.http.app import BROWSER_HEADERS, create_app
+from orchestrator.api.http.auth import Access, is_loopback
+from orchestrator.api.http.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
+from orchestrator.api.http.limits import RATE, RateLimit
+from orchestrator.api.native.automatic import AutomaticEvaluations
+from orchestrator.control.bus import Bus
+from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.deliveries import Deliveries
+from orchestrator.control.disk import DEFAULT, MinFree
+from orchestrator.control.peers import Peers
+from orchestrator.control.reconciler import Controller
+from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
+from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.engines.api import EngineError, Setting
+from orchestrator.engines.installed import make_engine
+from orchestrator.engines.local.gangs import running_gangs
+from orchestrator.engines.registry import EngineSet
+from orchestrator.engines.secrets import Secrets, SecretsError
 from orchestrator.home import HomeLock
-from orchestrator.job_secrets import Secrets, SecretsError
 from orchestrator.keys import KeyStore
-from orchestrator.peers import Peers
-from orchestrator.pools import ensure_pools
-from orchestrator.tables import Job
-from orchestrator.webhooks import Webhook, WebhooksError, read_webhooks
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.session import Database, DatabaseError
 from shared_store.layout import Store
 
 log = logging.getLogger("muster.controller")
@@ -78,10 +78,11 @@ class Server:
 
         ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
         ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
-        the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of
-        jobs is kept; None: for ever. ``engines``: what starts the nodes, of :data:`orchestrator.engines.ENGINES`; the first has the queue ``default``.
-        ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.job_secrets.Secrets`); None: jobs get none.
-        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.webhooks.read_webhooks`).
+        the volumes of the store and the database for something new to start. ``retention``: seconds for which the history of jobs is kept;
+        None: without end. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the
+        first.
+        ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
+        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`).
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
 
         Raises:
@@ -109,7 +110,7 @@ class Server:
                 stack.callback(found.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
-                    ensure_pools(session, nodes.names)
+                    ensure_compute_environments(session, nodes.names)
             except (DatabaseError, SecretsError) as error:
                 raise ServerError(str(error)) from None
             self.bus = Bus(home, nodes.addresses)
@@ -194,17 +195,17 @@ def _take_lock(home: Path) -> HomeLock:
         ) from None
 
 
-def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Sequence[str] | None) -> Several:
+def _make_engines(names: Sequence[str], home: Path, cpus: float | None, gpus: Sequence[str] | None) -> EngineSet:
     """The engines; where one can't be made, those before it are closed. Raises ServerError."""
     with ExitStack() as stack:
         made = []
         for name in dict.fromkeys(names):
             try:
-                made.append(make_engine(name, home, cpus, gpus))
+                made.append(make_engine(name, Setting(home, cpus, gpus)))
             except EngineError as error:
                 raise ServerError(str(error)) from None
             stack.callback(made[-1].close)
-        several = Several(made)
+        several = EngineSet(made)
         stack.pop_all()
     return several
 

@@ -1,7 +1,7 @@
 """The shared persistent volume: its layout, atomic commits, checkpoints, logs, metrics and outcomes.
 
 Both sides of Muster import this package (``orchestrator`` → ``shared_store`` ← ``worker``); it imports neither of them, and no
-torch. It is the only thing, with the environment variables of :mod:`shared_store.contract`, that crosses between the two.
+torch. Only this package and the environment variables of :mod:`shared_store.contract` cross between the two.
 """
 
 from __future__ import annotations

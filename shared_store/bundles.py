@@ -1,7 +1,7 @@
-"""Policy bundles: directories that appear whole, with a manifest that has the digest of every file.
+"""Policy bundles: directories that appear atomically, with a manifest that has the digest of every file.
 
-``manifest.json`` lists all other files, by their path in the bundle, with size and SHA-256; nothing else lies beside them. Its own
-``digest`` is the SHA-256 of the rest of it.
+``manifest.json`` lists all other files, by their path in the bundle, with size and SHA-256; a bundle has no further files. Its own
+``digest`` is the SHA-256 of its other content.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ FORMAT = 1
 MANIFEST, CONTRACT, REPORT, POLICY = "manifest.json", "contract.json", "report.json", "policy.onnx"
 _PART = r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,199}"
 _PATH = re.compile(rf"{_PART}(?:/{_PART}){{0,7}}")
-"""What a file of a bundle may be called: never a path that leads elsewhere."""
+"""Valid paths of a bundle's files: none leads out of it."""
 
 
 class DamagedBundle(Exception):
-    """A bundle can't be used; the message names it, the file, and what is wrong with it."""
+    """A bundle can't be used; the message names it, the file and the error."""
 
 
 def seal(bundle: Path, facts: Mapping[str, Any]) -> None:
-    """Write the manifest of the files that lie in ``bundle``, and make all of it durable. Raises OSError.
+    """Write the manifest of the files in ``bundle``, and make the bundle durable. Raises OSError.
 
     Args:
-        bundle: The directory, which nobody reads yet.
-        facts: What else the manifest says; JSON values.
+        bundle: The directory, still without readers.
+        facts: Further entries of the manifest; JSON values.
     """
     files = {}
     for path in _files(bundle):
@@ -80,11 +80,11 @@ def read_manifest(bundle: Path) -> dict[str, Any]:
 
 
 def verify(bundle: Path) -> dict[str, Any]:
-    """The manifest of a bundle all of whose files are as they were sealed, with none missing and none added. Raises DamagedBundle."""
+    """Verify that no file of a bundle was altered, removed or added since it was sealed; returns its manifest. Raises DamagedBundle."""
     manifest = read_manifest(bundle)
     listed: dict[str, Any] = manifest["files"]
     try:
-        if (bundle / MANIFEST).read_bytes() != _written(manifest):  # what JSON does not tell apart, such as spaces
+        if (bundle / MANIFEST).read_bytes() != _written(manifest):  # differences that parsing hides, such as spaces
             raise DamagedBundle(f"bundle {bundle}: the content of {MANIFEST} was altered")
         there = set(_files(bundle)) - {MANIFEST}
         for path in sorted(listed.keys() - there):
@@ -118,11 +118,11 @@ def read_contract(bundle: Path) -> Contract:
 
 
 def copy(bundle: Path, target: Path) -> None:
-    """Copy a bundle to ``target``, which must not exist, verified and whole or not at all.
+    """Copy a bundle atomically to ``target``, which must not exist, and verify it.
 
     Raises:
-        DamagedBundle: The bundle is not as it was sealed.
-        FileExistsError: There is something at ``target``.
+        DamagedBundle: The bundle was altered since it was sealed.
+        FileExistsError: ``target`` exists.
         OSError: The volume is full or gone.
     """
     if os.path.lexists(target):
@@ -137,7 +137,7 @@ def copy(bundle: Path, target: Path) -> None:
 
 
 def copy_files(bundle: Path, hidden: Path) -> None:
-    """Copy a bundle into the new directory ``hidden``, durably, and prove that the copy is as it was sealed. Raises as :func:`copy`."""
+    """Copy a bundle durably into the new directory ``hidden``, and verify the copy. Raises as :func:`copy`."""
     manifest = verify(bundle)
     hidden.mkdir()
     for path in (*manifest["files"], MANIFEST):
@@ -172,7 +172,7 @@ def _written(manifest: Mapping[str, Any]) -> bytes:
 
 
 def _files(bundle: Path) -> list[str]:
-    """Paths of all files in a bundle, relative to it. Raises DamagedFile for a link or anything else that is no file."""
+    """Paths of all files in a bundle, relative to it. Raises DamagedFile for links and other irregular files."""
     found = []
     for folder, folders, names in os.walk(bundle):
         for name in (*folders, *names):

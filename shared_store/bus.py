@@ -1,4 +1,4 @@
-"""The bus's protocol, as both ends speak it: the keys, and the credential that proves who sent a message.
+"""The bus's protocol, shared by both ends: the keys, and the credential that authenticates a message's sender.
 
 A node's presence, progress and commands lie below ``muster/<job>/<attempt>/<node>``. Every node may connect to the router, so a
 key proves nothing: each attempt has a secret of its own, and each message carries a proof made with it.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 LARGEST_MESSAGE = 4 * 2**20
 """Bytes; the router refuses larger messages."""
 LONGEST_ANSWER = 500_000
-"""Characters of the answer to a command; the rest is left out."""
+"""Characters of the answer to a command; longer answers are truncated."""
 LARGEST_PROGRESS = 65536
 """Bytes of JSON; the controller drops a larger report."""
 
@@ -24,12 +24,12 @@ Node = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class Credential:
-    """What an attempt's nodes authenticate with; its text is ``MUSTER_BUS_TOKEN``."""
+    """Authenticates an attempt's nodes; its text is ``MUSTER_BUS_TOKEN``."""
 
     password: str
-    """Of the router: the same for all nodes; lets them connect, and no more."""
+    """Of the router: the same for all nodes; it only lets them connect."""
     secret: str
-    """Of the attempt: known to its nodes and to the controller only."""
+    """Of the attempt: only its nodes and the controller know it."""
 
     @classmethod
     def derive(cls, master: str, job: str, attempt: int) -> Credential:
@@ -39,7 +39,7 @@ class Credential:
 
     @classmethod
     def parse(cls, token: str) -> Credential:
-        """The credential in a ``MUSTER_BUS_TOKEN``; one that no router accepts where the text is malformed."""
+        """The credential in a ``MUSTER_BUS_TOKEN``; for a malformed text, one that no router accepts."""
         password, _, secret = token.partition(".")
         return cls(password, secret)
 
@@ -50,7 +50,7 @@ class Credential:
         return "Credential(…)"
 
     def prove(self, *parts: str) -> str:
-        """The proof that a holder of the secret says ``parts``."""
+        """The proof that ``parts`` come from a holder of the secret."""
         return _mac(self.secret, *parts)
 
     def proves(self, proof: object, *parts: str) -> bool:
@@ -59,7 +59,7 @@ class Credential:
 
 
 def prefix(job: str, attempt: int, node: int) -> str:
-    """Where the keys of a node begin."""
+    """Common prefix of a node's keys."""
     return f"muster/{job}/{attempt}/{node}"
 
 
@@ -70,7 +70,7 @@ def presence_key(credential: Credential, job: str, attempt: int, node: int) -> s
 
 
 def node_of(key: str) -> Node | None:
-    """The node that a key speaks of; None where it is no node's key."""
+    """The node of a key; None if it is not a node's key."""
     parts = key.split("/")
     try:
         return parts[1], int(parts[2]), int(parts[3])

@@ -1,7 +1,7 @@
-"""Control groups (version 2) around nodes: nothing that a node starts can leave its group, whatever sessions and forks it hides behind.
+"""Control groups (version 2) around nodes: no process of a node can leave its group, whatever sessions and forks it uses.
 
-They are used where this process may make one below its own: as root, or where it was delegated (``systemd-run --user --scope -p
-Delegate=yes``). Whether it may is found out by trying. No controller is enabled in them. Linux only.
+They are used where this process may create one below its own: as root, or where it is delegated (``systemd-run --user --scope -p
+Delegate=yes``). A trial shows whether it may. No controller is enabled in them. Linux only.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from shared_store.processes import Process, find_process
 
 _TRIES = 25
 _NEW = 60.0
-"""Seconds within which a process is about to enter a group that was made."""
+"""Seconds after its creation within which a group may still be waiting for its process."""
 
 
 def own_group() -> str:
-    """Directory of the control group that this process is in; empty where it can't make groups below it."""
+    """Directory of this process's control group; empty if it can't create groups below it."""
     try:
         with open("/proc/self/cgroup") as file:
             path = next(line[3:].rstrip("\n") for line in file if line.startswith("0::"))
@@ -36,14 +36,14 @@ def own_group() -> str:
 
 
 def members(group: str) -> list[Process]:
-    """Processes in the group and in groups below it; none where there is no such group."""
+    """Processes in the group and in groups below it; none if the group does not exist."""
     found = []
     for directory, _, _ in os.walk(group):
         try:
             with open(os.path.join(directory, "cgroup.procs")) as file:
                 pids = file.read().split()
         except OSError as error:
-            if error.errno in (errno.ENOENT, errno.ENODEV):  # it was removed, before or after it was opened
+            if error.errno in (errno.ENOENT, errno.ENODEV):  # removed, before or after it was opened
                 continue
             raise
         found += [process for pid in pids if (process := find_process(int(pid)))]
@@ -51,7 +51,7 @@ def members(group: str) -> list[Process]:
 
 
 def kill_group(group: str) -> None:
-    """SIGKILL to all of the group at once, where the kernel can (Linux 5.14); nothing where ``group`` is empty."""
+    """Send SIGKILL to the whole group at once, if the kernel can (Linux 5.14); do nothing if ``group`` is empty."""
     if not group:
         return
     with contextlib.suppress(OSError):
@@ -63,18 +63,18 @@ def kill_group(group: str) -> None:
 
 
 def remove_group(group: str) -> None:
-    """Remove the group and those below it; one that is not empty, or not there, is left alone."""
+    """Remove the group and those below it; leave groups alone that have processes or do not exist."""
     for _ in range(_TRIES):
         for directory, _, _ in os.walk(group, topdown=False):
             with contextlib.suppress(OSError):
                 os.rmdir(directory)
         if not os.path.isdir(group):
             return
-        time.sleep(0.02)  # processes that have just died still count for a moment
+        time.sleep(0.02)  # processes still count for a moment after their death
 
 
 def remove_abandoned_groups(directory: str) -> None:
-    """Remove groups of nodes below ``directory`` that are empty and not new: left by shims that were killed while no controller stopped the gang."""
+    """Remove empty, old groups of nodes below ``directory``: leftovers of shims that were killed while no controller stopped the gang."""
     for entry in os.scandir(directory) if directory else ():
         with contextlib.suppress(OSError):  # the kernel refuses where a process is in it
             if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:

@@ -1,4 +1,4 @@
-"""Checkpoints: committed whole or not at all, verified when they are read, never written twice.
+"""Checkpoints: committed atomically, verified when they are read, never written twice.
 
 ``checkpoints/<iteration, 8 digits>-e<epoch>/`` holds ``manifest.json`` and the files that it lists with size and SHA-256. The
 directory appears by a rename, after everything in it is durable. ``LATEST`` is a hint for people; the truth is the listing.
@@ -35,20 +35,20 @@ FORMAT = 1
 _NAME = re.compile(r"([0-9]{8})-e([0-9]{1,18})")
 _MAKING = re.compile(r"\.([0-9]{8})-e([0-9]{1,18})\.tmp")
 _FILE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
-"""What a file of a checkpoint may be called: never a path that leads elsewhere."""
+"""Valid names of a checkpoint's files: none leads out of it."""
 
 
 class DamagedCheckpoint(Exception):
-    """A checkpoint can't be used; the message names it, the file, and what is wrong with it."""
+    """A checkpoint can't be used; the message names it, the file and the error."""
 
 
 class NewerFormat(DamagedCheckpoint):
-    """A newer Muster wrote the checkpoint: nothing is wrong with it, so nobody may set it aside."""
+    """A newer Muster wrote the checkpoint: it is not damaged, so it must not be set aside."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A committed checkpoint. ``iteration`` is how many iterations were done when it was taken."""
+    """A committed checkpoint. ``iteration`` is the number of finished iterations."""
 
     path: Path
     iteration: int
@@ -60,7 +60,7 @@ class Checkpoint:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """The content of ``manifest.json``. Raises DamagedCheckpoint where there is none that can be read."""
+        """The content of ``manifest.json``. Raises DamagedCheckpoint if it can't be read."""
         try:
             manifest = read_json(self.path / "manifest.json")
         except (OSError, ValueError) as error:
@@ -116,7 +116,7 @@ class Checkpoint:
 
 
 def checkpoint_called(directory: Path, name: str) -> Checkpoint | None:
-    """The checkpoint of that name in ``directory``, whether it exists or not; None where no checkpoint can be called so."""
+    """The checkpoint of that name in ``directory``, whether it exists or not; None for an invalid name."""
     match = _NAME.fullmatch(name)
     return Checkpoint(directory / match[0], int(match[1]), int(match[2])) if match else None
 
@@ -124,8 +124,8 @@ def checkpoint_called(directory: Path, name: str) -> Checkpoint | None:
 def list_checkpoints(run: Run) -> list[Checkpoint]:
     """Every committed checkpoint, the newest last.
 
-    A later epoch is newer whatever its iteration: each attempt starts from the newest of those before it, unless a person
-    chose an older one, and then the later history is the one that counts.
+    A later epoch is newer whatever its iteration: each attempt starts from the newest checkpoint before it, unless a person
+    chose an older one; then the later history counts.
     """
     try:
         entries = os.listdir(run.checkpoints)
@@ -142,17 +142,17 @@ def newest_checkpoint(
     chosen_since: int = 0,
     damaged: Callable[[Checkpoint, DamagedCheckpoint], None] | None = None,
 ) -> Checkpoint | None:
-    """The checkpoint that an attempt goes on from: the newest one that verifies; None where there is none.
+    """The checkpoint from which an attempt resumes: the newest one that verifies; None without any.
 
     Args:
         run: The run.
-        chosen: Name of the checkpoint that a person asked for. It stands until the job that was asked has committed one of
-            its own, that is one of epoch ``chosen_since`` or later.
+        chosen: Name of the checkpoint that a person chose. The choice holds until the job has committed a checkpoint of its
+            own, that is, of epoch ``chosen_since`` or later.
         chosen_since: Epoch of that job's first attempt.
-        damaged: Called for each newer one that does not verify (to name it and to set it aside).
+        damaged: Called for each newer checkpoint that does not verify (to report it and to set it aside).
 
     Raises:
-        DamagedCheckpoint: The chosen one is missing or does not verify: a person's choice is never replaced by a guess.
+        DamagedCheckpoint: The chosen one is missing or does not verify; no other replaces a person's choice.
     """
     for checkpoint in reversed(list_checkpoints(run)):
         if chosen is not None and checkpoint.epoch < chosen_since:
@@ -173,11 +173,11 @@ def newest_checkpoint(
 
 
 def best_checkpoint(run: Run) -> Checkpoint | None:
-    """The best checkpoint, the later one of equals; None where none has been evaluated or has a score yet.
+    """The best checkpoint, of equals the later; None if none has an evaluation or a score yet.
 
-    Where two or more have been evaluated in the worlds of their training, it is the one with the greatest mean return of those that are
-    there; one alone would be the best of one. Else it is the one with the greatest score, which is a mean over many episodes of the training; the reward of
-    the one iteration before a checkpoint counts for nothing here.
+    If two or more existing checkpoints have been evaluated in the worlds of their training, it is the one with the greatest mean return.
+    Otherwise it is the one with the greatest score, which is a mean over many episodes of the training, not the reward of the single
+    iteration before the checkpoint.
     """
     checkpoints = list_checkpoints(run)
     evaluated = by_checkpoint(run)
@@ -195,18 +195,18 @@ def best_checkpoint(run: Run) -> Checkpoint | None:
 
 
 def best_evaluated(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> Checkpoint | None:
-    """The one with the greatest mean return, the later one of equals; None where none is evaluated.
+    """The evaluated checkpoint with the greatest mean return, of equals the later; None if none is evaluated.
 
     Args:
         checkpoints: The newest last.
-        evaluated: As :func:`shared_store.evaluations.by_checkpoint` has it.
+        evaluated: From :func:`shared_store.evaluations.by_checkpoint`.
     """
     judged = [checkpoint for checkpoint in reversed(checkpoints) if checkpoint.name in evaluated]
     return max(judged, key=lambda checkpoint: float(evaluated[checkpoint.name]["mean_return"]), default=None)
 
 
 def set_aside(checkpoint: Checkpoint) -> Path:
-    """Take a damaged checkpoint out of the listing without deleting it; returns where it is now."""
+    """Take a damaged checkpoint out of the listing without deleting it; returns its new path."""
     target = checkpoint.path.with_name(f"{checkpoint.name}.damaged")
     suffix = 1
     while target.exists():
@@ -218,9 +218,9 @@ def set_aside(checkpoint: Checkpoint) -> Path:
 
 
 def sweep(run: Run, up_to: tuple[int, int] | None = None) -> list[str]:
-    """Delete what interrupted commits and deletions left behind; returns the names. For the newest epoch's main rank only.
+    """Delete the leftovers of interrupted commits and deletions; returns their names. For the newest epoch's main rank only.
 
-    ``up_to``: epoch and iteration of a checkpoint; those in the making that come after it are left alone.
+    ``up_to``: epoch and iteration of a checkpoint; unfinished ones after it are left alone.
     """
     swept = []
     for entry in os.listdir(run.checkpoints) if run.checkpoints.exists() else []:
@@ -238,13 +238,13 @@ def sweep(run: Run, up_to: tuple[int, int] | None = None) -> list[str]:
 
 
 class CheckpointWriter:
-    """One checkpoint in the making: every rank writes its own files into ``path``, durably, then the main rank commits."""
+    """An unfinished checkpoint: every rank durably writes its own files into ``path``, then the main rank commits."""
 
     def __init__(self, run: Run, iteration: int, epoch: int) -> None:
         self.run, self.iteration, self.epoch = run, iteration, epoch
         self.name = f"{iteration:08d}-e{epoch}"
         self.path = run.checkpoints / f".{self.name}.tmp"
-        run.checkpoints.mkdir(exist_ok=True)  # not its parents: a run that somebody deleted does not come back in part
+        run.checkpoints.mkdir(exist_ok=True)  # not its parents: a deleted run must not come back in part
         self.path.mkdir(exist_ok=True)
 
     def commit(
@@ -253,14 +253,14 @@ class CheckpointWriter:
         """Publish the checkpoint: manifest, fsync, fence, rename, ``LATEST``, retention. Main rank only, after all files.
 
         Args:
-            facts: What else the manifest says (world size, worlds, reward, versions); JSON values.
-            keep: How many of the newest checkpoints to keep; None keeps all. The best by ``score`` is always kept.
-            digests: ``{name: {"size", "sha256"}}`` of every file, as those who wrote them know them; read back where None.
+            facts: Further entries of the manifest (world size, worlds, reward, versions); JSON values.
+            keep: Number of the newest checkpoints to keep; None keeps all. The best by ``score`` is always kept.
+            digests: ``{name: {"size", "sha256"}}`` of every file, from its writer; None: read the files back.
 
         Raises:
             StaleEpoch: A newer attempt owns the run; nothing was published.
-            FileExistsError: The name is committed already; it is never written twice.
-            OSError: The volume is full or gone; the last checkpoint stands.
+            FileExistsError: A checkpoint of this name is already committed.
+            OSError: The volume is full or gone; the last checkpoint remains valid.
         """
         for notes in self.path.glob(".*"):
             notes.unlink()
@@ -283,21 +283,21 @@ class CheckpointWriter:
         check_epoch(self.run, self.epoch)
         os.rename(self.path, target)
         sync_directory(self.run.checkpoints)
-        # The checkpoint is committed. What fails from here on costs a hint or space, and an attempt that was frozen in the rename
-        # must not prune what its successor made.
+        # The checkpoint is committed. A failure from here on costs a hint or space, and an attempt that was frozen in the rename
+        # must not prune its successor's checkpoints.
         with contextlib.suppress(OSError, StaleEpoch):
             check_epoch(self.run, self.epoch)
             if keep is not None:
                 retain(self.run, keep)
-            # every rank's writer takes its saves in order: nobody works any more on an earlier one that failed
+            # every rank's writer takes its saves in order: no rank still works on an earlier, failed one
             sweep(self.run, up_to=(self.epoch, self.iteration))
             write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode())
         return Checkpoint(target, self.iteration, self.epoch)
 
 
 def retain(run: Run, keep: int) -> list[str]:
-    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, the best evaluated one, and those that an
-    export, or an evaluation that keeps its checkpoint, was made of or waits for; returns the deleted names.
+    """Delete all but the newest ``keep`` checkpoints, the one with the greatest ``score``, the best evaluated one, and those of finished
+    or pending exports and of evaluations that keep their checkpoint; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
     scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
@@ -313,7 +313,7 @@ def retain(run: Run, keep: int) -> list[str]:
 
 
 def _score(checkpoint: Checkpoint) -> float | None:
-    """How good the policy was: ``score`` of the manifest, or ``reward`` of one that an older Muster wrote."""
+    """The policy's score: ``score`` of the manifest, or ``reward`` in one that an older Muster wrote."""
     try:
         manifest = checkpoint.manifest
     except DamagedCheckpoint:

@@ -1,6 +1,6 @@
 """The node contract: the environment variables with which every engine starts every node.
 
-The ``AWS_BATCH_*`` names mean what they mean on AWS; ``MASTER_ADDR`` and its kin are torch.distributed's; ``MUSTER_*`` are ours.
+The ``AWS_BATCH_*`` names have their meaning on AWS; ``MASTER_ADDR`` and its kin are torch.distributed's; ``MUSTER_*`` are ours.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ _FOR_RANKS = "MUSTER_RANK_ENV_"
 
 
 def sealed(job: Mapping[str, str], contract: Mapping[str, str]) -> dict[str, str]:
-    """The variables of a node's supervisor: the contract, and the job's own so that they take effect in its ranks only.
+    """The variables of a node's supervisor: the contract, and the job's own with a prefix, so that only its ranks see them.
 
-    A job's ``PYTHONPATH``, ``LD_PRELOAD`` or ``TMPDIR`` must not change what supervises it. The contract wins over the job.
+    A job's ``PYTHONPATH``, ``LD_PRELOAD`` or ``TMPDIR`` must not change its supervisor. The contract wins over the job.
     """
     return {**{f"{_FOR_RANKS}{name}": value for name, value in job.items() if name not in contract}, **contract}
 
 
 def sealed_in_image(job: Mapping[str, str], contract: Mapping[str, str]) -> dict[str, str]:
-    """The same for a container: a job's ``PATH`` is kept in its place as well, since the image's Python is looked for in it."""
+    """The same for a container: a job's ``PATH`` also stays in place, since it is searched for the image's Python."""
     return {**sealed(job, contract), **{name: value for name, value in job.items() if name == "PATH"}}
 
 
@@ -36,7 +36,7 @@ def job_variables(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def rank_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables of a rank, from those of its supervisor: the job's own stand over what the node inherited."""
+    """The variables of a rank, from those of its supervisor: the job's own override the node's inherited ones."""
     inherited = {name: value for name, value in environment.items() if not name.startswith(_FOR_RANKS)}
     return {**inherited, **job_variables(environment)}
 
@@ -47,7 +47,7 @@ class ContractError(Exception):
 
 @dataclass(frozen=True)
 class NodeContract:
-    """What a node of a gang is told when it starts."""
+    """The settings with which a node of a gang starts."""
 
     job: str
     """Job id, without ``#``."""
@@ -73,20 +73,20 @@ class NodeContract:
     cpus: float = 1.0
     """The node's share of CPUs, divided among its ranks."""
     stall_timeout: float | None = None
-    """Seconds without an iteration after which a rank counts as stuck; None where nobody asked."""
+    """Seconds without an iteration after which a rank counts as stuck; None: never."""
     log_limit: int = LIMIT
-    """Bytes of the node's log that are kept."""
+    """Bytes of the node's log to keep."""
     is_gang: bool = True
     """False for a single-node job: AWS gives it no node variables."""
     array: tuple[int, int] | None = None
     """Index and size, of an array's child."""
     isolation: str = ""
-    """``image``: a plain process starts as it would in a container: in an empty directory, with few of the machine's variables and a
+    """``image``: a plain process starts as in a container: in an empty directory, with few of the machine's variables and a
     standard PATH. ``muster``: the same with Muster's own environment on PATH, as in Muster's own image. Empty: neither."""
     user: str | None = None
-    """``UID:GID`` of the program, where that is not the supervisor's."""
+    """``UID:GID`` of the program, if it differs from the supervisor's."""
     address: str | None = None
-    """The node's own address, where the engine gives it one."""
+    """The node's own address, if the engine sets one."""
     bus: str | None = None
     """Endpoint of the controller's bus router."""
     bus_token: str | None = None
@@ -94,7 +94,7 @@ class NodeContract:
 
     @property
     def node_rank(self) -> int:
-        """The main node is rank 0 whatever its index; the others follow in the order of theirs."""
+        """Rank of the node: 0 for the main node whatever its index; the others follow in the order of their indices."""
         if self.node_index == self.main_index:
             return 0
         return self.node_index + (1 if self.node_index < self.main_index else 0)
@@ -105,7 +105,7 @@ class NodeContract:
 
     @property
     def gang(self) -> str:
-        """Names the attempt; carried by every process of it, so that none can be missed when it is stopped."""
+        """Name of the attempt, which every process of it carries, so that a stop misses none."""
         return f"{self.job}/{self.attempt}/{self.epoch}"
 
     def to_env(self) -> dict[str, str]:
@@ -143,7 +143,7 @@ class NodeContract:
         return env | {name: value for name, value in optional.items() if value}
 
     def _batch_env(self) -> dict[str, str]:
-        """What depends on the kind of job; the main node's address is told to the children only."""
+        """The variables that depend on the kind of job; only the other nodes get the main node's address."""
         if not self.is_gang:
             env = {"AWS_BATCH_JOB_ID": self.job}
             if self.array is not None:

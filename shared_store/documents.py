@@ -1,4 +1,4 @@
-"""Documents of the store as dataclasses: read without any library, and refused in one line with the place of what is wrong."""
+"""Documents of the store as dataclasses: parsed without a library, and refused in one line that names the place of the error."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from shared_store.wording import kind_of, nearest, shown
 
 
 class DocumentError(ValueError):
-    """A document is not what it should be; one line with the place in it."""
+    """A document is invalid; one line that names the place of the error."""
 
 
 def parse(kind: Any, value: Any, where: str) -> Any:
-    """A value of a JSON document as the type that a field has.
+    """Convert a value of a JSON document to the type of a field.
 
     Args:
-        kind: A dataclass, or what its fields may be annotated with: dataclasses, numbers, texts, literals, tuples, mappings, ``X | None``.
+        kind: A dataclass, or a type of its fields: dataclass, number, text, literal, tuple, mapping, ``X | None``.
         value: Plain values.
-        where: What the document is called; then the keys to the value.
+        where: Name of the document, followed by the keys to the value.
 
     Raises:
-        DocumentError: It is none of that; one line with the keys to it, and the nearest name for an unknown one.
+        DocumentError: The value does not fit; one line with its keys, and for an unknown name the nearest one.
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind):

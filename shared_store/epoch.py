@@ -1,8 +1,8 @@
 """Fencing: every attempt that may write to a run has an epoch, and only the attempt that the run's ``EPOCH`` names may commit.
 
-Before it launches a gang, the controller creates ``EPOCH.<n>``, exclusively: of several controllers on one store one alone gets
-the number, on NFS and EFS too. Then it writes n to ``EPOCH``. A gang that was believed dead and comes back reads a number there
-that is not its own, and stops. Readers open ``EPOCH`` alone; ``EPOCH.<n>`` tells controllers which attempt writes.
+Before it launches a gang, the controller creates ``EPOCH.<n>``, exclusively: of several controllers on one store, only one gets
+the number, also on NFS and EFS. Then it writes n to ``EPOCH``. A gang that was believed dead and comes back reads another gang's
+number there, and stops. Readers open only ``EPOCH``; ``EPOCH.<n>`` tells controllers which attempt writes.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from shared_store.layout import Run, StoreError
 LARGEST_EPOCH = 10**15 - 1
 """A greater number in ``EPOCH`` is damage: no run has that many attempts."""
 _KEPT = 64
-"""Claims that are kept behind the newest one, so that a controller that froze while it claimed can't free a number."""
+"""Number of older claims to keep, so that a controller that froze while it claimed can't free a number."""
 _PUBLICATION = 1.0
-"""Seconds between a claim and its publication after which the controller that claimed is taken for dead."""
+"""Seconds between a claim and its publication after which the claiming controller counts as dead."""
 _LONGEST_CLAIM = 4096
-"""Bytes that are read of a claim."""
+"""Bytes of a claim to read."""
 
 
 class StaleEpoch(Exception):
@@ -35,7 +35,7 @@ class StaleEpoch(Exception):
 
 @dataclass(frozen=True)
 class Claim:
-    """Which attempt has an epoch, as ``EPOCH.<n>`` says while the attempt is open."""
+    """The attempt that has an epoch, from ``EPOCH.<n>`` while the attempt is open."""
 
     controller: str
     """Id of the attempt's controller on this store."""
@@ -44,7 +44,7 @@ class Claim:
 
 
 def read_epoch(run: Run) -> int:
-    """The epoch that may write to ``run``; 0 before the first attempt. Raises ValueError where the file is damaged."""
+    """The epoch that may write to ``run``; 0 before the first attempt. Raises ValueError if the file is damaged."""
     path = run.path / "EPOCH"
     refuse_links(run.path, 1)
     try:
@@ -60,11 +60,12 @@ def read_epoch(run: Run) -> int:
 def take_epoch(run: Run, after: int, claim: Claim) -> int:
     """Give the run to ``claim``, with the first free epoch greater than ``after``; returns it.
 
-    ``after``: at least the run's epoch, as the caller read it before it decided to take the run. An epoch that another controller has claimed and not yet published is waited for, up to a second: that controller has the run
-    then. One that died in between is passed over.
+    ``after``: at least the run's epoch when the caller decided to take the run. If another controller has claimed an epoch and not yet
+    published it, this waits up to a second for the publication, which gives the run to that controller. The claim of a controller that
+    died in between is skipped.
 
     Raises:
-        StaleEpoch: Another controller took the run at this moment.
+        StaleEpoch: Another controller has just taken the run.
         ValueError: ``EPOCH`` is damaged, or no epoch is left.
         OSError: The store can't be written.
     """
@@ -77,7 +78,7 @@ def take_epoch(run: Run, after: int, claim: Claim) -> int:
 
 
 def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
-    """Give the run to ``epoch``. Raises StaleEpoch where that is not greater than the run's, or where another attempt has it."""
+    """Give the run to ``epoch``. Raises StaleEpoch if it is not greater than the run's, or if another attempt has it."""
     current = read_epoch(run)
     if epoch <= current:
         raise StaleEpoch(f"run {run.name}: epoch {epoch} does not follow {current}")
@@ -87,7 +88,7 @@ def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
 
 
 def read_claim(run: Run, epoch: int) -> Claim | None:
-    """Which open attempt has ``epoch``; None where that is closed, unknown or damaged. Raises OSError."""
+    """The open attempt that has ``epoch``; None if it is closed, unknown or damaged. Raises OSError."""
     try:
         with open_regular(_claim_path(run, epoch)) as file:
             value = json.loads(file.read(_LONGEST_CLAIM))
@@ -97,9 +98,9 @@ def read_claim(run: Run, epoch: int) -> Claim | None:
 
 
 def close_claim(run: Run, epoch: int) -> None:
-    """Note that the attempt with ``epoch`` is closed. The file stays, empty: the number is never given again.
+    """Mark the attempt with ``epoch`` as closed. The file stays, empty, so that the number is never used again.
 
-    Raises OSError, DamagedFile where the run or the file is a link or anything else than what was made.
+    Raises OSError; DamagedFile if the run is a link, or the file is not a regular one.
     """
     refuse_links(run.path, 1)
     with contextlib.suppress(FileNotFoundError), open_regular(_claim_path(run, epoch), write=True) as file:
@@ -108,14 +109,14 @@ def close_claim(run: Run, epoch: int) -> None:
 
 
 def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
-    """Make sure that this is the volume on which the controller gave the run to ``epoch``, before a node starts on it.
+    """Check, before a node starts, that this is the volume on which the controller gave the run to ``epoch``.
 
     Args:
-        patience: Seconds that a network file system gets to show what another machine has written.
+        patience: Seconds for a network file system to show another machine's writes.
 
     Raises:
         StaleEpoch: Another attempt owns the run.
-        StoreError: The epoch is not here: another directory of the same name, or nothing mounted.
+        StoreError: The epoch is missing: another directory of the same name, or nothing mounted.
     """
     deadline = time.monotonic() + patience
     while (current := read_epoch(run)) < epoch:
@@ -124,7 +125,7 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
                 f"store {run.path.parent.parent} on {socket.gethostname()} is not the controller's: run {run.name} has epoch "
                 f"{current} there, not {epoch}; mount the same volume at this path on every node"
             )
-        # to open a directory has NFS look again at what it took for absent
+        # opening a directory makes NFS look again for files that it cached as absent
         for directory in (run.path.parent, run.path):
             with contextlib.suppress(OSError):
                 os.listdir(directory)
@@ -134,9 +135,9 @@ def find_epoch(run: Run, epoch: int, patience: float = 10.0) -> None:
 
 
 def check_epoch(run: Run, epoch: int) -> None:
-    """Raises StaleEpoch where another attempt owns the run.
+    """Raises StaleEpoch if another attempt owns the run.
 
-    A smaller number counts as well: of two controllers that publish at the same instant the last one owns the run, and exactly one
+    A smaller number counts, too: of two controllers that publish at the same instant, the last one owns the run, and exactly one
     gang goes on. A missing file proves nothing.
     """
     current = read_epoch(run)
@@ -145,7 +146,7 @@ def check_epoch(run: Run, epoch: int) -> None:
 
 
 def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
-    """Create ``EPOCH.<epoch>``; False where it exists: the number is taken."""
+    """Create ``EPOCH.<epoch>``; False if it exists, because the number is taken."""
     if epoch > LARGEST_EPOCH:
         raise ValueError(f"{run.path / 'EPOCH'}: no epoch is left after {LARGEST_EPOCH}")
     refuse_links(run.path, 1)
@@ -159,12 +160,12 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
             file.write(json.dumps(asdict(claim)).encode())
             file.flush()
         os.fsync(descriptor)
-    sync_directory(run.path)  # a number that a crash of the volume forgets could be given again
+    sync_directory(run.path)  # if a crash of the volume lost the number, it could be used again
     return True
 
 
 def _await_publication(run: Run, epoch: int, claim: Claim) -> None:
-    """Returns where ``epoch`` will not be published: its controller died, or it is the caller's own, which died before."""
+    """Returns once ``epoch`` is sure not to be published: its controller died, or it is the caller's own claim from before a crash."""
     deadline = time.monotonic() + _PUBLICATION
     while time.monotonic() < deadline:
         if (current := read_epoch(run)) >= epoch:

@@ -1,4 +1,4 @@
-"""The evaluations of a run: ``evaluations/<checkpoint>[-<job>].json`` sums one up, the ``.parquet`` beside it has a row an episode.
+"""The evaluations of a run: ``evaluations/<checkpoint>[-<job>].json`` is a summary, the ``.parquet`` beside it has a row per episode.
 
 The table is written first: an evaluation exists once its summary does.
 """
@@ -17,26 +17,26 @@ from shared_store.layout import LARGEST_DESCRIPTION, Run
 from shared_store.wording import counted
 
 TERMS_SHOWN = 6
-"""Reward terms that a printed table has: those of the greatest size."""
+"""Number of reward terms in a printed table: the largest ones."""
 
 _NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
 _NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")
 
 
 def evaluation_name(checkpoint: str, job: str = "") -> str:
-    """What an evaluation is called: after its checkpoint, and after its job, of an array with the index, where that did nothing else."""
+    """Name of an evaluation: its checkpoint, and for a job that only evaluates, the job, with the index of an array's child."""
     parent, _, index = job.partition(":")
     return "-".join(filter(None, (checkpoint, parent[:8], index)))
 
 
 def checkpoint_of(name: str) -> str | None:
-    """Name of the checkpoint that the evaluation called ``name`` is of; None where no evaluation is called so."""
+    """Name of the checkpoint of the evaluation ``name``; None for an invalid name."""
     match = _NAME.fullmatch(name)
     return match[1] if match else None
 
 
 def list_evaluations(run: Run) -> list[dict[str, Any]]:
-    """The summaries of a run's evaluations, the newest last; what is damaged is passed over. Raises OSError."""
+    """The summaries of a run's evaluations, the newest last; damaged ones are skipped. Raises OSError."""
     try:
         names = [path.stem for path in run.evaluations.glob("*.json")]
     except FileNotFoundError:
@@ -56,7 +56,7 @@ def _read(run: Run, name: str) -> dict[str, Any] | None:
 
 
 def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
-    """Of each checkpoint its evaluation in the worlds of its own training: that of the most episodes, the newer one of equals."""
+    """For each checkpoint, its evaluation in the worlds of its own training with the most episodes, of equals the newer."""
     found: dict[str, dict[str, Any]] = {}
     for summary in list_evaluations(run):
         before = found.get(summary["checkpoint"])
@@ -66,7 +66,7 @@ def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def keep_for_evaluation(run: Run, checkpoint: str) -> None:
-    """Have retention leave a checkpoint alone that a job is going to evaluate, and no longer the one before. Raises as :func:`evaluation_is_over`."""
+    """Protect the checkpoint of a pending evaluation from retention, in place of an earlier one. Raises as :func:`evaluation_is_over`."""
     refuse_links(run.evaluations, 2)
     write_atomic(run.evaluations / f"{checkpoint}.wanted", b"")
     for path in run.evaluations.glob("*.wanted"):
@@ -75,32 +75,32 @@ def keep_for_evaluation(run: Run, checkpoint: str) -> None:
 
 
 def evaluation_is_over(run: Run, checkpoint: str) -> None:
-    """The other end of :func:`keep_for_evaluation`. Raises DamagedFile where a link leads out of the run, OSError."""
+    """End the protection of :func:`keep_for_evaluation`. Raises DamagedFile if a link leads out of the run, OSError."""
     refuse_links(run.evaluations, 2)
     (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
 
 
 def wanted_checkpoints(run: Run) -> set[str]:
-    """Names of the checkpoints that a job is going to evaluate, as :func:`keep_for_evaluation` was told."""
+    """Names of the checkpoints of pending evaluations, from :func:`keep_for_evaluation`."""
     return {path.stem for path in run.evaluations.glob("*.wanted")}
 
 
 def kept_checkpoints(run: Run) -> set[str]:
-    """Names of the checkpoints that retention leaves alone for their evaluations.
+    """Names of the checkpoints that their evaluations protect from retention.
 
-    Those that are going to be evaluated, and those that have been, unless each evaluation says that its checkpoint need not be kept;
-    of these the best one.
+    These are the checkpoints of pending and finished evaluations, unless every evaluation of a checkpoint says that it need not be
+    kept; of the latter, only the best.
     """
     kept = wanted_checkpoints(run)
     for path in run.evaluations.glob("*.json"):
         summary = _read(run, path.stem) if checkpoint_of(path.stem) else None
-        if summary is None or summary.get("keep", True):  # also where it can't be read: nothing is lost by a guess
+        if summary is None or summary.get("keep", True):  # also if it can't be read: keeping is safe
             kept.add(checkpoint_of(path.stem) or path.stem)
     return kept
 
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """An evaluation as a person reads it."""
+    """An evaluation as lines of text."""
     if _mapping(summary, "race"):
         yield from races.lines(summary)
         return
@@ -157,7 +157,7 @@ def _row(name: str, figures: Mapping[str, Any]) -> str:
 
 
 def _mapping(found: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """What any job may have written there."""
+    """A mapping that any job may have written."""
     value = found.get(key)
     return value if isinstance(value, Mapping) else {}
 

@@ -1,7 +1,7 @@
-"""Writing files so that a reader, after any crash, sees the old content or the new one and nothing between.
+"""Atomic writes: after any crash, a reader sees either the old content or the new one.
 
-The rules are those that also hold on NFS and EFS: new content goes under a hidden name in the same directory, is fsynced and
-closed (the close is where NFS reports a full disk), is renamed, and the directory is fsynced.
+The rules also hold on NFS and EFS: new content goes under a hidden name in the same directory, is fsynced and closed (NFS reports a
+full disk at the close), is renamed, and the directory is fsynced.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pathlib import Path
 from typing import Any
 
 LARGEST_JSON = 16 << 20
-"""Bytes of a JSON file; what is larger was not written by Muster."""
+"""Bytes of a JSON file; Muster writes no larger one."""
 DEEPEST_JSON = 100
 """Levels of lists and objects in a JSON file."""
 
 
 class DamagedFile(ValueError):
-    """A file of the store can't be used; the message is one line: which file, and what is wrong with it."""
+    """A file of the store can't be used; the message names the file and the error in one line."""
 
 
 def sync_file(path: Path) -> None:
-    """Make the content of ``path`` durable. Raises OSError (ENOSPC, EIO) where the volume could not keep it."""
+    """Make the content of ``path`` durable. Raises OSError (ENOSPC, EIO) if the volume could not keep it."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -47,9 +47,9 @@ def sync_directory(path: Path) -> None:
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Replace ``path`` with ``data``, whole or not at all. Raises OSError; a failed write leaves no file behind.
+    """Replace ``path`` with ``data`` atomically. Raises OSError; a failed write leaves no file behind.
 
-    ``mode``: permissions, less the umask, from the first instant; 0o600 for what others must not read.
+    ``mode``: permissions, less the umask, from the first instant; 0o600 for secrets.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     hidden = path.parent / f".{path.name}.{uuid.uuid4().hex[:8]}.tmp"
@@ -71,13 +71,13 @@ def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> None:
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
-    """The JSON object in ``path``; None where there is no such file.
+    """The JSON object in ``path``; None if the file does not exist.
 
     Any job may have written the file: it must be a regular one of at most ``largest`` bytes, nested at most
     :data:`DEEPEST_JSON` levels, with text and numbers that JSON can repeat. NaN and Infinity are read as None.
 
     Raises:
-        DamagedFile: It is none of that.
+        DamagedFile: The file breaks one of these rules.
         OSError: The volume can't be read.
     """
     try:
@@ -90,7 +90,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
 def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     """The JSON object in ``data``, nested at most :data:`DEEPEST_JSON` levels, with text and numbers that JSON can repeat.
 
-    NaN and Infinity are read as None. Raises DamagedFile, with ``name`` in front, where it is anything else.
+    NaN and Infinity are read as None. Raises DamagedFile, with ``name`` in front, for anything else.
     """
     try:
         value = json.loads(data, parse_constant=lambda _: None)
@@ -105,7 +105,7 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
 
 
 def refuse_links(path: Path, levels: int) -> None:
-    """Raise DamagedFile where directory ``path`` is a link, or one of the ``levels - 1`` above it: it leads out of the run."""
+    """Raise DamagedFile if directory ``path``, or one of the ``levels - 1`` above it, is a link, which leads out of the run."""
     for each in (path, *path.parents[: levels - 1]):
         if each.is_symlink():
             raise DamagedFile(
@@ -114,9 +114,9 @@ def refuse_links(path: Path, levels: int) -> None:
 
 
 def open_regular(path: Path, *, write: bool = False) -> BufferedReader | BufferedRandom:
-    """Open a file of the store: any job may have put a link there, which leads out of the store, or a pipe, which never ends.
+    """Open a regular file of the store: a job may have put a link in its place, which leads out of the store, or a pipe, which never ends.
 
-    To read it; with ``write`` also to write it where it exists. Raises DamagedFile where it is no regular file, OSError as
+    It is opened to read; with ``write``, an existing file also to write. Raises DamagedFile if it is not a regular file, OSError as
     ``open`` does.
     """
     access = os.O_RDWR if write else os.O_RDONLY
@@ -141,7 +141,7 @@ def _read_regular(path: Path, largest: int) -> bytes:
 
 
 def _check_plain(value: object, data: bytes) -> None:
-    """Raise ValueError for what can be read, but not written again as JSON."""
+    """Raise ValueError for a value that can be read, but not written again as JSON."""
     level = [value]
     for _ in range(DEEPEST_JSON):
         if any(isinstance(each, float) and not math.isfinite(each) for each in level):

@@ -1,4 +1,4 @@
-"""Where everything lies on the shared volume (``<store>/runs/<run>/…``)."""
+"""The layout of the shared volume (``<store>/runs/<run>/…``)."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ FORMAT = 1
 """Version of the layout; a store with a newer one is refused."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-"""What a run may be called: it becomes a directory name."""
+"""Valid names of runs: a name becomes a directory."""
 
 LARGEST_DESCRIPTION = 128 << 10
-"""Bytes of ``run.json`` and of an evaluation: what the API shows of a run."""
+"""Bytes of ``run.json`` and of an evaluation, which the API returns."""
 
 
 class StoreError(Exception):
-    """The store can't be used; the message says which path, why, and what to do."""
+    """The store can't be used; the message names the path, the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training history, continued by one or more jobs. Paths only; nothing is created by asking for them."""
+    """One training history, continued by one or more jobs. It has paths only, and creates nothing on access."""
 
     path: Path
 
@@ -52,7 +52,7 @@ class Run:
         return self.path / "parent"
 
     def teacher(self, name: str) -> Run:
-        """Where the run holds a copy of the weights of run ``name``, which its policy imitates; they lie there as in a run."""
+        """The copy of the weights of run ``name``, the teacher of this run's policy, in the layout of a run."""
         return Run(self.path / "teachers" / name)
 
     @property
@@ -89,7 +89,7 @@ class Run:
         return self.path / "outcomes" / job / str(attempt) / f"node-{node}.json"
 
     def check_links(self) -> None:
-        """Raise DamagedFile where the run, or a directory of it that is read or written, is a link: it leads out of the store."""
+        """Raise DamagedFile if the run, or a directory of it that Muster uses, is a link, which leads out of the store."""
         for name in (
             "checkpoints",
             "metrics",
@@ -106,9 +106,9 @@ class Run:
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:
-        """The content of ``run.json`` (spec, code versions, creation time); None where the run does not exist.
+        """The content of ``run.json`` (spec, code versions, creation time); None if the run does not exist.
 
-        Raises DamagedFile where it is no such description or :meth:`check_links` refuses, OSError where the volume can't be read.
+        Raises DamagedFile if it is malformed or :meth:`check_links` refuses, OSError if the volume can't be read.
         """
         self.check_links()
         path = self.path / "run.json"
@@ -122,7 +122,7 @@ class Run:
         return found
 
     def is_missing(self) -> bool:
-        """Whether the store can be read and has no such run; False where that is not certain, as while the volume is away."""
+        """Whether the store can be read and lacks the run; False if that is uncertain, for example while the volume is away."""
         try:
             os.lstat(self.path / "run.json")
         except FileNotFoundError:
@@ -132,7 +132,7 @@ class Run:
         return False
 
     def create(self, description: dict[str, Any]) -> None:
-        """Write ``run.json`` once; a run that exists keeps the one it has. Raises as :meth:`check_links`, OSError."""
+        """Write ``run.json`` once; an existing run keeps its own. Raises as :meth:`check_links`, OSError."""
         self.check_links()
         if not (self.path / "run.json").exists():
             write_json(self.path / "run.json", description)
@@ -148,7 +148,7 @@ class Store:
         object.__setattr__(self, "path", Path(path).expanduser().absolute())
 
     def open(self) -> Store:
-        """Create the layout where it is missing and prove that it can be written.
+        """Create a missing layout and check that it can be written.
 
         Raises StoreError for a path that can't be created or written, or that holds a newer format.
         """
@@ -192,7 +192,7 @@ class Store:
         return self.path / "leagues"
 
     def runs(self, after: str = "", most: int | None = None) -> list[Run]:
-        """The runs that exist, by name: those behind ``after``, at most so many."""
+        """The existing runs, by name: those after ``after``, at most ``most``."""
         try:
             entries = sorted(entry.name for entry in os.scandir(self.path / "runs") if entry.name > after)
         except FileNotFoundError:
@@ -202,7 +202,7 @@ class Store:
 
 
 def names_in(directory: Path) -> list[str]:
-    """What bears a valid name in a directory of the store, sorted; nothing where the directory does not exist.
+    """The valid names in a directory of the store, sorted; none if the directory does not exist.
 
     Raises:
         DamagedFile: The directory is a link.

@@ -1,10 +1,10 @@
-"""Leagues of the racer: ``leagues/<name>/``, races of registered models by one set of rules; nothing of one is ever changed.
+"""Leagues of the racer: ``leagues/<name>/``, races of registered models by one set of rules; a league is immutable.
 
 ``definition/`` has the rules (``league.json``), ``entries/<number>/`` a model, its evaluation and its race (``entry.json``),
-``disqualified/<number>/`` why an entry does not count (``ruling.json``); each with a manifest of digests (:mod:`shared_store.bundles`).
-Entries count up from 1 without a gap: one that is missing was deleted. Each appears by a rename that fails where there is one of its
-number already, so several who enter at once get several numbers. The digests show damage and edits; they are no signatures: who may
-write the store can write a new entry whole, and a race that is run again shows that.
+``disqualified/<number>/`` the reason why an entry does not count (``ruling.json``); each has a manifest of digests
+(:mod:`shared_store.bundles`). Entries count up from 1 without a gap: a missing one was deleted. Each appears by a rename that fails if
+its number exists, so simultaneous entries get different numbers. The digests show damage and edits, but they are not signatures:
+anyone who can write the store can forge a whole entry; running its race again exposes that.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ CAR: Mapping[str, Any] = {
     "stuck_steps": 15,
     "put_back": 1.0,
 }
-"""Settings of the tasks ``Racer…`` that every car of a new league has, whatever it was trained with."""
+"""Settings of the tasks ``Racer…`` for every car of a new league, whatever its training used."""
 _NUMBER = re.compile(r"[1-9][0-9]{0,8}")
 
 
 class LeagueError(Exception):
-    """There is no such league or entry, it is altered, or an entry can't be made; one line."""
+    """A league or entry does not exist or was altered, or an entry can't be made; one line."""
 
 
 class UnknownLeague(LeagueError):
-    """There is no league, or no entry, of that name."""
+    """The league or entry does not exist."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How a race is driven, as the summary of one has it.
+    """The rules of a race, as in its summary.
 
     Attributes:
-        laps: Each is a trial from the start line.
+        laps: Number of laps; each is a trial from the start line.
         continuous: Whether a car that leaves the road is put back and goes on, with a penalty.
-        off_track_penalty: Added to the lap's time for leaving the road [s].
-        crash_penalty: Added for touching an obstacle [s].
-        max_resets: How often a car is put back in one lap.
-        seconds: Simulated time that a lap may take [s].
-        ranking: What counts.
+        off_track_penalty: Time added to a lap for leaving the road [s].
+        crash_penalty: Time added for touching an obstacle [s].
+        max_resets: Number of times that a car is put back in one lap.
+        seconds: Limit of a lap's simulated time [s].
+        ranking: The ranking criterion.
     """
 
     laps: int = 3
@@ -80,17 +80,17 @@ class League:
     """The definition of a league.
 
     Attributes:
-        name: What it is called.
-        track: Names of the tracks; of several, lap n is driven on number (n - 1) modulo their count.
-        rules: How a race is driven.
+        name: Its name.
+        track: Names of the tracks; with several, lap n is driven on number (n - 1) modulo their count.
+        rules: The rules of its races.
         seed: Of every race.
         owner: The key or the user that created it.
-        created: When [Unix s].
-        opens: When the first race may be started [Unix s]; at once where None.
-        closes: From when on none is [Unix s]; never where None.
+        created: Time of creation [Unix s].
+        opens: Time from which races may start [Unix s]; None: at once.
+        closes: Time from which no race may start [Unix s]; None: never.
         most_entries: Of each key or user.
-        track_digests: Of those tracks that lie in the store.
-        car: Settings of the task that every car has.
+        track_digests: Of the tracks in the store.
+        car: Settings of the task for every car.
     """
 
     name: str
@@ -106,7 +106,7 @@ class League:
     car: Mapping[str, Any] = field(default_factory=lambda: dict(CAR))
 
     def closed(self, when: float) -> str:
-        """Why no race may be started at ``when`` [Unix s]; empty where one may."""
+        """The reason why no race may start at ``when`` [Unix s]; empty if one may."""
         if self.opens is not None and when < self.opens:
             return f"league {self.name} opens at {moment(self.opens)}"
         if self.closes is not None and when >= self.closes:
@@ -114,7 +114,7 @@ class League:
         return ""
 
     def misfit(self, summary: Mapping[str, Any]) -> str:
-        """What an evaluation's summary has that is not of this league; empty where it is of its rules, tracks, seed and car."""
+        """The first mismatch of an evaluation's summary with this league's rules, tracks, seed and car; empty without any."""
         race = summary.get("race")
         if not isinstance(race, Mapping):
             return "it is no race"
@@ -133,13 +133,13 @@ class League:
         return ""
 
     def section(self) -> dict[str, Any]:
-        """What the section ``race`` of a job says of a race in this league, beside the run."""
+        """The section ``race`` of a job for a race in this league, without the run."""
         rules = {key: value for key, value in asdict(self.rules).items() if key not in ("laps", "ranking")}
         places = {"trials": self.rules.laps, "seed": self.seed, "track": list(self.track), "config": dict(self.car)}
         return {**places, **rules}
 
     def check_tracks(self, store: Store) -> None:
-        """Raise LeagueError where a track of the store is gone, damaged, or another one under its name."""
+        """Raise LeagueError if a track of the store is missing, damaged or was replaced."""
         for name, digest in self.track_digests.items():
             if digest_of_track(store, name) != digest:
                 raise LeagueError(f"league {self.name}: track {name} is another one than when the league was created")
@@ -157,7 +157,7 @@ class StoredLeague:
         return self.path.name
 
     def definition(self) -> League:
-        """Its rules, as they were sealed. Raises LeagueError where anything of them is altered or missing."""
+        """Its sealed rules. Raises LeagueError if any part of them is altered or missing."""
         document = self._sealed(self.path / "definition", "league.json", f"league {self.name}")[0]
         try:
             found: League = parse(League, document, f"league {self.name}")
@@ -172,7 +172,7 @@ class StoredLeague:
         return self._sealed(self.path / "definition", "league.json", f"league {self.name}")[1]
 
     def numbers(self) -> range:
-        """Of all entries that were made. Raises LeagueError."""
+        """Numbers of all entries. Raises LeagueError."""
         try:
             refuse_links(self.path / "entries", 3)
             there = [int(name) for name in os.listdir(self.path / "entries") if _NUMBER.fullmatch(name)]
@@ -181,7 +181,7 @@ class StoredLeague:
         return range(1, max(there, default=0) + 1)
 
     def entry(self, number: int) -> dict[str, Any]:
-        """What an entry holds, with its ``digest``, as it was sealed. Raises UnknownLeague, LeagueError for one that is altered."""
+        """The sealed content of an entry, with its ``digest``. Raises UnknownLeague; LeagueError if it is altered."""
         self._check_number(number)
         what = f"league {self.name}: entry {number}"
         if not os.path.lexists(self.path / "entries" / str(number)):
@@ -206,7 +206,7 @@ class StoredLeague:
         return {**found, "digest": digest}
 
     def ruling(self, number: int) -> dict[str, Any] | None:
-        """Why an entry is disqualified; None where it is not. An altered ruling still disqualifies, and says that it is altered."""
+        """The ruling that disqualifies an entry; None without one. An altered ruling still disqualifies, and says that it is altered."""
         path = self.path / "disqualified" / str(number)
         if not os.path.lexists(path):
             return None
@@ -216,7 +216,7 @@ class StoredLeague:
             return {"reason": str(error)}
 
     def contenders(self) -> list[Contender]:
-        """All entries as the table needs them; those that are altered say so. Raises LeagueError where the league itself is."""
+        """All entries for the table, with a note in altered ones. Raises LeagueError if the league itself is altered."""
         found = []
         for number in self.numbers():
             ruling = self.ruling(number)
@@ -231,7 +231,7 @@ class StoredLeague:
         return found
 
     def enter(self, entry: Mapping[str, Any]) -> dict[str, Any]:
-        """Make the next entry, for good.
+        """Make the next entry, permanently.
 
         Args:
             entry: ``racer``, ``owner``, ``model`` (name, version, digest), ``evaluation`` (name, job, run) and ``race``.
@@ -240,8 +240,8 @@ class StoredLeague:
             The entry, as :meth:`entry`.
 
         Raises:
-            LeagueError: The owner has as many entries as may be, the racer's name is another owner's, or the evaluation was
-                entered already.
+            LeagueError: The owner has reached the limit of entries, the racer's name is another owner's, or the evaluation has
+                already been entered.
             OSError: The volume is full or gone.
         """
         digest = self.digest()
@@ -254,7 +254,7 @@ class StoredLeague:
                 return self.entry(number)
 
     def disqualify(self, number: int, reason: str, by: str) -> None:
-        """Say beside an entry, for good, that it does not count. Raises LeagueError where that is said already, OSError."""
+        """Disqualify an entry permanently, in a file beside it. Raises LeagueError if it is already disqualified, OSError."""
         self._check_number(number)
         try:
             ruling = {"entry": number, "reason": reason, "by": by, "time": time.time()}
@@ -263,7 +263,7 @@ class StoredLeague:
             raise LeagueError(f"league {self.name}: entry {number} is disqualified already") from None
 
     def admit(self, owner: str, racer: str, evaluation: Mapping[str, Any] | None = None) -> None:
-        """Raise LeagueError where ``owner`` may make no further entry, not as ``racer``, or not with this evaluation."""
+        """Raise LeagueError if ``owner`` may not make a further entry, not as ``racer``, or not with this evaluation."""
         own, most = 0, self.definition().most_entries
         for number in self.numbers():
             try:
@@ -311,7 +311,7 @@ def names(store: Store) -> list[str]:
 
 
 def find(store: Store, name: str) -> StoredLeague:
-    """The league of that name. Raises UnknownLeague with the nearest one where there is none."""
+    """The league of that name. Raises UnknownLeague with the nearest name."""
     known = names(store)
     if name not in known:
         hint = nearest(name, known, "" if known else "none was created yet")
@@ -320,7 +320,7 @@ def find(store: Store, name: str) -> StoredLeague:
 
 
 def create(store: Store, league: League) -> StoredLeague:
-    """Create a league, for good. Raises LeagueError where no league can be called so, or one is; OSError."""
+    """Create a league, permanently. Raises LeagueError for an invalid name or an existing league; OSError."""
     if not NAME.fullmatch(league.name):
         raise LeagueError(
             f"league name {league.name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a "
@@ -345,7 +345,7 @@ def create(store: Store, league: League) -> StoredLeague:
 
 
 def digest_of_track(store: Store, name: str) -> str | None:
-    """Digest of a track of the store; None for a preset and for one that is drawn from a seed. Raises LeagueError: there is none."""
+    """Digest of a track of the store; None for a preset and for one drawn from a seed. Raises LeagueError if it does not exist."""
     if tracks.is_made(name):
         return None
     try:
@@ -362,7 +362,7 @@ def _same(value: Any, other: Any) -> bool:
 
 
 def moment(seconds: float) -> str:
-    """A time [Unix s] as people read it, in UTC."""
+    """A time [Unix s] as text, in UTC."""
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(seconds))
 
 

@@ -1,9 +1,9 @@
-"""The files of one node's log: a head, and behind it a tail of segments; at the limit the oldest are deleted.
+"""The files of one node's log: a head, followed by a tail of segments; at the limit, the oldest segments are deleted.
 
-``node-0.log`` is the head, the first half of the limit. What follows goes into ``node-0.log.<start>.<lines>``, one file after
-the other: the position at which the file begins, and the number of lines between the head and it. Positions are bytes of the log
-as if nothing had been left out, so a reader's position stays valid whatever is deleted. Files are only created, appended to and
-deleted, by one writer, which is what works on NFS.
+``node-0.log`` is the head, the first half of the limit. The rest goes into ``node-0.log.<start>.<lines>``, one file after
+the other: the position at which the file begins, and the number of lines between the head and it. Positions count all bytes of the
+log, including deleted ones, so a reader's position stays valid. Files are only created, appended to and deleted, by one writer,
+which is safe on NFS.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 from shared_store.files import DamagedFile, open_regular, refuse_links
 
 LIMIT = 1 << 30
-"""Bytes of a node's log in one attempt that are kept where nothing else is asked for."""
+"""Bytes of a node's log in one attempt to keep, by default."""
 LEAST_LIMIT = 1 << 20
 """Bytes below which a limit is refused."""
 
@@ -30,11 +30,11 @@ _LEVELS = 4
 _SEGMENTS = 16
 """Files of this fraction of the limit make up the tail; half of that many are kept."""
 _IDENTITY = 64
-"""Bytes of a file's beginning that tell it from another one."""
+"""Bytes of a file's beginning that identify it."""
 _CHECK = 1 << 20
 """Bytes between two looks at the volume's free space."""
 _RESERVE = 256 << 20
-"""Bytes of a volume that no log takes; of a small volume a fiftieth."""
+"""Bytes of a volume that logs leave free; on a small volume, a fiftieth."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -49,17 +49,17 @@ class Segment(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """What was read of a log."""
+    """A part of a log that was read."""
 
     start: int
-    """Position of the first byte of ``data``; beyond the one asked for where something was left out."""
+    """Position of the first byte of ``data``; beyond the requested one if bytes were left out."""
     data: bytes
     more: bool
-    """Whether there may be more behind it already."""
+    """Whether more may follow already."""
     left_out: tuple[int | None, int] | None = None
-    """Lines (None: not known) and bytes that were deleted before the reader came to them."""
+    """Lines (None: unknown) and bytes that were deleted before the reader reached them."""
     identity: bytes = b""
-    """How the file begins: with a line of its own time, so another file of the same name begins in another way."""
+    """The beginning of the file: a line with its time, so another file of the same name begins differently."""
     replaced: bool = False
     """The file was truncated or replaced: ``data`` is from its new beginning."""
 
@@ -67,7 +67,7 @@ class Chunk(NamedTuple):
 def log_segments(directory: Path) -> dict[str, list[Segment]]:
     """The regular files of every log in ``directory`` by the name of its head, in order.
 
-    Empty where there is no such directory, or where a link leads to it.
+    Empty if the directory does not exist or is a link.
     """
     found: dict[str, list[Segment]] = {}
     try:
@@ -87,25 +87,25 @@ def log_segments(directory: Path) -> dict[str, list[Segment]]:
 
 
 def segments_of(path: Path) -> list[Segment]:
-    """The files of the log whose head is ``path``, in order; empty where it has none yet."""
+    """The files of the log whose head is ``path``, in order; empty if it has none yet."""
     return log_segments(path.parent).get(path.name, [])
 
 
 def read_log(
     segments: Sequence[Segment], position: int, most: int, identity: bytes = b"", inside: bool = False
 ) -> Chunk:
-    """Up to ``most`` bytes of one file, from ``position`` on. Raises OSError, also where the file was deleted meanwhile.
+    """Up to ``most`` bytes of one file, from ``position`` on. Raises OSError, also if the file was deleted meanwhile.
 
     Args:
         segments: The log's files, not empty.
-        position: The end of the chunk before; 0 where there was none.
+        position: The end of the previous chunk; 0 at first.
         most: Bytes.
-        identity: That of the chunk before; empty where it is not known.
-        inside: Whether ``position`` is inside a line, not where one begins.
+        identity: Identity of the previous chunk; empty if unknown.
+        inside: Whether ``position`` is inside a line rather than at its beginning.
     """
     place = max((place for place, segment in enumerate(segments) if segment.start <= position), default=0)
     start, _, path = segments[place]
-    with open_regular(path) as file:  # anew each time: what a network file system keeps honest
+    with open_regular(path) as file:  # reopened each time, so that a network file system shows the current state
         end, last = start + os.fstat(file.fileno()).st_size, place == len(segments) - 1
         if position >= end and not last:
             start, lines, _ = segments[place + 1]
@@ -128,7 +128,7 @@ def read_log(
 
 
 def left_out(lines: int | None, size: int, why: str) -> str:
-    """What a reader gets in place of lines that are gone.
+    """The text that replaces deleted lines for a reader.
 
     >>> left_out(123456, 1_200_000_000, "the log reached its limit")
     '… 123,456 lines (1.2 GB) left out: the log reached its limit'
@@ -145,7 +145,7 @@ def left_out(lines: int | None, size: int, why: str) -> str:
 
 
 def count_lines(path: Path) -> int:
-    """Newlines in a file; 0 where there is none. Reads it in blocks. Raises OSError."""
+    """Newlines in a file; 0 if it does not exist. Reads it in blocks. Raises OSError."""
     try:
         with open(path, "rb") as file:
             return sum(block.count(b"\n") for block in iter(lambda: file.read(_CHECK), b""))
@@ -154,17 +154,17 @@ def count_lines(path: Path) -> int:
 
 
 class LogWriter:
-    """Appends whole lines to a node's log and keeps it within its limit. One writer a log."""
+    """Appends whole lines to a node's log and keeps it within its limit. One writer per log."""
 
     def __init__(self, path: Path, limit: int = LIMIT) -> None:
-        """Go on with the log whose head is ``path``, or begin it. Raises OSError, DamagedFile where a directory on the way is a link.
+        """Continue or begin the log whose head is ``path``. Raises OSError; DamagedFile if a directory on the way is a link.
 
-        ``limit``: bytes to keep: half of them from the log's beginning, half from its end. Less where the volume is nearly full: no
-        log takes more than a quarter of what it finds free, so that it has a tail, and its end is kept, whatever comes.
+        ``limit``: bytes to keep, half of them from the log's beginning, half from its end. On a nearly full volume it is less: a log
+        takes at most a quarter of the free space, so that it has a tail and its end is always kept.
         """
         self.path = path
         self.error: OSError | None = None
-        """Why the last :meth:`append` did not write everything."""
+        """The reason why the last :meth:`append` did not write everything."""
         refuse_links(path.parent, _LEVELS)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._segments = segments_of(path) or [Segment(0, 0, path)]
@@ -178,14 +178,14 @@ class LogWriter:
 
     @property
     def lines(self) -> int:
-        """Lines that were ever written. Reads the head. Raises OSError."""
+        """Number of all lines ever written. Reads the head. Raises OSError."""
         return count_lines(self.path) + self._lines
 
     def append(self, data: bytes) -> int:
-        """Append whole lines; returns how many bytes of them are in the log, which are whole lines, too.
+        """Append whole lines; returns how many of their bytes are in the log, also as whole lines.
 
-        Fewer than all where the volume has no room even after the oldest segments were deleted, or can't be written: then
-        :attr:`error` says why. The last 2 % of a volume (at most 256 MiB) are left to checkpoints, outcomes and the database.
+        It returns fewer if the volume is full even after the oldest segments were deleted, or can't be written; then
+        :attr:`error` says why. The last 2 % of a volume (at most 256 MiB) are reserved for checkpoints, outcomes and the database.
         """
         self.error, written = None, 0
         while written < len(data):
@@ -209,14 +209,14 @@ class LogWriter:
         return written
 
     def sync(self) -> None:
-        """Make what was written durable. Raises OSError."""
+        """Make the written lines durable. Raises OSError."""
         os.fsync(self._file)
 
     def close(self) -> None:
         os.close(self._file)
 
     def _piece(self, data: bytes, start: int) -> bytes:
-        """The lines that still belong into the current file; empty where it is full."""
+        """The lines that still fit into the current file; empty if it is full."""
         first = self._segments[-1].start == 0
         room = (self.limit // 2 if first else self.limit // _SEGMENTS) - self._size
         most = min(room, _CHECK)
@@ -242,9 +242,9 @@ class LogWriter:
             self._lines += data.count(b"\n")
 
     def _mend(self, known: bool = True) -> int:
-        """Take back half a line at the end of the file; returns the bytes of whole lines that the last write still added.
+        """Remove a partial line at the end of the file; returns the bytes of whole lines that the last write added.
 
-        ``known``: the file ended with a whole line before that write.
+        ``known``: whether the file ended with a whole line before that write.
         """
         try:
             size = os.fstat(self._file).st_size
@@ -273,7 +273,7 @@ class LogWriter:
         self._drop_oldest(0, self.limit // 2 - self.limit // _SEGMENTS)
 
     def _drop_oldest(self, count: int, most: int | None = None) -> bool:
-        """Delete that many segments of the tail, and more while it holds more than ``most`` bytes; True where one went."""
+        """Delete that many segments of the tail, and more while it holds more than ``most`` bytes; True if any was deleted."""
         dropped = False
         while len(self._segments) > 2:
             _, oldest, *_ = self._segments
@@ -287,7 +287,7 @@ class LogWriter:
         return dropped
 
     def _check_room(self, size: int) -> None:
-        """Raises OSError (ENOSPC) where the volume is nearly full: other things need the rest more."""
+        """Raises OSError (ENOSPC) on a nearly full volume, whose rest is reserved for other files."""
         self._unchecked += size
         if self._unchecked < self._interval:
             return
@@ -298,6 +298,6 @@ class LogWriter:
         self._interval = min(_CHECK, reserve // 4)
 
     def _room(self) -> tuple[int, int]:
-        """Bytes that are free on the volume, and how many of them are not for logs."""
+        """Free bytes on the volume, and how many of them are reserved."""
         volume = os.fstatvfs(self._file)
         return volume.f_bavail * volume.f_frsize, min(_RESERVE, volume.f_blocks * volume.f_frsize // 50)

@@ -1,7 +1,6 @@
-"""Logs: one log a node and attempt, one writer a log, one line ``<RFC 3339 UTC, µs> <rank or -> <o|e> <text>``.
+"""Logs: one log per node and attempt, one writer per log, lines ``<RFC 3339 UTC, µs> <rank or -> <o|e> <text>``.
 
-Followers poll sizes and open the files (:mod:`.log_files`) anew each round, which is what works on NFS (no inotify, no kept
-handles).
+Followers poll sizes and reopen the files (:mod:`.log_files`) each round, which is safe on NFS (no inotify, no open handles).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
 _HEAD = re.compile(r"node-([0-9]{1,9})\.log")
 _ATTEMPT = re.compile(r"[0-9]{1,9}")
 _CHUNK = 1 << 20
-"""Bytes that a poll reads of a log; of the logs of many nodes less."""
+"""Bytes that a poll reads of a log; fewer with many nodes."""
 _LEAST_CHUNK = 256 << 10
 """More than the longest line."""
 _MOST = 8 << 20
@@ -38,7 +37,7 @@ REPLACED = "the log was truncated or replaced; following goes on from its new be
 END_LINE = "node {node} ended: {reason}"
 """The supervisor's last line: no output of the job, so CloudWatch Logs does not show it."""
 OUTCOME_LINE = "muster-outcome "
-"""How the last line begins that a supervisor prints where its log leaves the node as text (AWS); the outcome follows as JSON."""
+"""Beginning of a supervisor's last line where its log leaves the node as text (AWS); the outcome follows as JSON."""
 
 
 class LogLine(NamedTuple):
@@ -54,7 +53,7 @@ class LogLine(NamedTuple):
     """``o`` standard output, ``e`` standard error."""
     text: str
     position: int = 0
-    """Where the log goes on after it (:mod:`.log_files`)."""
+    """Position in the log after this line (:mod:`.log_files`)."""
 
     def to_json(self) -> str:
         """One line of JSON, without its newline; printable ASCII only."""
@@ -86,7 +85,7 @@ def _escaped(text: str) -> str:
 
 
 def parse_line(line: str, attempt: int, node: int) -> LogLine | None:
-    """The line as written by :func:`format_line`; None for one that is not."""
+    """The line as written by :func:`format_line`; None for any other text."""
     match = _LINE.fullmatch(line)
     if not match:
         return None
@@ -96,27 +95,27 @@ def parse_line(line: str, attempt: int, node: int) -> LogLine | None:
 
 @dataclass
 class _Source:
-    """What a follower knows of one log."""
+    """A follower's state of one log."""
 
     attempt: int
     node: int
     position: int
-    """Up to which it was read."""
+    """Position up to which it was read."""
     given: int = 0
-    """Up to which it was given out."""
+    """Position up to which lines were returned."""
     identity: bytes = b""
-    """How the file begins that was read last."""
+    """Beginning of the file that was read last."""
     inside: bool = False
-    """Whether ``position`` is inside a line that is longer than any of ours."""
+    """Whether ``position`` is inside a line that is longer than any line of Muster's."""
     newest: str = ""
-    """The greatest time so far. Lines are merged by it: a clock that is set back does not move a line before an earlier one."""
+    """The greatest time so far. Lines are merged by it, so a clock that is set back does not reorder them."""
     read: list[tuple[str, LogLine]] = field(default_factory=list)
-    """Lines that were read and not given out yet, with the time to merge by."""
+    """Lines that were read but not returned yet, with their times for merging."""
     more: bool = False
-    """Whether there may be more to read already."""
+    """Whether more may be ready to read."""
 
     def fill(self, segments: Sequence[Segment], most: int, rank: int | None) -> None:
-        """Read on, where everything that was read was given out."""
+        """Read on if every line so far has been returned."""
         if self.read:
             return
         try:
@@ -145,13 +144,13 @@ class _Source:
         self.position, self.identity = chunk.start + whole, chunk.identity
 
     def _explain(self, chunk: Chunk, stamp: str) -> None:
-        """Say what the reader can't have, in a line of its own."""
+        """Add a line that says which part is missing."""
         text = REPLACED if chunk.replaced else left_out(*chunk.left_out, LIMIT_REACHED) if chunk.left_out else ""
         self.newest = self.newest or stamp
         self.read.append((self.newest, LogLine(self.newest, self.attempt, self.node, None, "e", text, chunk.start)))
 
     def take(self, until: str | None) -> list[tuple[str, LogLine]]:
-        """The lines up to that time; all where it is None."""
+        """The lines up to that time; None: all."""
         count = len(self.read) if until is None else bisect_right(self.read, until, key=itemgetter(0))
         taken, self.read = self.read[:count], self.read[count:]
         self.given = taken[-1][1].position if taken and self.read else self.given if self.read else self.position
@@ -162,9 +161,9 @@ class _Source:
 class LogFollower:
     """Reads a job's log lines, all nodes and attempts merged by time, each line once.
 
-    Lines of one node keep the order in which they were written. ``offsets`` (bytes that were given out of each log) is the
-    follower's whole state: a new one with the same offsets goes on where the old one stopped. ``node`` and ``rank`` select.
-    What was deleted before the follower came to it, and a log that was truncated or replaced, is said in a line (rank None).
+    Lines of one node keep their order. ``offsets`` (bytes returned of each log) is the follower's whole state: a new one with the
+    same offsets continues where the old one stopped. ``node`` and ``rank`` select. A line (rank None) reports deleted lines that the
+    follower did not reach in time, and logs that were truncated or replaced.
     """
 
     run: Run
@@ -174,11 +173,11 @@ class LogFollower:
     attempt: int | None = None
     offsets: dict[str, int] = field(default_factory=dict)
     behind: bool = False
-    """Whether there was more than the last poll gave out."""
+    """Whether there was more than the last poll returned."""
     _sources: dict[str, _Source] = field(default_factory=dict)
 
     def poll(self) -> list[LogLine]:
-        """The whole lines that were added since the last call, or the first few MiB of them, in the order of their times."""
+        """The whole lines since the last call, or the first few MiB of them, in the order of their times."""
         lines: list[LogLine] = []
         self.behind = False
         for attempt in [self.attempt] if self.attempt is not None else _attempts(self.run, self.job):
@@ -186,7 +185,7 @@ class LogFollower:
             most = min(_CHUNK, max(_LEAST_CHUNK, _MOST // max(1, len(logs))))
             for source, segments in logs:
                 source.fill(segments, most, self.rank)
-            # what was not read yet of one log may be older than what was read of another
+            # unread lines of one log may be older than read lines of another
             until = min((source.newest for source, _ in logs if source.more), default=None)
             taken = []
             for source, _ in logs:
@@ -200,14 +199,14 @@ class LogFollower:
         return lines
 
     def drain(self) -> Iterator[LogLine]:
-        """All that is there now."""
+        """All lines that exist now."""
         for lines in self.batches():
             yield from lines
 
     def batches(self) -> Iterator[list[LogLine]]:
         """:meth:`drain`, many lines at a time."""
         self.behind = True
-        while self.behind:  # a poll may pass over 1 MiB of another rank's lines and return none
+        while self.behind:  # a poll may skip 1 MiB of another rank's lines and return none
             if lines := self.poll():
                 yield lines
 
@@ -227,7 +226,7 @@ class LogFollower:
 
 
 def _attempts(run: Run, job: str) -> list[int]:
-    """Those that have a log. What a job put in place of a directory, or beside them, is none. Raises OSError."""
+    """The attempts that have a log. Other files, which a job may have put there, are ignored. Raises OSError."""
     directory = run.path / "logs" / job
     try:
         refuse_links(directory, 3)

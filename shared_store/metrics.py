@@ -1,7 +1,7 @@
-"""The numbers of a run, one JSON line an iteration, one file an epoch.
+"""The metrics of a run, one JSON line per iteration, one file per epoch.
 
-An attempt that resumes from iteration k supersedes what earlier attempts wrote after k, so that a run has one history: no
-iteration twice, none from a past that was given up.
+An attempt that resumes from iteration k supersedes the later records of earlier attempts, so that a run has one history: no
+iteration twice, none from an abandoned past.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ _NAME = re.compile(r"metrics-e([0-9]{1,18})\.jsonl")
 _BLOCK = 16 << 10
 """Bytes between two marks."""
 _LONGEST = 64 << 10
-"""Bytes of a line; a longer one is no record, and is passed over."""
+"""Bytes of a line; a longer one is not a record, and is skipped."""
 _LOOK = 64 << 20
-"""Bytes of new lines that one look at a history takes up; the next look goes on behind them."""
+"""Bytes of new lines that one look at a history reads; the next look continues after them."""
 _IDENTITY = 256
-"""Bytes of a file's beginning that tell it from another one."""
+"""Bytes of a file's beginning that identify it."""
 
 
 class MetricsWriter:
-    """Appends the metrics of one attempt; one writer a file, on the main node."""
+    """Appends the metrics of one attempt; one writer per file, on the main node."""
 
     def __init__(self, run: Run, epoch: int, resumed_from: int) -> None:
-        """Open the file of ``epoch``; ``resumed_from`` is the number of iterations already done (0 for a new run)."""
+        """Open the file of ``epoch``; ``resumed_from`` is the number of finished iterations (0 for a new run)."""
         run.metrics.mkdir(parents=True, exist_ok=True)
         self.path = run.metrics / f"metrics-e{epoch}.jsonl"
         self._file = open(self.path, "a", buffering=1)  # noqa: SIM115 - closed by close()
         self.write({"resumed_from": resumed_from})
 
     def write(self, record: Mapping[str, Any]) -> None:
-        """Append one record; ``iteration`` counts from 1. A value that is not finite must be given as None."""
+        """Append one record; ``iteration`` counts from 1. Non-finite values must be given as None."""
         self._file.write(json.dumps(record, allow_nan=False) + "\n")
 
     def close(self) -> None:
@@ -79,9 +79,9 @@ def scalars(record: Mapping[str, Any]) -> dict[str, float]:
 
 
 def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:
-    """The run's history: one record an iteration, in order, for iterations greater than ``after``. Raises OSError.
+    """The run's history: one record per iteration, in order, for iterations greater than ``after``. Raises OSError.
 
-    For an iteration seen twice the later epoch counts. A last line that a crash cut short is passed over.
+    If an iteration has several records, the later epoch's counts. A last line that a crash cut short is skipped.
     """
     history = MetricsHistory(run)
     found = history.after(after)
@@ -92,7 +92,7 @@ def read_metrics(run: Run, after: int = 0) -> list[dict[str, Any]]:
 
 @lru_cache(maxsize=256)
 def history_of(run: Run) -> MetricsHistory:
-    """The run's history, with what earlier looks found: for callers that ask again and again."""
+    """The run's history, cached between calls, for callers that poll."""
     return MetricsHistory(run)
 
 
@@ -101,27 +101,27 @@ class _Section:
     """Records of one file whose iterations rise."""
 
     resumed_from: int | None
-    """What came before it counts up to this iteration; None: all of it."""
+    """Earlier records count up to this iteration; None: all of them."""
     end: int
     """Byte after its last record."""
     last: int = 0
     """Its last iteration."""
     marks: list[tuple[int, int]] = field(default_factory=list)
-    """Of a record every 16 KiB: iteration and byte at which it begins."""
+    """Iteration and first byte of a record every 16 KiB."""
 
 
 @dataclass
 class _File:
     path: Path
     end: int = 0
-    """Bytes of whole lines that are known."""
+    """Bytes of the whole lines read so far."""
     inside: bool = False
     """Whether ``end`` is inside a line that is too long."""
     identity: bytes = b""
     sections: list[_Section] = field(default_factory=list)
 
     def refresh(self, most: int) -> int:
-        """Take up what was added, up to about ``most`` bytes of it; returns how many."""
+        """Read the added lines, up to about ``most`` bytes; returns how many."""
         with open_regular(self.path) as file:
             head = file.read(_IDENTITY)
             if os.fstat(file.fileno()).st_size < self.end or not head.startswith(self.identity):
@@ -163,19 +163,19 @@ class _File:
 
 
 class MetricsHistory:
-    """A run's history, read from where it was read before. Safe to use from many threads."""
+    """A run's history, read incrementally. Thread-safe."""
 
     def __init__(self, run: Run) -> None:
         self.behind = False
-        """Whether there is more than the last look took up."""
+        """Whether there is more than the last look read."""
         self._run = run
         self._lock = threading.Lock()
         self._known: dict[Path, _File] = {}
 
     def after(self, iteration: int = 0, most: int | None = None) -> list[dict[str, Any]]:
-        """As :func:`read_metrics`, the first ``most`` of them; reads 16 KiB and what is asked for. Raises OSError.
+        """As :func:`read_metrics`, the first ``most`` records; reads 16 KiB plus these. Raises OSError.
 
-        What was added since the last look is taken up in parts: :attr:`behind`.
+        New lines are read in parts, see :attr:`behind`.
         """
         found: dict[int, dict[str, Any]] = {}
         with self._lock:
@@ -189,7 +189,7 @@ class MetricsHistory:
         return [found[i] for i in sorted(found)[:most]]
 
     def last(self) -> dict[str, Any] | None:
-        """The newest record; None where there is none. Raises OSError."""
+        """The newest record; None without any. Raises OSError."""
         with self._lock:
             newest = 0
             for _, section in self._refresh():
@@ -218,7 +218,7 @@ def _files(run: Run) -> list[tuple[int, Path]]:
 
 
 def _record(line: bytes) -> dict[str, Any]:
-    """The record of a line; empty where it is damaged."""
+    """The record of a line; empty if it is damaged."""
     try:
         return json_object(line, "record")
     except DamagedFile:

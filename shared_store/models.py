@@ -1,8 +1,8 @@
-"""The model registry: ``models/<name>/<version>/``, policies that were chosen to be kept, each written once and never again.
+"""The model registry: ``models/<name>/<version>/``, immutable versions of policies.
 
-A version holds ``bundle/`` (:mod:`shared_store.bundles`), ``model.json`` (where the policy comes from, and how it was evaluated) and
-``manifest.json`` with the digest of every file. Versions count up from 1. A version appears by a rename that fails where there is
-one of that number already, so several who register at once get several versions, and none is ever overwritten.
+A version holds ``bundle/`` (:mod:`shared_store.bundles`), ``model.json`` (the policy's lineage and evaluations) and
+``manifest.json`` with the digest of every file. Versions count up from 1. A version appears by a rename that fails if its number
+exists, so simultaneous registrations get different versions, and none is ever overwritten.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
 
 class ModelError(Exception):
-    """There is no such model, or it can't be registered; one line that says what there is."""
+    """A model does not exist or can't be registered; one line that names the alternatives."""
 
 
 class AlreadyRegistered(ModelError):
@@ -39,7 +39,7 @@ class AlreadyRegistered(ModelError):
 
 
 class UnknownModel(ModelError):
-    """There is no model, or no version, of that name."""
+    """The model or version does not exist."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Model:
 
 
 def check_name(name: str) -> None:
-    """Raise ModelError for what no model can be called: a name becomes a directory."""
+    """Raise ModelError for an invalid name of a model: a name becomes a directory."""
     if not NAME.fullmatch(name):
         raise ModelError(
             f"model name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
@@ -98,7 +98,7 @@ def model_names(store: Store) -> list[str]:
 
 
 def versions(store: Store, name: str) -> list[Model]:
-    """The versions of a model, the newest last. Raises ModelError for a name that no model can have, DamagedFile for a link."""
+    """The versions of a model, the newest last. Raises ModelError for an invalid name, DamagedFile for a link."""
     check_name(name)
     folder = store.models / name
     refuse_links(folder, 2)
@@ -110,7 +110,7 @@ def versions(store: Store, name: str) -> list[Model]:
 
 
 def find(store: Store, name: str, version: int | None = None) -> Model:
-    """A version of a model, the newest where none is named. Raises UnknownModel with the nearest name, or the versions that there are."""
+    """A version of a model, by default the newest. Raises UnknownModel with the nearest name, or the existing versions."""
     found = versions(store, name)
     if not found:
         known = model_names(store)
@@ -126,7 +126,7 @@ def find(store: Store, name: str, version: int | None = None) -> Model:
 
 
 _in_progress: set[Path] = set()
-"""Hidden directories of registrations that go on in this process."""
+"""Hidden directories of this process's current registrations."""
 
 
 def register(
@@ -141,22 +141,22 @@ def register(
 ) -> Model:
     """Keep the bundle of a checkpoint as the next version of a model.
 
-    What a registration of the same registrar left behind when it was killed is deleted first.
+    First, it deletes the leftovers of killed registrations by the same registrar.
 
     Args:
         store: Of the models.
         name: Of the model.
         run: Of the checkpoint.
-        checkpoint: It was exported.
-        facts: What else ``model.json`` says: who registered it, for whom.
-        registrar: Id of the controller, under which no other process registers at the same time.
-        again: Whether a checkpoint that is a version of the model already becomes another one.
+        checkpoint: An exported one.
+        facts: Further entries of ``model.json``: who registered it, for whom.
+        registrar: Id of the controller; no other process registers under it at the same time.
+        again: Whether to register a checkpoint that is already a version of the model once more.
 
     Raises:
         AlreadyRegistered: The checkpoint is a version of the model, and ``again`` is false; nothing is made.
-        ModelError: No model can be called so, or the checkpoint has no bundle.
-        DamagedBundle: The bundle is not as it was exported.
-        OSError, DamagedFile: The volume is full or gone, or has a link where a directory should be.
+        ModelError: The name is invalid, or the checkpoint has no bundle.
+        DamagedBundle: The bundle was altered after its export.
+        OSError, DamagedFile: The volume is full or gone, or has a link in place of a directory.
     """
     bundle = run.exports / checkpoint.name
     check_name(name)
@@ -190,7 +190,7 @@ def register(
             for path in hidden.rglob("*"):
                 if path.is_file():
                     path.chmod(0o444)
-            # where another was faster, its version stands and this one is the next: a directory with files in it is never replaced
+            # if another registration was faster, this one is the next version: a rename never replaces a non-empty directory
             with contextlib.suppress(FileExistsError):
                 bundles.publish(hidden, model.path)
                 return model
@@ -200,7 +200,7 @@ def register(
 
 
 def _version_of(there: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
-    """The newest version that is of the same checkpoint: by its files, since another run may have had the name of this one."""
+    """The newest version of the same checkpoint, compared by its files, since an earlier run may have had the same name."""
     for model in reversed(there):
         with contextlib.suppress(DamagedBundle):
             facts = model.facts()
@@ -210,14 +210,14 @@ def _version_of(there: Sequence[Model], lineage: Mapping[str, Any]) -> Model | N
 
 
 def _clear_leftovers(store: Store, registrar: str) -> None:
-    """Delete what registrations of this controller left, of any model, when it was killed; of others nobody knows whether they go on."""
+    """Delete the leftovers of this controller's killed registrations, for any model; those of other controllers may still be running."""
     for path in store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ():
         if path not in _in_progress and not path.parent.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
 
 
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Where a policy comes from, and what is known of how good it is."""
+    """The origin of a policy, and its known scores."""
     description = run.description() or {}
     judged = (read_json(run.exports / checkpoint.name / bundles.REPORT) or {}).get("judged")
     return {

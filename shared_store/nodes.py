@@ -1,4 +1,4 @@
-"""A node's processes and their end for good: from inside, by the shim or the supervisor, and from outside, by the engine. Linux only."""
+"""The reliable end of a node's processes: from inside, by the shim or the supervisor, and from outside, by the engine. Linux only."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from shared_store.cgroups import kill_group, members, remove_group
 from shared_store.processes import PATIENCE, Process, children, descendants, end_all, find_process, kill, marked
 
 _CHASE = 200
-"""Looks at the children of a subreaper in a row: one that replaces itself by a child of its own all the time is caught in few."""
+"""Consecutive looks at a subreaper's children: a few catch even a process that keeps replacing itself by a child of its own."""
 
 
 def end_descendants(patience: float = PATIENCE, group: str = "") -> Sequence[Process]:
-    """Kill and reap all descendants of this process, a subreaper, and all of a control group.
+    """Kill and reap all descendants of this process, a subreaper, and all processes of a control group.
 
     Args:
         patience: Seconds after which this gives up.
         group: Directory of the control group; empty for none.
 
     Returns:
-        What SIGKILL has not ended by then; empty in all ordinary cases.
+        The processes that SIGKILL has not ended by then; normally none.
     """
     me = os.getpid()
 
@@ -34,7 +34,7 @@ def end_descendants(patience: float = PATIENCE, group: str = "") -> Sequence[Pro
             if below := descendants(me):
                 found |= {process.pid: process for process in below}
                 break
-            _chase(me)  # there is one, and it was not where it was looked for
+            _chase(me)  # a child exists that the look did not find
         return list(found.values())
 
     def strike(found: Sequence[Process]) -> None:
@@ -46,7 +46,7 @@ def end_descendants(patience: float = PATIENCE, group: str = "") -> Sequence[Pro
 
 
 def has_children() -> bool:
-    """Whether this process has a child that lives; reaps those that do not."""
+    """Whether this process has a living child; reaps dead ones."""
     try:
         while os.waitpid(-1, os.WNOHANG)[0]:
             pass
@@ -66,7 +66,7 @@ def _chase(me: int) -> None:
 
 @dataclass(frozen=True)
 class NodeProcesses:
-    """What finds the processes of a node."""
+    """The data that identify a node's processes."""
 
     pid: int
     """Of its shim."""
@@ -77,20 +77,20 @@ class NodeProcesses:
 
     @property
     def shim(self) -> Process | None:
-        """None once it has ended, also where its pid was given to another process."""
+        """The shim; None once it has ended, also if another process has its pid."""
         process = find_process(self.pid)
         return process if process is not None and process.start == self.start else None
 
 
 def end_nodes(nodes: Sequence[NodeProcesses], marks: Collection[str]) -> Sequence[Process]:
-    """Kill all that is left of nodes; their shims reap it and then leave by themselves.
+    """Kill all remaining processes of nodes; their shims reap them and then exit by themselves.
 
     Args:
         nodes: Shims and control groups.
-        marks: Variables (``NAME=VALUE``) that every process of the nodes, and no other, has unless it took them out.
+        marks: Variables (``NAME=VALUE``) of every process of the nodes, unless it removed them, and of no other process.
 
     Returns:
-        The processes that SIGKILL has not ended within ``PATIENCE`` seconds; empty in all ordinary cases.
+        The processes that SIGKILL has not ended within ``PATIENCE`` seconds; normally none.
     """
     give_up_on_shims = time.monotonic() + PATIENCE / 2
 

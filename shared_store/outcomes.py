@@ -1,6 +1,6 @@
-"""How each node of an attempt ended, committed by its supervisor before it leaves.
+"""The outcome of each node of an attempt, committed by its supervisor before it exits.
 
-A controller that was down when a gang ended reads here what the engine can't tell it any more.
+A controller that was down when a gang ended reads it here, when the engine no longer knows it.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from shared_store.files import read_json, refuse_links, write_json
 from shared_store.layout import Run
 
 LONGEST_TEXT = 16 << 10
-"""Characters of a reason, a message or a traceback; what is longer is cut where it is written, and again where it is read, since
-a job can write the file itself."""
+"""Characters of a reason, a message or a traceback; longer texts are truncated at the write, and again at the read, since a job can
+write the file itself."""
 _LATEST = 2.0**40
-"""Unix times [s] in an outcome are smaller."""
+"""Upper limit of Unix times [s] in an outcome."""
 _NUMBER = int | float
 _LEVELS = 4
 """Directories from that of an outcome up to its run: ``<run>/outcomes/<job>/<attempt>``."""
 EX_TEMPFAIL = 75
-"""Exit code for "checkpointed and left on request: start me again, and don't count it as a failure" (sysexits.h)."""
+"""Exit code for "checkpointed and exited on request: start again, and don't count it as a failure" (sysexits.h)."""
 
 
 @dataclass(frozen=True)
 class FirstError:
-    """The first thing that went wrong on a node."""
+    """The first error on a node."""
 
     rank: int
     message: str
     traceback: str
     time: float
-    """Unix time [s] at which it happened."""
+    """Its Unix time [s]."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Outcome:
     node: int
     epoch: int
     exit_code: int
-    """0 done, 75 left on request, 128 + n killed by signal n, else the program's own."""
+    """0 done, 75 exited on request, 128 + n killed by signal n, else the program's own."""
     signal: str | None
     reason: str
     error: FirstError | None
@@ -50,25 +50,25 @@ class Outcome:
     ended: float
     """Unix times [s] of the first rank's start and of the last rank's end."""
     asked: bool = False
-    """Its ranks ended because they were told to: what made the gang end is elsewhere. Outcomes of older versions lack it."""
+    """Whether its ranks ended on request, so that the cause of the gang's end is elsewhere. Outcomes of older versions lack it."""
 
 
 def first_cause(ends: Sequence[tuple[bool, float]]) -> int:
-    """Which of several failures made the others happen: the first by time of those that were not asked for, else the first of all.
+    """The failure that caused the others: the earliest one not on request, else the earliest of all.
 
     Args:
-        ends: Of each failure whether it was asked to end, and when it ended (Unix time [s]). Not empty.
+        ends: For each failure, whether the end was requested, and its time (Unix time [s]). Not empty.
 
     Returns:
-        Its index in ``ends``; of equal ones the smallest.
+        Its index in ``ends``; of equal times the smallest.
     """
     return min(range(len(ends)), key=lambda index: ends[index])
 
 
 def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
-    """Commit ``outcome``, its texts bounded.
+    """Commit ``outcome``, with bounded texts.
 
-    Raises OSError where the store can't be written, DamagedFile where a directory on the way is a link.
+    Raises OSError if the store can't be written, DamagedFile if a directory on the way is a link.
     """
     path = run.outcome(job, attempt, outcome.node)
     refuse_links(path.parent, _LEVELS)
@@ -76,7 +76,7 @@ def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
 
 
 def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
-    """The committed outcome of a node; None while there is none, or where it is damaged. Raises OSError."""
+    """The committed outcome of a node; None if it does not exist yet or is damaged. Raises OSError."""
     try:
         path = run.outcome(job, attempt, node)
         refuse_links(path.parent, _LEVELS)
@@ -87,7 +87,7 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
 
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
-    """The outcome that ``asdict`` made this of, its texts bounded. Raises TypeError where it is damaged."""
+    """The outcome from its ``asdict`` form, with bounded texts. Raises TypeError if it is damaged."""
     error = FirstError(**value["error"]) if value.get("error") else None
     outcome = Outcome(**{**value, "error": error})
     _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)

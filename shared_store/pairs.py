@@ -1,7 +1,7 @@
 """The difference between two policies that played the same episodes: the same worlds, from the same starts.
 
-Student (1908), "The probable error of a mean", whose second example is this test: of the differences d of the pairs the mean,
-mean(d) ∓ t(n - 1) · s(d) / √n. What makes one episode harder than another is in both of a pair, and falls out of their difference.
+Student (1908), "The probable error of a mean", second example: the mean of the differences d of the pairs, with its interval
+mean(d) ∓ t(n - 1) · s(d) / √n. The difficulty of an episode affects both of a pair, and cancels in their difference.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ LEVEL = 0.95
 
 
 def are_paired(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
-    """Whether two evaluations, as their summaries say, played the same episodes as far as both went.
+    """Whether two evaluations, by their summaries, played the same episodes, as far as both went.
 
-    Episodes have the same number where they have the same world: fewer of them are the first ones of more. At the end of a training
-    there is no seed, and the worlds are its own.
+    Episodes of the same number have the same world, so a shorter evaluation's episodes are the first of a longer one's. An evaluation
+    at the end of a training has no seed, and uses the training's worlds.
     """
     same = all((new.get(key) or None) == (old.get(key) or None) for key in ("seed", "task", "config"))
     return same and isinstance(new.get("seed"), int)
 
 
 def read_returns(table: Path) -> list[float]:
-    """The returns of an evaluation's Parquet table, by the number of their episodes.
+    """The returns in an evaluation's Parquet table, by episode number.
 
-    Raises OSError, ValueError for what is no such table, ImportError without pyarrow.
+    Raises OSError, ValueError for any other table, ImportError without pyarrow.
     """
     import pyarrow.parquet
 
@@ -44,10 +44,10 @@ def read_returns(table: Path) -> list[float]:
 
 
 def paired(new: Sequence[float], old: Sequence[float]) -> dict[str, Any]:
-    """How far ``new`` is above ``old``, which have the same order: as many pairs as the shorter one has.
+    """The difference ``new`` - ``old``, which have the same order; there are as many pairs as the shorter one has values.
 
     Returns:
-        ``difference``, its interval ``low`` to ``high``, the ``verdict`` (``better``, ``worse`` or ``within noise``; of a single
+        ``difference``, its interval ``low`` to ``high``, the ``verdict`` (``better``, ``worse`` or ``within noise``; for a single
         pair ``unknown``), ``method`` and ``pairs``. Raises ValueError without a pair, ImportError without scipy.
     """
     apart = [a - b for a, b in zip(new, old, strict=False)]
@@ -62,12 +62,12 @@ def paired(new: Sequence[float], old: Sequence[float]) -> dict[str, Any]:
 
 
 def verdict(low: float, high: float) -> str:
-    """What an interval of a difference says."""
+    """The verdict for the interval of a difference."""
     return "better" if low > 0 else "worse" if high < 0 else "within noise"
 
 
 def quantile(freedom: float) -> float:
-    """Student's t that a 95 % interval needs."""
+    """Student's t for a 95 % interval."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, 0.5 + LEVEL / 2))

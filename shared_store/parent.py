@@ -1,7 +1,7 @@
-"""The weights with which a clone begins: the run holds a copy of them, so the source may change or be deleted.
+"""The initial weights of a clone: the run holds a copy of them, so the source may change or be deleted.
 
 ``parent/<checkpoint>/`` of the run has the ``learner.pt`` of the source's checkpoint and a manifest of that file alone;
-``parent`` in ``run.json`` says where they come from. The copy is made before the run exists, under a hidden name among the runs,
+``parent`` in ``run.json`` names their origin. The copy is made before the run exists, under a hidden name among the runs,
 and appears with ``run.json`` by one rename.
 
 A run that imitates a teacher holds a copy of the teacher's weights in the same way: ``teachers/<run>/checkpoints/<checkpoint>/``.
@@ -23,24 +23,24 @@ from shared_store.files import DamagedFile, open_regular, sync_directory, write_
 from shared_store.layout import Run, Store
 
 WEIGHTS = "learner.pt"
-"""The file of a checkpoint that holds what was learnt; the others hold worlds and generators."""
+"""The file of a checkpoint with the learner's state; the others hold worlds and random generators."""
 FACTS = ("score", "score_error", "score_episodes", "env_steps")
-"""Numbers of the source's manifest that the lineage repeats."""
+"""Numbers of the source's manifest to repeat in the lineage."""
 
 
 class RunExists(Exception):
-    """There is a run, or something else, of that name."""
+    """A run, or another file, of that name exists."""
 
 
 class WeightsCopy:
-    """A copy of the weights of ``source``, a checkpoint, in the making: under a hidden name among the runs.
+    """An unfinished copy of the weights of ``source``, a checkpoint, under a hidden name among the runs.
 
-    As a context it is closed at the end, and discarded where an error ends it.
+    As a context manager it is closed at the end, and discarded after an error.
 
     Args:
-        store: Where the runs are.
-        owner: Of the hidden directory; the next copy that the same owner makes clears away what a crash left of earlier ones.
-        source: Whose weights.
+        store: Store of the runs.
+        owner: Of the hidden directory; the next copy of the same owner deletes the leftovers of crashed ones.
+        source: Checkpoint with the weights.
     """
 
     _in_progress: set[Path] = set()
@@ -60,7 +60,7 @@ class WeightsCopy:
             self.discard()
 
     def copy(self, place: str = "parent") -> None:
-        """Copy the weights into directory ``place``, durably, and prove that they are what the source's manifest says.
+        """Copy the weights durably into directory ``place``, and verify them against the source's manifest.
 
         Raises:
             DamagedCheckpoint: The source is missing, truncated or altered.
@@ -90,7 +90,7 @@ class WeightsCopy:
             sync_directory(each)
 
     def discard(self) -> None:
-        """Take back what was made, where it came to nothing."""
+        """Delete the unfinished copy."""
         with suppress(OSError):
             shutil.rmtree(self.hidden, ignore_errors=True)
             if self._published is not None:
@@ -98,7 +98,7 @@ class WeightsCopy:
         self.close()
 
     def close(self) -> None:
-        """Nothing of it is under a hidden name any more."""
+        """End the copy: no part of it has a hidden name any more."""
         shutil.rmtree(self.hidden, ignore_errors=True)
         self._in_progress.discard(self.hidden)
 
@@ -110,7 +110,7 @@ class WeightsCopy:
 
 
 class NewRun(WeightsCopy):
-    """A run in the making that will begin with the weights of ``source``, a checkpoint of run ``parent``."""
+    """An unfinished run that will begin with the weights of ``source``, a checkpoint of run ``parent``."""
 
     def __init__(self, store: Store, owner: str, parent: str, source: Checkpoint) -> None:
         super().__init__(store, owner, source)
@@ -128,7 +128,7 @@ class NewRun(WeightsCopy):
         }
 
     def publish(self, name: str, description: Mapping[str, Any]) -> Run:
-        """Make it the run ``name`` with this ``run.json`` (and :attr:`lineage`), by one rename. Raises RunExists, OSError."""
+        """Publish it as run ``name`` with this ``run.json`` (and :attr:`lineage`), by one rename. Raises RunExists, OSError."""
         run = self._store.run(name)
         write_json(self.hidden / "run.json", {**description, "parent": self.lineage})
         if os.path.lexists(run.path):
@@ -152,7 +152,7 @@ class TeacherCopy(WeightsCopy):
         self.teacher = teacher
 
     def publish(self, run: Path) -> None:
-        """Give it to the run in directory ``run``, by one rename; again, to another one instead. Raises OSError."""
+        """Move it to the run in directory ``run``, by one rename; a second call moves it on to another run. Raises OSError."""
         place = Run(run).teacher(self.teacher).checkpoints
         target = place / self.source.name
         if not target.exists():
@@ -163,7 +163,7 @@ class TeacherCopy(WeightsCopy):
                 sync_directory(each)
 
     def discard(self) -> None:
-        """Take back what was made, and the directories that were made for it."""
+        """Delete the copy and the directories that were created for it."""
         super().discard()
         if self._published is not None:
             with suppress(OSError):  # one that is not empty: a run's
@@ -172,7 +172,7 @@ class TeacherCopy(WeightsCopy):
 
 
 def parent_checkpoint(run: Run) -> Checkpoint | None:
-    """The weights with which ``run`` began, verified; None for a run that began with new ones.
+    """The initial weights of ``run``, verified; None for a run that began with new ones.
 
     Raises:
         DamagedCheckpoint: They are missing, truncated or altered.

@@ -1,6 +1,6 @@
-"""The policy contract: what goes into a policy and what comes out of it, as a document that is read without any of Muster's other code.
+"""The policy contract: a policy's inputs and outputs, as a document that needs none of Muster's other code.
 
-Whoever has it can rebuild the observations of a robot, term by term, and turn the policy's actions into inputs of its actuators. It is
+It suffices to rebuild the observations of a robot, term by term, and to turn the policy's actions into inputs of its actuators. It is
 ``contract.json`` of a run and of an exported bundle, and ``contract`` of a checkpoint's manifest. Shapes leave the batch out.
 """
 
@@ -17,27 +17,27 @@ from shared_store.documents import DocumentError, parse
 FORMAT = 2
 """Version of the document; a newer one is refused."""
 CLOSE = 1e-6
-"""Relative difference up to which two numbers are the same: a model that is compiled anew rounds."""
+"""Relative difference up to which two numbers count as equal: recompiling a model rounds."""
 LARGEST = 3.4028234663852886e38
-"""What stands for infinity: the greatest number of 32 bits."""
+"""Stands for infinity: the greatest 32-bit float."""
 
 Pair = tuple[float, float]
 
 
 class _Part:
-    """What the parts of a contract have in common: JSON Schema takes the texts under their fields."""
+    """Base of the contract's parts; the texts under their fields become JSON Schema descriptions."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"use_attribute_docstrings": True, "extra": "forbid"}
 
 
 @dataclass(frozen=True)
 class Frame(_Part):
-    """A frame on a body of the robot, in which a vector is measured."""
+    """A frame on a body of the robot in which a vector is measured."""
 
     name: str
     """Of the site or body."""
     body: str
-    """The body that it is on."""
+    """Its body."""
     position: tuple[float, float, float]
     """Of its origin in the body's frame [m]."""
     rotation: tuple[float, float, float, float]
@@ -48,18 +48,18 @@ class Frame(_Part):
 
 @dataclass(frozen=True)
 class Term(_Part):
-    """Some numbers of an observation, one behind the other: ``scale * clip(quantity - offset)`` of each, in this order."""
+    """Consecutive numbers of an observation, each ``scale * clip(quantity - offset)``, in this order."""
 
     name: str
     """Of the term in its task."""
     kind: Literal["measured", "command", "previous_action"]
-    """Where it comes from: sensors, the operator, or the policy itself (its last actions, clipped)."""
+    """Its source: sensors, the operator, or the policy itself (its last actions, clipped)."""
     first: int
     """Index of its first number in the group."""
     names: tuple[str, ...]
     """Of the numbers of one step."""
     units: tuple[str, ...]
-    """Of each quantity, before the scale; ``1`` of a ratio. Empty: the task declares nothing of the number but its name."""
+    """Of each quantity, before the scale; ``1`` for a ratio. Empty: the task declares only the number's name."""
     scale: tuple[float, ...]
     """Factor of each [1/unit]."""
     offset: tuple[float, ...]
@@ -67,30 +67,30 @@ class Term(_Part):
     clip: Pair | None = None
     """Limits of ``quantity - offset``, before the scale [unit]; null: not limited."""
     ranges: tuple[Pair | None, ...] = ()
-    """Least and greatest value of each number of a command in training [unit]; null: not known. Empty where it is no command."""
+    """Least and greatest value of each number of a command in training [unit]; null: unknown. Empty if it is not a command."""
     history: int = 1
-    """Control steps that are seen: ``history * len(names)`` numbers, those of the oldest step first. Before an episode's first step, its
-    first values."""
+    """Observed control steps: ``history * len(names)`` numbers, the oldest step first. Before an episode's first step, its first
+    values."""
     delay: tuple[int, int] = (0, 0)
-    """Least and greatest number of control steps by which it came late in training."""
+    """Least and greatest delay in training [control steps]."""
     quantity: str = ""
-    """Name of the function that gives it, in Muster's library of terms or in the task; empty: not declared."""
+    """Name of the function that computes it, in Muster's library of terms or in the task; empty: not declared."""
     parameters: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     """Numbers of that function."""
     robot: str = ""
-    """Name of the robot or object that it is of; empty: not declared."""
+    """Name of its robot or object; empty: not declared."""
     element: Literal["", "joint", "body", "site", "index", "action"] = ""
-    """What the function is called for, once for each of ``elements``; empty: it is called once."""
+    """Kind of the ``elements``, for each of which the function is called once; empty: it is called once."""
     elements: tuple[str, ...] = ()
     """Names of these joints, bodies, sites or actions, or of the sensor's rows, in order."""
     sensors: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Sensors that it reads, each with its kind and what it is on."""
+    """Sensors that it reads, each with its kind and mounting."""
     command: str = ""
-    """The command that it tells, by name."""
+    """Name of the command that it shows."""
     library: bool = False
     """Whether ``quantity`` is a function of Muster's library, so that its name says what it computes."""
     frame: Frame | None = None
-    """Where a quantity of the robot's root or of a sensor is measured, and along which axes; null: not known, or it has no such place."""
+    """Origin and axes of the measurement, for a quantity of the robot's root or of a sensor; null: unknown or not applicable."""
 
     @property
     def size(self) -> int:
@@ -100,16 +100,16 @@ class Term(_Part):
 
 @dataclass(frozen=True)
 class Image(_Part):
-    """Images as bytes, channels first: of several frames the present one is first."""
+    """Images as bytes, channels first; the present frame comes first."""
 
     channels: tuple[str, ...]
     """Of one frame, in order."""
     frames: int
-    """The present one, and those of the control steps before."""
+    """Number of frames: the present one and those of the control steps before."""
     camera: Mapping[str, Any]
     """Settings of the camera: its place [m, rad], its field of view [rad], its size [px]."""
     scaling: str = "none: the policy takes the bytes, 0 to 255, and scales them itself"
-    """What is done with the bytes before the policy."""
+    """Scaling of the bytes before the policy."""
 
 
 @dataclass(frozen=True)
@@ -125,26 +125,26 @@ class Group(_Part):
     dtype: Literal["float32", "uint8"]
     """Of its elements."""
     terms: tuple[Term, ...] = ()
-    """What its numbers are, in order; empty for images, and where the task does not say it."""
+    """Its numbers, in order; empty for images, and if the task does not declare them."""
     image: Image | None = None
-    """What its images are."""
+    """Its images."""
 
 
 @dataclass(frozen=True)
 class Action(_Part):
-    """One number that a policy asks for: the actuator's input is ``offset + scale * action``, the action clipped to ``clip`` before."""
+    """One number of a policy's output: the actuator's input is ``offset + scale * action``, after clipping the action to ``clip``."""
 
     name: str
-    """Name of the joint; of a choice, its own; of a frame that inverse kinematics move, its name and the axis."""
+    """Name of the joint; for a choice, its own; for a frame that inverse kinematics moves, its name and the axis."""
     kind: Literal["effort", "position", "velocity", "choice"]
     """Whether the input is a force or torque, or the target of a position or velocity controller in the actuator; a choice is one of
-    several actions, of which the policy names one. Of a frame that is moved, the inputs are position targets."""
+    several actions, of which the policy selects one. For a moved frame, the inputs are position targets."""
     unit: str
     """Unit of the input: N, N m, m, rad, m/s or rad/s."""
     scale: float
     """Input that an action of 1 adds [unit]."""
     default_position: float
-    """Position of the joint at the start of an episode, before it is varied [m, rad]."""
+    """Position of the joint at the start of an episode, before random offsets [m, rad]."""
     offset: float = 0.0
     """Input at an action of 0 [unit]."""
     clip: Pair | None = (-1.0, 1.0)
@@ -152,18 +152,18 @@ class Action(_Part):
     stiffness: float = 0.0
     """Gain on the error of the position [N/m, N m/rad]."""
     damping: float = 0.0
-    """Gain on the velocity, which the actuator works against [N s/m, N m s/rad]."""
+    """Damping gain on the velocity [N s/m, N m s/rad]."""
     effort_limit: float | None = None
     """Greatest force or torque of the actuator [N, N m]; null: not limited."""
     range: Pair | None = None
-    """Least and greatest position of the joint [m, rad]; null: not limited, or not known."""
+    """Least and greatest position of the joint [m, rad]; null: not limited, or unknown."""
     rule: str = ""
     """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
 
 
 @dataclass(frozen=True)
 class Command(_Part):
-    """What the operator asks for."""
+    """A command of the operator."""
 
     name: str
     """Of the command in its task."""
@@ -172,9 +172,9 @@ class Command(_Part):
     units: tuple[str, ...]
     """Of each."""
     ranges: tuple[Pair | None, ...]
-    """Least and greatest value of each in training [unit]; null: not known."""
+    """Least and greatest value of each in training [unit]; null: unknown."""
     seconds: Pair
-    """Least and greatest time for which it held in training [s]."""
+    """Least and greatest duration in training [s]."""
     quantity: str = ""
     """Name of the function that draws it; empty: not declared."""
     library: bool = False
@@ -183,7 +183,7 @@ class Command(_Part):
 
 @dataclass(frozen=True)
 class State(_Part):
-    """A part of what a recurrent policy remembers: zeros when an episode begins, then what the policy gave the step before."""
+    """A part of a recurrent policy's state: zeros when an episode begins, then the output of the step before."""
 
     name: str
     """Of the input."""
@@ -195,29 +195,29 @@ class State(_Part):
 
 @dataclass(frozen=True)
 class Contract(_Part):
-    """Everything."""
+    """The policy contract."""
 
     task: str
     """Name of the task, or module:Class."""
     muster: str
     """Version of the program that wrote it."""
     control_hz: float
-    """How often the policy is asked [1/s]."""
+    """Rate at which the policy acts [1/s]."""
     groups: tuple[Group, ...]
     """The policy's inputs, in order."""
     actions: tuple[Action, ...]
-    """What its output ``actions`` is, in order; of choices the output is one number, the index of the choice. Empty: not declared."""
+    """Its output ``actions``, in order; with choices, the output is one number, the index of the choice. Empty: not declared."""
     action_names: tuple[str, ...]
     """Of the actions, or of the choices."""
     commands: tuple[Command, ...] = ()
-    """What it can be asked for."""
+    """The commands that it follows."""
     states: tuple[State, ...] = ()
-    """What it remembers, in the order of the inputs behind the groups."""
+    """Its recurrent state, in the order of the inputs after the groups."""
     discrete: bool = False
     """Whether an action is one of several choices."""
     normalizer: Literal["inside", "unknown"] = "inside"
-    """Inside: the policy takes observations as described here, and whatever it normalises them with is a part of it. Unknown: the
-    algorithm does not say how its policy is written to a file, so the inputs are all groups of the task."""
+    """Inside: the policy takes observations as described here, and contains their normalisation. Unknown: the algorithm does not
+    declare how it exports its policy, so the inputs are all groups of the task."""
     format: int = FORMAT
     """Version of the document."""
 
@@ -227,19 +227,19 @@ class Contract(_Part):
         return found
 
     def group(self, name: str) -> Group | None:
-        """The group of that name; None where the policy does not see it."""
+        """The group of that name; None if the policy does not see it."""
         return next((group for group in self.groups if group.name == name), None)
 
 
 def read(document: Any, where: str = "contract.json") -> Contract:
-    """A contract from what :meth:`Contract.document` gave.
+    """A contract from the document of :meth:`Contract.document`.
 
     Args:
         document: Plain values.
-        where: What to call it in an error.
+        where: Its name in errors.
 
     Raises:
-        DocumentError: It is no contract, or a newer one; one line with the place in it.
+        DocumentError: It is not a contract, or a newer one; one line with the place of the error.
     """
     if isinstance(document, Mapping) and isinstance(version := document.get("format"), int) and version > FORMAT:
         raise DocumentError(f"{where}: has format {version}, this Muster reads up to {FORMAT}; upgrade Muster")
@@ -266,12 +266,12 @@ def _check_terms(group: Group, here: str) -> None:
 
 
 def differences(before: Contract, now: Contract, *, ranges: bool = False) -> list[str]:
-    """In what a policy of ``before`` would misunderstand ``now``: a plain line a difference; empty where they mean the same.
+    """The points in which a policy of ``before`` would misunderstand ``now``, one line each; empty if both mean the same.
 
     Args:
-        before: What the policy was trained with.
-        now: What it would meet.
-        ranges: Also name what only training is about: ranges of commands, how long they hold, delays.
+        before: The contract of the policy's training.
+        now: The contract that it would meet.
+        ranges: Also compare properties of the training: ranges and durations of commands, delays.
     """
     lines = []
     if before.control_hz != now.control_hz:
@@ -292,7 +292,7 @@ def differences(before: Contract, now: Contract, *, ranges: bool = False) -> lis
 
 
 def brief(lines: Sequence[str], most: int = 5) -> str:
-    """The first of several differences in one line, and how many more there are."""
+    """The first differences in one line, and the number of further ones."""
     more = f"; and {len(lines) - most} more" if len(lines) > most else ""
     return "; ".join(lines[:most]) + more
 
@@ -313,7 +313,7 @@ def _group_differences(before: Group, now: Group, ranges: bool) -> list[str]:
 
 
 def _columns(group: Group, ranges: bool) -> dict[str, dict[str, Any]]:
-    """What each number of a group means, by its label, in order."""
+    """The meaning of each number of a group, by its label, in order."""
     found = {}
     for term in group.terms:
         common: dict[str, Any] = {
@@ -362,11 +362,11 @@ def _command_differences(before: Contract, now: Contract, ranges: bool) -> list[
 
 
 def _named(before: dict[str, dict[str, Any]], now: dict[str, dict[str, Any]], what: str) -> list[str]:
-    """What became of things that have an order and names: ``observation 12: joint_pos/left_knee scale 1 became 0.5``."""
+    """The changes of ordered, named items: ``observation 12: joint_pos/left_knee scale 1 became 0.5``."""
     old, new = list(before), list(now)
     lines = [f"{what} {old.index(name)}: {name} is gone" for name in old if name not in now]
     lines += [f"{what} {new.index(name)}: {name} is new" for name in new if name not in before]
-    if not lines:  # else everything behind has moved
+    if not lines:  # otherwise all later items have moved
         moved = [(name, new.index(name)) for index, name in enumerate(old) if new[index] != name]
         lines = [f"{what} {old.index(name)}: {name} became {what} {place}" for name, place in moved]
     for index, name in enumerate(old):
@@ -381,7 +381,7 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]
         if (name in before) != (name in now):
             yield f"{name} {_value(new if name in now else old)} is {'new' if name in now else 'gone'}"
         elif name == "frame" and None in (old, new):
-            continue  # a contract of format 1 does not say it
+            continue  # a contract of format 1 lacks it
         elif not _same(old, new):
             yield f"{name} {_value(old)} became {_value(new)}"
 
@@ -408,12 +408,12 @@ def _states(states: Mapping[str, tuple[int, ...]]) -> str:
 
 
 def _flat(value: Mapping[str, Any]) -> dict[str, Any]:
-    """With the entries of ``camera`` beside the others."""
+    """The mapping, with the entries of ``camera`` beside the others."""
     return {**{name: each for name, each in value.items() if name != "camera"}, **value["camera"]}
 
 
 def _plain(value: Any) -> Any:
-    """As JSON gives it back: lists for tuples, and no infinity."""
+    """The value after a round trip through JSON: lists for tuples, and no infinity."""
     if isinstance(value, float) and math.isinf(value):
         return math.copysign(LARGEST, value)
     if isinstance(value, Mapping):

@@ -1,6 +1,6 @@
-"""Processes of this machine as ``/proc`` shows them: whose descendants they are, what marks they carry, how they are ended for good.
+"""Processes of this machine, from ``/proc``: their descendants, their marks in the environment, and their reliable end.
 
-Linux only. Imports nothing that is slow to load: the node's shim uses it.
+Linux only. Imports only fast modules, because the node's shim uses it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 PATIENCE = 10.0
-"""Seconds after which a process that has not ended from SIGKILL counts as one that can't be killed."""
+"""Seconds after SIGKILL from which a process counts as unkillable."""
 _LONGEST_PAUSE = 0.5
-"""Seconds between two tries to end what is left."""
+"""Seconds between two attempts to end the remaining processes."""
 _STATES = {
     "D": "in an uninterruptible wait for a device, a file system or a frozen control group",
     "T": "stopped",
@@ -26,7 +26,7 @@ _STATES = {
 
 @dataclass(frozen=True)
 class Process:
-    """A process that is neither a zombie nor gone; pid and start time identify it."""
+    """A running process, not a zombie; pid and start time identify it."""
 
     pid: int
     parent: int
@@ -42,9 +42,9 @@ class Process:
 
 
 def find_process(pid: int) -> Process | None:
-    """The process with that id; None where it is gone or a zombie.
+    """The process with that id; None if it is gone or a zombie.
 
-    Raises OSError where it can't be looked at now, without free descriptors for instance: that is not the end of a process.
+    Raises OSError if it can't be read now, for example without free descriptors; that does not mean that the process has ended.
     """
     try:
         with open(f"/proc/{pid}/stat", errors="replace") as file:
@@ -73,7 +73,7 @@ def descendants(of: int) -> list[Process]:
 
 
 def children(of: int) -> list[int]:
-    """Pids of the direct children of process ``of``, zombies included: fast, but not on every kernel, and without a guarantee."""
+    """Pids of the direct children of process ``of``, including zombies: fast, but not on every kernel, and without a guarantee."""
     try:
         with open(f"/proc/{of}/task/{of}/children") as file:
             return [int(pid) for pid in file.read().split()]
@@ -84,7 +84,7 @@ def children(of: int) -> list[int]:
 def marked(marks: Collection[str]) -> list[Process]:
     """Processes, other than this one, that have all of ``marks`` (``NAME=VALUE``) in their environment.
 
-    Raises ValueError without a mark: every process of the machine would have all of none. Raises OSError as above.
+    Raises ValueError without a mark, because all processes would match. Raises OSError as above.
     """
     wanted = {mark.encode() for mark in marks}
     if not wanted or any(not mark.partition(b"=")[2] for mark in wanted):
@@ -112,12 +112,12 @@ def end_all(
     """Kill what ``find`` returns until it returns nothing.
 
     Args:
-        find: Looks for the processes that have to end. It is asked again after each kill: they may start others meanwhile.
+        find: Returns the processes that have to end. It is called again after each kill, since they may start others meanwhile.
         patience: Seconds after which this gives up.
-        strike: Kills what was found; by default SIGKILL to each.
+        strike: Kills the found processes; by default with SIGKILL to each.
 
     Returns:
-        What was left when the patience was over; empty in all ordinary cases.
+        The processes that remain after ``patience``; normally none.
     """
     deadline, pause = time.monotonic() + patience, 0.001
     while left := find():
@@ -130,14 +130,14 @@ def end_all(
 
 
 def kill(processes: Sequence[Process]) -> None:
-    """SIGKILL to each; those that are gone or belong to another user are passed over."""
+    """Send SIGKILL to each; skip those that are gone or belong to another user."""
     for process in processes:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.kill(process.pid, signal.SIGKILL)
 
 
 def unkillable(left: Sequence[Process]) -> str:
-    """One clause that names processes that did not end from SIGKILL, and where they are."""
+    """One clause that names processes that survived SIGKILL, and their host."""
     more = f" and {len(left) - 3} more" if len(left) > 3 else ""
     named = "; ".join(str(process) for process in left[:3])
     return f"SIGKILL does not end {named}{more} on host {socket.gethostname()}"

@@ -1,4 +1,4 @@
-"""Races: by which rules a job's ``race`` section has laps driven, what that changes of the task, and how a person reads the result."""
+"""Races: the rules from a job's ``race`` section, their changes of the task's configuration, and the result as text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from shared_store.wording import counted
 
 TRIALS = 3
-"""Laps of a race, unless its job says more."""
+"""Laps of a race, by default."""
 SIM_TRACE = "sim-trace"
 """Directory of a race's step logs, in that of its evaluation."""
 DEFAULTS: Mapping[str, Any] = {
@@ -20,18 +20,18 @@ DEFAULTS: Mapping[str, Any] = {
 }
 """Rules that a ``race`` section may change."""
 NO_RACER = "which drives no laps; a race is for runs of a racer's task, such as Racer"
-"""Why a run has no race, behind its task."""
+"""The reason why a run can't race; follows the name of its task."""
 _FROM_THE_LINE = {"start": "line", "start_sideways": [0.0, 0.0], "start_turned": [0.0, 0.0]}
 
 
 def rules_of(section: Mapping[str, Any]) -> dict[str, Any]:
-    """The rules of a race, as its result has them; ``ranking`` is for a league to say."""
+    """The rules of a race, as in its result; a league sets ``ranking``."""
     rules = {key: section.get(key, value) for key, value in DEFAULTS.items()}
     return {"laps": section.get("trials", TRIALS), **rules, "ranking": None}
 
 
 def race_changes(section: Mapping[str, Any]) -> dict[str, Any]:
-    """What a race changes of the configuration with which its run was trained: what its section says, and above that its rules.
+    """A race's changes of its run's training configuration: those of its section, overridden by its rules.
 
     Args:
         section: ``race`` of a job YAML.
@@ -44,14 +44,14 @@ def race_changes(section: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def key_of(section: Mapping[str, Any], path: tuple[str | int, ...]) -> str:
-    """Where in the job a value of the changed configuration comes from."""
+    """The key in the job from which a value of the changed configuration comes."""
     first = "seconds" if path[:1] == ("episode_seconds",) else path[0] if path else ""
     place = ("race",) if first in DEFAULTS or (first == "track" and section.get("track")) else ("race", "config")
     return ".".join(map(str, (*place, first, *path[1:])))
 
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """The race in the summary of an evaluation, as a person reads it."""
+    """The race in the summary of an evaluation, as lines of text."""
     race: Mapping[str, Any] = summary["race"]
     rules, trials = race["rules"], race["trials"]
     yield (
@@ -74,7 +74,7 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def clock(seconds: float | None) -> str:
-    """A time as minutes, seconds and milliseconds, ``1:02.345``; a dash where there is none."""
+    """A time as minutes, seconds and milliseconds, ``1:02.345``; a dash for None."""
     if seconds is None:
         return "-"
     minutes, rest = divmod(round(seconds * 1000), 60_000)

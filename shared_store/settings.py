@@ -1,4 +1,4 @@
-"""Comparing the settings of two jobs: what a run that goes on, or a clone, may not change; and changing some of them."""
+"""Compare the settings of two jobs, for those that a resumed run or a clone must keep; and change some of them."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import Any
 
 
 def setting_at(settings: Any, key: str) -> Any:
-    """The setting ``key``, in which a dot leads into a section; None where there is none, or an empty section."""
+    """The setting ``key``, in which a dot leads into a section; None if it is missing or an empty section."""
     for part in key.split("."):
         settings = settings.get(part) if isinstance(settings, Mapping) else None
     return None if settings == {} else settings
 
 
 def first_difference(old: Any, new: Any, keys: Iterable[str]) -> tuple[str, Any, Any] | None:
-    """The first of ``keys`` whose setting differs, with both values; None where all are equal."""
+    """The first of ``keys`` whose setting differs, with both values; None if all are equal."""
     pairs = ((key, setting_at(old, key), setting_at(new, key)) for key in keys)
     return next((pair for pair in pairs if pair[1] != pair[2]), None)
 
 
 def innermost(key: str, old: Any, new: Any) -> tuple[str, Any, Any]:
-    """The first part of a setting that differs, with both values: of sections the first of their keys."""
+    """The first part of a setting that differs, with both values: in sections, the first such key."""
     while isinstance(old, Mapping) and isinstance(new, Mapping):
         part = next(name for name in {**old, **new} if old.get(name) != new.get(name))
         key, old, new = f"{key}.{part}", old.get(part), new.get(part)
@@ -28,11 +28,11 @@ def innermost(key: str, old: Any, new: Any) -> tuple[str, Any, Any]:
 
 
 def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> list[str]:
-    """The settings that a run can't change once it has a checkpoint, as the class of an algorithm's settings names them.
+    """The settings that a run can't change once it has a checkpoint, from the class of an algorithm's settings.
 
     Args:
-        kind: That class; None where it is not known.
-        saved: The settings in a checkpoint: those that an older Muster did not have can't be compared.
+        kind: That class; None if unknown.
+        saved: The settings in a checkpoint; those that an older Muster lacked can't be compared.
         of_clone: Leave out those that a clone may change.
     """
     may_change = getattr(kind, "clone_may_change", ()) if of_clone else ()
@@ -41,7 +41,7 @@ def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> l
 
 
 def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``settings`` with the changes: sections key by key, all else, and a section that becomes empty, as a whole."""
+    """``settings`` with the changes: sections are merged key by key; other values, and sections that become empty, are replaced."""
     result = dict(settings)
     for key, value in changes.items():
         old = result.get(key)

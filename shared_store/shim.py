@@ -1,14 +1,14 @@
 """A node's shim, the parent of its supervisor: ``python -I -S shim.py PARENT GROUP FILES COMMAND ...``.
 
-It outlives whatever the node does. Everything the node starts is re-parented to it, not to init, when its own parent dies (it is a
-subreaper), and where control groups can be made it puts the node into one. When the supervisor ends, however it ends, the shim kills
-and reaps all that is left and leaves with the supervisor's exit code. It passes on SIGTERM, SIGINT and SIGHUP.
+It is a subreaper: processes of the node whose parent dies are re-parented to it, not to init. If control groups can be created, it
+puts the node into one. When the supervisor ends, however it ends, the shim kills and reaps all remaining processes and exits with the
+supervisor's exit code. It passes on SIGTERM, SIGINT and SIGHUP.
 
-What this promises. Nothing survives the supervisor's end. Where a job kills the shim itself, too, the engine ends the node: by its control
-group, else by the marks in its environment. So one thing is left: a job that kills the shim and whose processes have left both behind,
-the marks (``env -i``) and the group (where there is none, or where the job's user may move processes out of it).
-A process that SIGKILL does not end (state D) is named on standard error after ten seconds; the
-shim then calls itself ``STUCK``, for the engine to see, and stays until that process is gone. Linux only.
+Guarantee: no process survives the supervisor's end. If a job also kills the shim, the engine ends the node, by its control group or
+else by the marks in its environment. One gap remains: a job that kills the shim and whose processes have removed the marks (``env -i``)
+and are in no group (none exists, or the job's user may move processes out of it).
+After ten seconds, the shim names a process that survives SIGKILL (state D) on standard error; it then renames itself to ``STUCK``, for
+the engine to see, and stays until that process is gone. Linux only.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import time
 from collections.abc import Callable, Sequence
 
 STUCK = "muster-stuck"
-"""Name of a shim's process whose supervisor has ended, while something of the node can't be killed."""
+"""Process name of a shim whose supervisor has ended, while a process of the node can't be killed."""
 SCRATCH = "muster-node-{pid}-"
-"""Prefix of a supervisor's temporary directory, by its pid: the shim removes that of one that was killed."""
+"""Prefix of a supervisor's temporary directory, by its pid: the shim removes that of a killed supervisor."""
 _PASSED_ON = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _ORPHANED = signal.SIGUSR1
-"""What the kernel sends the shim when the process that it is tied to dies."""
+"""Signal from the kernel to the shim when the process that it is tied to dies."""
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 
 
@@ -33,10 +33,10 @@ def shimmed(command: Sequence[str], group: str = "", *, tied_to: int = 0, files:
     """The command line that runs ``command``, a node's supervisor, below a shim.
 
     Args:
-        command: What to run. It keeps the shim's standard streams and environment.
-        group: Directory of a control group to make for it; empty for none.
-        tied_to: Pid of the parent with whose death (of its thread that starts the shim) the node has to end; 0 for none.
-        files: Soft limit of open files for the node, at most the hard one; 0 for that of the process that starts the shim.
+        command: The command. It keeps the shim's standard streams and environment.
+        group: Directory of a control group to create for it; empty for none.
+        tied_to: Pid of the parent; the node ends when the parent's thread that starts the shim dies; 0 for none.
+        files: Soft limit of open files for the node, at most the hard one; 0 for the limit of the process that starts the shim.
     """
     return [sys.executable, "-I", "-S", __file__, str(tied_to), group, str(files), *command]
 
@@ -48,7 +48,7 @@ def group_of(command: Sequence[bytes]) -> str | None:
 
 
 def main(parent: str, group: str, files: str, *command: str) -> None:
-    """Run ``command`` to its end; leaves with its exit code, 128 + n for signal n."""
+    """Run ``command`` to its end; exits with its exit code, 128 + n for signal n."""
     import ctypes
 
     libc = ctypes.CDLL(None)
@@ -57,7 +57,7 @@ def main(parent: str, group: str, files: str, *command: str) -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, watched)
     if int(parent):
         libc.prctl(_PR_SET_PDEATHSIG, _ORPHANED, 0, 0, 0)
-        if os.getppid() != int(parent):  # it died before the kernel was told
+        if os.getppid() != int(parent):  # it died before the request to the kernel
             os._exit(1)
     sys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     me = os.getpid()
@@ -111,7 +111,7 @@ def _wait(supervisor: int, watched: set[signal.Signals]) -> int:
 
 
 def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
-    """Kill and reap all that is left of the node; returns when nothing is."""
+    """Kill and reap all remaining processes of the node; returns when none is left."""
     from shared_store.cgroups import remove_group
     from shared_store.nodes import end_descendants
     from shared_store.processes import unkillable
@@ -133,7 +133,7 @@ def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
 
 
 def _removed(group: str) -> bool:
-    """Remove the group; False where there is something in it."""
+    """Remove the group; False if it is not empty."""
     try:
         if group:
             os.rmdir(group)

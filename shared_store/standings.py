@@ -1,6 +1,6 @@
-"""Who is ahead in a league of the racer: what a race counts, what breaks a tie, who is not ranked. Pure functions.
+"""The standings of a racer's league: counted times, ties, entries without a rank. Pure functions.
 
-All times are simulated, with the penalty seconds added, and are compared in whole milliseconds.
+All times are simulated, include penalties, and are compared in whole milliseconds.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ LAP_COMPLETE = "lap_complete"
 """Status of a trial that is a whole lap."""
 
 _COMPARED = ("status", "completion", "lap_time", "time", "off_tracks", "crashes", "immobilized", "reversed", "resets")
-"""What two races of one policy on one seed have in common, trial by trial."""
+"""The results that two races of one policy on one seed share, trial by trial."""
 
 
 class BadRace(ValueError):
-    """An evaluation is no race, or not of these rules; one line."""
+    """An evaluation is not a race, or not by these rules; one line."""
 
 
 @dataclass(frozen=True)
 class Race:
-    """What counts of a race.
+    """The counted results of a race.
 
     Attributes:
-        laps: How many were to be driven.
-        times: Of each lap that is complete, with its penalties [s].
-        resets: How often the car was put back.
-        off_tracks: How often it left the road.
-        crashes: How often it touched an obstacle.
+        laps: Number of laps in the race.
+        times: Time of each complete lap, with its penalties [s].
+        resets: Number of times that the car was put back.
+        off_tracks: Number of times that it left the road.
+        crashes: Number of times that it touched an obstacle.
     """
 
     laps: int
@@ -50,20 +50,20 @@ class Race:
         return _milliseconds(min(self.times)) if self.times else None
 
     def counts(self, ranking: Ranking) -> int | None:
-        """The time by which it is ranked [ms]; None where it has none.
+        """The time by which it is ranked [ms]; None without one.
 
-        ``total`` is of all laps and wants each of them complete; ``best`` and ``average`` are of the complete ones.
+        ``total`` requires all laps to be complete; ``best`` and ``average`` are over the complete ones.
         """
         if not self.times or (ranking == "total" and len(self.times) < self.laps):
             return None
         if ranking == "best":
             return self.best
-        total = math.fsum(self.times)  # of the exact times: rounded ones would add up to another
+        total = math.fsum(self.times)  # of the exact times: rounded ones would give another sum
         return _milliseconds(total if ranking == "total" else total / len(self.times))
 
 
 def read_race(race: Any) -> Race:
-    """What counts of the key ``race`` of an evaluation's summary. Raises BadRace."""
+    """The counted results in the key ``race`` of an evaluation's summary. Raises BadRace."""
     if not isinstance(race, Mapping):
         raise BadRace("it is no race: its summary has no key race")
     rules, trials = race.get("rules"), race.get("trials")
@@ -97,10 +97,10 @@ def _milliseconds(seconds: float) -> int:
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """What differs between two races of one policy, a line each; nothing where every lap is the same to the last bit.
+    """The differences between two races of one policy, a line each; none if every lap is bitwise the same.
 
     Args:
-        before: The key ``race`` of a summary, such as an entry has.
+        before: The key ``race`` of a summary, such as an entry's.
         after: That of another evaluation.
     """
     lines = [
@@ -120,15 +120,15 @@ def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str
 
 @dataclass(frozen=True)
 class Contender:
-    """An entry, as far as the table is concerned.
+    """An entry, with the data for the table.
 
     Attributes:
-        entry: Its number; they count up from 1 in the order in which they were made.
-        racer: Who races.
+        entry: Its number; numbers count up from 1 in the order of creation.
+        racer: Name of the racer.
         model: ``NAME@VERSION``.
-        race: None where the entry is altered.
-        disqualified: Why it is; empty where it is not.
-        problem: What is wrong with its files; empty where nothing is.
+        race: None if the entry is altered.
+        disqualified: The reason for its disqualification; empty without one.
+        problem: The error in its files; empty without one.
     """
 
     entry: int
@@ -163,15 +163,15 @@ class Row:
 
 
 def table(contenders: Sequence[Contender], ranking: Ranking, *, every: bool = False) -> list[Row]:
-    """The standings: ranked rows first, then those that are not.
+    """The standings: ranked rows first, then the others.
 
-    Of a racer with several entries the best one is ranked. Equal times are parted by fewer resets, then fewer off-tracks, then the
-    earlier entry, so that no two entries share a rank.
+    If a racer has several entries, the best one is ranked. Fewer resets break ties, then fewer off-tracks, then the earlier entry, so
+    that no two entries share a rank.
 
     Args:
         contenders: All entries.
-        ranking: What counts.
-        every: Whether the other entries of a racer are rows, too.
+        ranking: The ranking criterion.
+        every: Whether a racer's other entries are also rows.
     """
     timed: list[tuple[tuple[int, int, int, int], Contender]] = []
     others: list[Row] = []

@@ -1,7 +1,7 @@
-"""Runs a command whose life is tied to that of the process that started it: ``python -I -S tied.py PARENT IGNORED COMMAND ...``.
+"""Runs a command that dies with the process that started it: ``python -I -S tied.py PARENT IGNORED COMMAND ...``.
 
-A program of its own, not a ``preexec_fn``: Python may not run between fork and exec where a process has threads (its own locks may be
-held by one that the child does not have; seen with CPython 3.11: the child waits for ever, and so does who started it). Linux only.
+It is a program of its own, not a ``preexec_fn``: Python must not run between fork and exec in a process with threads, since a thread
+that the child lacks may hold one of Python's locks (seen with CPython 3.11: child and parent wait forever). Linux only.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _PR_SET_PTRACER = 0x59616D61
 def tied(command: Sequence[str], ignoring: Sequence[int] = ()) -> list[str]:
     """The command line that runs ``command`` so that the kernel kills it when this process dies, however it dies.
 
-    The signal is tied to the *thread* that forks (``prctl(2)``), so it must be started from one that lives as long as the
-    process. All signals do by default what they do, but for those in ``ignoring``.
+    The signal is tied to the *thread* that forks (``prctl(2)``), so start it from one that lives as long as the process. All signals
+    have their default action, except those in ``ignoring``.
     """
     ignored = ",".join(str(int(number)) for number in ignoring)
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), ignored, *command]
 
 
 def start_tied(command: Sequence[str], ignoring: Sequence[int] = (), **options: Any) -> subprocess.Popen[bytes]:
-    """Start ``command`` as :func:`tied` has it, with ``options`` of ``Popen``. It ignores its signals from its first instant:
+    """Start ``command`` with :func:`tied` and ``options`` of ``Popen``. It ignores the signals in ``ignoring`` from the start, because
     Slurm sends SIGTERM to every process of a step, whatever its session.
     """
-    import subprocess  # not for what this program itself starts
+    import subprocess  # not at the top: this program itself does not need it
 
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ignoring)
     try:
@@ -44,21 +44,21 @@ def start_tied(command: Sequence[str], ignoring: Sequence[int] = (), **options: 
 
 
 def follow(parent: int) -> None:
-    """Have this process, and what it becomes by exec, killed by the kernel when its parent, ``parent``, dies.
+    """Make the kernel kill this process, also after an exec, when its parent, ``parent``, dies.
 
     The parent may read its stacks, also under Yama's ptrace_scope 1.
     """
-    import ctypes  # what starts commands with this module need not pay for it
+    import ctypes  # not at the top: callers that only start commands do not need it
 
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     libc.prctl(_PR_SET_PTRACER, parent, 0, 0, 0)
-    if os.getppid() != parent:  # it died before the kernel was told
+    if os.getppid() != parent:  # it died before the request to the kernel
         os._exit(1)
 
 
 def main(parent: str, ignored: str, *command: str) -> None:
-    """Become ``command``; 127 and one line on standard error where that is not possible."""
+    """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     follow(int(parent))
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGPIPE, signal.SIGXFSZ):  # Python and others change these
         signal.signal(number, signal.SIG_DFL)

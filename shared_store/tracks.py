@@ -1,7 +1,7 @@
-"""Tracks of the racer: ``tracks/<name>/``, each written once and never again.
+"""Tracks of the racer: ``tracks/<name>/``, each immutable.
 
-A track is ``track.npy`` (rows of centre, inner and outer x and y [m], the last row is the first) and ``manifest.json`` with the file's
-digest, the track's measures, and where it comes from. It appears by a rename that fails where there is one of that name already.
+A track is ``track.npy`` (rows of centre, inner and outer x and y [m], the last row repeats the first) and ``manifest.json`` with the
+file's digest, the track's measures and its origin. It appears by a rename that fails if the name exists.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from shared_store.wording import nearest
 
 FILE = "track.npy"
 LARGEST = 1 << 20
-"""Bytes of a track's file, here and where one is imported."""
+"""Bytes of a track's file, here and at an import."""
 PRESETS = ("oval", "rounded-rectangle", "chicane")
-"""Tracks that lie in no store (:mod:`worker.racer.presets`)."""
+"""Tracks outside the store (:mod:`worker.racer.presets`)."""
 _DRAWN = re.compile(r"random:([0-9]{1,19})")
-"""A track that is drawn from a seed (:mod:`worker.racer.naming`)."""
+"""A track drawn from a seed (:mod:`worker.racer.naming`)."""
 
 
 class TrackError(Exception):
-    """There is no such track, it can't be kept, or it is damaged; one line."""
+    """A track does not exist, can't be stored, or is damaged; one line."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class StoredTrack:
         return self.path.name
 
     def facts(self) -> dict[str, Any]:
-        """Its measures and origin, as they were kept. Raises TrackError where the description is damaged."""
+        """Its measures and origin. Raises TrackError if the description is damaged."""
         try:
             refuse_links(self.path, 2)
             found: dict[str, Any] = bundles.read_manifest(self.path)["track"]
@@ -54,7 +54,7 @@ class StoredTrack:
         return found
 
     def read(self) -> bytes:
-        """The content of ``track.npy``, as it was kept. Raises TrackError where anything of the track is altered or missing."""
+        """The content of ``track.npy``. Raises TrackError if any part of the track is altered or missing."""
         try:
             refuse_links(self.path, 2)
             bundles.verify(self.path)
@@ -76,15 +76,15 @@ def names(store: Store) -> list[str]:
 
 
 def is_made(name: str) -> bool:
-    """Whether a track of this name is a preset or drawn from a seed, so that it is in no store."""
+    """Whether a track of this name is a preset or drawn from a seed, and so not in the store."""
     drawn = _DRAWN.fullmatch(name)
     return name in PRESETS or (drawn is not None and int(drawn[1]) < 2**63)
 
 
 def find(store: Store, name: str, others: Sequence[str] = ()) -> StoredTrack:
-    """The track of that name. Raises TrackError with the nearest one where there is none.
+    """The track of that name. Raises TrackError with the nearest name.
 
-    ``others``: what else the caller could have meant.
+    ``others``: further names that the caller could have meant.
     """
     known = names(store)
     if name not in known:
@@ -96,16 +96,16 @@ def find(store: Store, name: str, others: Sequence[str] = ()) -> StoredTrack:
 
 
 def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> StoredTrack:
-    """Keep a track under ``name``.
+    """Store a track under ``name``.
 
     Args:
-        store: Where it is to lie.
-        name: What it is to be called; it becomes a directory.
+        store: The store.
+        name: Its name, which becomes a directory.
         data: Content of ``track.npy``.
-        facts: What else its manifest says: measures, origin.
+        facts: Further entries of its manifest: measures, origin.
 
     Raises:
-        TrackError: No track can be called so, or there is one already.
+        TrackError: The name is invalid, or a track of that name exists.
         OSError: The volume is full or gone.
     """
     if not NAME.fullmatch(name):

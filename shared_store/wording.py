@@ -1,4 +1,4 @@
-"""What is wrong with a value of a job's YAML, in one line: the same words at the submission and from a rank."""
+"""One-line errors about values of a job's YAML, with the same words at the submission and from a rank."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Refused(ValueError):
     """A value can't be used.
 
     Args:
-        path: Keys to it, from the configuration on.
+        path: Keys to it, starting at the configuration.
         words: One line: what was expected, what was found.
     """
 
@@ -42,7 +42,7 @@ class Refused(ValueError):
 
 
 def path_of(problem: Mapping[str, Any]) -> Path:
-    """Keys to the value that is wrong: a :class:`Refused` knows more of them than pydantic.
+    """Keys to the wrong value; a :class:`Refused` knows more of them than pydantic.
 
     Args:
         problem: One of ``pydantic.ValidationError.errors()``.
@@ -52,7 +52,7 @@ def path_of(problem: Mapping[str, Any]) -> Path:
 
 
 def explain(problem: Mapping[str, Any]) -> str:
-    """What was expected and what was found.
+    """The expected and the found value, in words.
 
     Args:
         problem: One of ``pydantic.ValidationError.errors()``.
@@ -69,7 +69,7 @@ def explain(problem: Mapping[str, Any]) -> str:
     if kind == "literal_error":
         return f"expected {problem['ctx']['expected']}, found {shown(found)}"
     if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
-        written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # what YAML 1.1 takes for a number
+        written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # a form that YAML 1.1 reads as a number
         return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
     if kind == "too_short" and problem["ctx"]["min_length"] == 1:
         # tuples are settings such as the widths of layers
@@ -82,19 +82,19 @@ def explain(problem: Mapping[str, Any]) -> str:
 
 
 def counted(count: int, thing: str, things: str = "") -> str:
-    """A number with what it counts: ``1 episode``, ``100 episodes``; ``things``: the plural that is not made with an s."""
+    """A count with its noun: ``1 episode``, ``100 episodes``; ``things``: an irregular plural."""
     return f"{count} {thing if count == 1 else things or f'{thing}s'}"
 
 
 def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:
-    """What to say of a name that is none of ``known``: the nearest of them, else ``otherwise``, or all that there are."""
+    """A hint about a name that is not in ``known``: the nearest of these, else ``otherwise``, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)
     return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
 
 
 def kind_of(value: object) -> str:
-    """What a value of a YAML document is, as people call it."""
+    """The common word for the type of a value of a YAML document."""
     names = {
         dict: "a mapping",
         list: "a list",

@@ -1,4 +1,4 @@
-"""Finding the checkpoint that a request means, and what to say where there is none."""
+"""Look-up of the checkpoint that a request names, and the error if there is none."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, NewerFormat,
 from shared_store.layout import Run
 
 CONFLICT = 409
-"""The request is well formed, but the state of things refuses it."""
+"""The request is well formed, but conflicts with the present state."""
 
 
 def choose(run: Run, wanted: int | Literal["best", "latest"] | None) -> Checkpoint | None:
@@ -33,7 +33,7 @@ def choose(run: Run, wanted: int | Literal["best", "latest"] | None) -> Checkpoi
 
 
 def refusal(run: Run, chosen: Checkpoint, error: DamagedCheckpoint) -> ClientError:
-    """What to say of a checkpoint that can't be used."""
+    """The error of a checkpoint that can't be used."""
     if isinstance(error, NewerFormat):
         return ClientError(f"run {run.name}: {error}", CONFLICT)
     others = [str(each.iteration) for each in list_checkpoints(run) if each.name != chosen.name]

@@ -1,4 +1,4 @@
-"""What an operation works with, and finding what a request names."""
+"""The context of an operation, and look-up of the objects that a request names."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from orchestrator.api.arns import plain_name
 from orchestrator.api.damaged import DamagedRow
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import JobsOf, Operation, check, is_visible, visible_queues
-from orchestrator.controller import Controller
-from orchestrator.database import find_job
-from orchestrator.jobs import Status
-from orchestrator.ownership import owner_of
-from orchestrator.tables import Job, JobDefinition, JobQueue, RunRecord
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
+from orchestrator.persistence.ownership import owner_of
+from orchestrator.persistence.queries import find_job
 from shared_store.layout import Run, Store, StoreError
 from shared_store.parent import NewRun, TeacherCopy
 from shared_store.wording import nearest
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
-"""Makes a submission safe to repeat after a lost answer."""
+"""Makes it safe to repeat a submission whose answer was lost."""
 
 _COMPARED = 1000
 """Names of runs among which the nearest to an unknown one is looked for."""
@@ -78,7 +78,7 @@ class Context:
             raise ClientError(str(error)) from None
 
     def reason(self, job: Job) -> str | None:
-        """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
+        """Why a job waits now, or a note for its user while it runs; None if its stored reason suffices."""
         return self.controller.reason(job)
 
 

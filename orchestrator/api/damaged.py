@@ -1,4 +1,4 @@
-"""Jobs whose row in the database is damaged: each answers for itself alone, and takes no answer about others with it."""
+"""Jobs whose row in the database is damaged: requests about them fail, requests about others don't."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from orchestrator.api.errors import ClientError
-from orchestrator.definition import gang_needs
-from orchestrator.tables import Job
+from orchestrator.persistence.models import Job
 
 DAMAGED = "the job's row in the database is damaged"
 
@@ -21,7 +20,7 @@ class DamagedRow(ClientError):
 
 @contextmanager
 def reading(job: Job) -> Iterator[None]:
-    """A block that reads the JSON columns of a job and its attempts: whatever fails in it because of them is a DamagedRow."""
+    """A block that reads the JSON columns of a job: whatever fails in it because of them is a DamagedRow."""
     try:
         yield
     except Exception as error:
@@ -33,8 +32,7 @@ def reading(job: Job) -> Iterator[None]:
 def _is_intact(job: Job) -> bool:
     """Whether the JSON columns have the shapes in which they are written."""
     try:
-        _ = gang_needs(job.node_properties).spec
-        _ = [(node["index"] + 0, node["host"]) for attempt in job.attempts for node in attempt.nodes]
+        _ = job.gang.spec
         _ = [entry["action"] for entry in job.evaluate_on_exit or []]
         return all(isinstance(each, dict) for each in (job.request, job.parameters, job.tags))
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError):

@@ -1,4 +1,4 @@
-"""What an evaluation or a race asks of its run, checked before its job exists."""
+"""Checks of the run of an evaluation or a race, before its job exists."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from orchestrator.api.checkpoints import choose, refusal
 from orchestrator.api.errors import ClientError
-from orchestrator.settings import task_config
+from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
 from shared_store.races import NO_RACER, key_of, race_changes

@@ -1,4 +1,4 @@
-"""Who may do what to what: every operation of the API is decided here, for every kind of key and every object.
+"""Permissions: every operation of the API is decided here, for every kind of key and every object.
 
 A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
 (a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a league), or to all queues (a
@@ -30,7 +30,14 @@ from enum import StrEnum
 from typing import Any
 
 from orchestrator.api.errors import ClientError
-from orchestrator.tables import ComputeEnvironment, Job, JobDefinition, JobQueue, RunRecord, SchedulingPolicy
+from orchestrator.persistence.models import (
+    ComputeEnvironment,
+    Job,
+    JobDefinition,
+    JobQueue,
+    RunRecord,
+    SchedulingPolicy,
+)
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""
@@ -39,7 +46,7 @@ QUEUES_TAG = "muster:queues"
 
 
 class Refusal(ClientError):
-    """A request that is not let in; ``kind`` is AWS's name for why."""
+    """A refused request; ``kind`` is AWS's name of the reason."""
 
     def __init__(self, kind: str, message: str, status: int = 403) -> None:
         super().__init__(message, status)
@@ -57,7 +64,7 @@ class Identity:
 
 THIS_PROCESS = Identity("this process")
 current_identity: ContextVar[Identity] = ContextVar("current_identity", default=THIS_PROCESS)
-"""Who sent the request that is being carried out; outside of one the controller itself, which may do everything."""
+"""The sender of the current request; outside of a request the controller itself, which may do everything."""
 
 
 class Operation(StrEnum):
@@ -177,7 +184,7 @@ def check(operation: Operation, *objects: Object) -> None:
 
 
 def check_all_queues(operation: Operation) -> None:
-    """Raise Refusal where the caller may not see what all queues have in one answer."""
+    """Raise Refusal unless the caller may see all queues in one answer."""
     identity = current_identity.get()
     if identity.queues is not None:
         queues = ", ".join(sorted(identity.queues)) or "none"

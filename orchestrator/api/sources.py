@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,11 +13,11 @@ from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
-from orchestrator.controller import Controller
-from orchestrator.definition import GangNeeds
-from orchestrator.excerpts import shown
-from orchestrator.ownership import owner_of
-from orchestrator.tables import RunRecord
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.excerpts import shown
+from orchestrator.domain.gang import GangSpec, NodeSpec
+from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.ownership import owner_of
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.layout import NAME
 from shared_store.parent import TeacherCopy, named_parent
@@ -39,10 +38,10 @@ class Source:
     """Of a teacher: run and checkpoint as the spec has them."""
 
 
-def sources_of(needs: GangNeeds) -> list[Source]:
+def sources_of(gang: GangSpec) -> list[Source]:
     """What a job reads; each node reads the spec of its own environment. Raises ClientError."""
-    specs = {node.environment.get("MUSTER_SPEC", "") for node in needs.nodes}
-    return sorted({source for text in specs for source in _sources(text)})
+    nodes = {id(node): node for node in gang.nodes}
+    return sorted({source for node in nodes.values() for source in _sources(node)})
 
 
 class TeacherNeeded(ClientError):
@@ -53,7 +52,7 @@ class TeacherNeeded(ClientError):
         self.run, self.checkpoint = run, checkpoint
 
 
-def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> TeacherNeeded | None:
+def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> TeacherNeeded | None:
     """The runs are there and have what is read of them, unless the job waits for another one that makes them.
 
     The caller may read them. A run that holds its teacher already needs the teacher's run no more. Raises ClientError.
@@ -62,10 +61,10 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> Teach
         The teacher's weights, where the job's run has to hold a copy of them.
     """
     teacher = None
-    mains = set(_sources(needs.setting("MUSTER_SPEC")))
-    for source in sources_of(needs):
+    mains = set(_sources(gang.nodes[gang.main]))
+    for source in sources_of(gang):
         is_teacher = source.key == _TEACHER
-        if is_teacher and _is_held(context, needs, source):
+        if is_teacher and _is_held(context, gang, source):
             continue
         if not is_waiting:
             try:
@@ -76,7 +75,7 @@ def check_sources(context: Context, needs: GangNeeds, is_waiting: bool) -> Teach
             nobodys = RunRecord(name=source.run, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
         if source.key in ("evaluate", "race") and not is_waiting:
-            check_evaluation(context.run(source.run), needs.spec or {}, source.key)
+            check_evaluation(context.run(source.run), gang.spec or {}, source.key)
         if is_teacher and not is_waiting:
             needed = TeacherNeeded(source.run, _checkpoint(context, source))
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take
@@ -122,11 +121,11 @@ def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:
     copy.publish(there.path)
 
 
-def _is_held(context: Context, needs: GangNeeds, source: Source) -> bool:
+def _is_held(context: Context, gang: GangSpec, source: Source) -> bool:
     """Whether the run has the teacher: in a checkpoint of its own, in the weights with which it begins, or as a copy."""
     if context.making is not None:
         return _has_teacher(context.making.source, source)
-    named = needs.setting("MUSTER_RUN")
+    named = gang.options.run
     if not named:
         return False
     run = context.run(named)
@@ -161,19 +160,18 @@ def _checkpoint(context: Context, source: Source) -> Checkpoint:
     return meant[-1]
 
 
-def _sources(spec: str) -> Iterator[Source]:
+def _sources(node: NodeSpec) -> Iterator[Source]:
     try:
-        document = json.loads(spec or "{}")
+        sections = node.spec or {}
     except (ValueError, RecursionError):
         return  # refused where it is read
-    sections = document if isinstance(document, dict) else {}
     for kind in ("evaluate", "race", "export", "record", "render"):
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield Source(section["run"], kind)
-    given = sections
+    given: Any = sections
     for part in _TEACHER.split("."):
-        given = given.get(part) if isinstance(given, dict) else None  # type: ignore[assignment]
+        given = given.get(part) if isinstance(given, dict) else None
     if given is not None:
         found = re.fullmatch(rf"({NAME.pattern})(?:@([0-9]{{1,8}}|[0-9]{{8}}-e[0-9]{{1,18}}))?", str(given))
         if found is None:

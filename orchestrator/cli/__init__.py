@@ -12,7 +12,7 @@ import typer
 from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
 from orchestrator.cli.misuse import Misuse, told
 from orchestrator.cli.terminal import echo, log_visibly, one_line
-from orchestrator.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
+from orchestrator.domain.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
 from shared_store.layout import StoreError
 

@@ -15,13 +15,13 @@ from rich.table import Table
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import Console, echo, echo_json
-from orchestrator.engines.aws_config import config_path
-from orchestrator.errors import ServerError
+from orchestrator.domain.errors import ServerError
+from orchestrator.engines.aws_batch.config import config_path
 from orchestrator.home import muster_home
 from shared_store.wording import counted
 
 if TYPE_CHECKING:
-    from orchestrator.aws_stack import Event, Stack
+    from orchestrator.engines.aws_batch.stack import Event, Stack
 
 NameOption = Annotated[str, typer.Option("--stack-name", help="Name of the CloudFormation stack.")]
 RegionOption = Annotated[str | None, typer.Option(help="AWS region; that of your AWS configuration by default.")]
@@ -172,7 +172,7 @@ def _pair(text: str) -> tuple[str, str]:
 def _stack_module() -> ModuleType:
     """What needs boto3. Raises ServerError where it is not installed."""
     try:
-        from orchestrator import aws_stack
+        from orchestrator.engines.aws_batch import stack as aws_stack
     except ModuleNotFoundError as error:
         raise ServerError("muster aws is not installed: pip install 'muster[aws]'") from error
     return aws_stack

@@ -11,8 +11,8 @@ from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
-from orchestrator.errors import UsageError
-from orchestrator.kept_files import changes_with_files
+from orchestrator.domain.errors import UsageError
+from orchestrator.spec.kept_files import changes_with_files
 
 _EXAMPLES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
 muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2"""
@@ -52,7 +52,10 @@ def clone(
             "name": name,
             "checkpoint": checkpoint,
             "nodes": nodes,
-            "set": [*changes_with_files(client, run, set_), *on_queue(set_, elsewhere)],
+            "set": [
+                *changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_),
+                *on_queue(set_, elsewhere),
+            ],
             "directory": os.getcwd(),
         }
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)

@@ -10,13 +10,13 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from orchestrator.cli.comparison.curves import ENDINGS, draw
+from orchestrator.cli.comparison.runs import Group, RunFacts, grouped, same_episodes
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from orchestrator.compared import Group, RunFacts, grouped, same_episodes
-from orchestrator.curves import ENDINGS, draw
-from orchestrator.errors import UsageError
+from orchestrator.domain.errors import UsageError
 from shared_store.pairs import paired, read_returns
 from shared_store.wording import counted
 

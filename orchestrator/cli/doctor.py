@@ -21,10 +21,10 @@ from rich.markup import escape
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import Client
-from orchestrator.engines import make_engine
-from orchestrator.engines.base import EngineError
-from orchestrator.engines.gpus import visible_gpus
-from orchestrator.errors import ApiError, Unreachable
+from orchestrator.domain.errors import ApiError, Unreachable
+from orchestrator.engines.api import EngineError, Setting
+from orchestrator.engines.installed import make_engine
+from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
 from shared_store.files import write_json
@@ -150,6 +150,6 @@ def _controller() -> Finding:
 
 def _engine(name: str) -> str:
     # an engine that launches nothing writes nothing there
-    hosts = [host for host in make_engine(name, muster_home()).capacity() if not host.away]
+    hosts = [host for host in make_engine(name, Setting(muster_home())).capacity() if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{counted(len(hosts), 'host')}, {cpus:g} CPU{'s' if cpus != 1 else ''}, {counted(gpus, 'GPU')}"

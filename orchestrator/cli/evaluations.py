@@ -15,10 +15,11 @@ from orchestrator.cli.progress import summary
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
-from orchestrator.errors import ServerError, UsageError
-from orchestrator.evaluating import evaluation_document
-from orchestrator.kept_files import with_files
-from orchestrator.spec import Spec, override, validate
+from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.spec.changes import override
+from orchestrator.spec.evaluations import evaluation_document
+from orchestrator.spec.kept_files import with_files
+from orchestrator.spec.model import Spec, validate
 from shared_store.races import SIM_TRACE
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500

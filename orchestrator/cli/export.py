@@ -12,8 +12,9 @@ from orchestrator.cli.jobs import submit_spec
 from orchestrator.cli.serving import StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, named
-from orchestrator.errors import ServerError, UsageError
-from orchestrator.spec import override, validate
+from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.spec.changes import override
+from orchestrator.spec.model import validate
 from shared_store import bundles
 from shared_store.files import read_json
 from shared_store.layout import Store

@@ -13,16 +13,16 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from orchestrator import specfile
 from orchestrator.cli.progress import best_told, evaluated, follow, shown_metrics
 from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
-from orchestrator.definition import compile_definition, compile_submission
-from orchestrator.engines import ENGINES
-from orchestrator.engines.base import engine_of
-from orchestrator.errors import SpecError
-from orchestrator.spec import Spec
-from orchestrator.spec_schema import contract_schema, schema
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.hosts import engine_of
+from orchestrator.engines.installed import ENGINES
+from orchestrator.spec import file as specfile
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.json_schema import contract_schema, schema
+from orchestrator.spec.model import Spec
 from shared_store.wording import counted
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]

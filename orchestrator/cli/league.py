@@ -12,6 +12,7 @@ import typer
 from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.league_table import COLUMNS, cells, write
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.models import ModelArgument, split_model
 from orchestrator.cli.progress import summary
@@ -19,8 +20,7 @@ from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from orchestrator.errors import ApiError, NotServing, UsageError
-from orchestrator.league_table import COLUMNS, cells, write
+from orchestrator.domain.errors import ApiError, NotServing, UsageError
 from shared_store.leagues import moment
 from shared_store.races import clock
 from shared_store.standings import RANKINGS, differences

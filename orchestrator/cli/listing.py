@@ -11,7 +11,7 @@ from rich.table import Table
 from orchestrator.cli.jobs import COLOURS, JsonOption, took, when
 from orchestrator.cli.terminal import echo, echo_json, one_line, print_cut
 from orchestrator.client import Client
-from orchestrator.evaluating import AUTOMATIC_TAG
+from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from shared_store.wording import counted
 
 _NEWEST = 20

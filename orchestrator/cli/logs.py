@@ -13,7 +13,7 @@ import typer
 from orchestrator.cli.jobs import JobArgument, JsonOption
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client
-from orchestrator.errors import SpecError
+from orchestrator.domain.errors import SpecError
 
 _COLOURS = (36, 33, 35, 32, 34, 31)
 """ANSI colours of the node prefixes, by node index."""

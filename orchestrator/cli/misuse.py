@@ -9,7 +9,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from orchestrator.errors import UsageError
+from orchestrator.domain.errors import UsageError
 from shared_store.wording import explain, nearest
 
 Misuse: type[Exception] = typer.BadParameter.__mro__[2]

@@ -18,7 +18,7 @@ from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
-from orchestrator.errors import UsageError
+from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
 from shared_store.evaluations import flattened
@@ -192,7 +192,7 @@ def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     digests = [str(each.get("weights")) for each in (before, now)]
     if digests[0] == digests[1]:
         return ""
-    from orchestrator.weights import difference  # imports what reads ONNX, where there is such a package
+    from orchestrator.cli.comparison.weights import difference  # imports what reads ONNX, where there is such a package
 
     told = difference(*(Path(each["path"]) / "bundle" / POLICY for each in (before, now)))
     return "" if told == "" else f"weights {told or f'differ: SHA-256 {digests[0][:12]} became {digests[1][:12]}'}"

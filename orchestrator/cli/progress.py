@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client
-from orchestrator.errors import Unreachable
+from orchestrator.domain.errors import Unreachable
 from shared_store.wording import counted
 
 _TERMINAL = ("SUCCEEDED", "FAILED")

@@ -11,7 +11,7 @@ from rich.table import Table
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json, one_line
 from orchestrator.client import Client
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 
 
 def register(app: typer.Typer) -> None:

@@ -21,9 +21,9 @@ from orchestrator.cli.progress import Activity
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client, named
-from orchestrator.errors import ApiError, ServerError, UsageError
-from orchestrator.spec import Record, Render, Spec
-from orchestrator.spec_sections import Resources, Retry
+from orchestrator.domain.errors import ApiError, ServerError, UsageError
+from orchestrator.spec.model import Record, Render, Spec
+from orchestrator.spec.sections import Resources, Retry
 
 SourceArgument = Annotated[
     str | None,

@@ -13,7 +13,7 @@ from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue,
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
-from orchestrator.kept_files import changes_with_files
+from orchestrator.spec.kept_files import changes_with_files
 
 RunArgument = Annotated[str, typer.Argument(help="A run, as `muster show JOB` names it.")]
 
@@ -40,7 +40,7 @@ def resume(
         body = {
             "checkpoint": checkpoint,
             "nodes": nodes,
-            "set": [*changes_with_files(client, run, set_), *elsewhere],
+            "set": [*changes_with_files(lambda: client.get(f"/api/runs/{named(run)}")["spec"], set_), *elsewhere],
             "directory": os.getcwd(),
         }
         resumed = client.post(f"/api/runs/{named(run)}/resume", body)

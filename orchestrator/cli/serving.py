@@ -13,15 +13,15 @@ from typing import Annotated
 
 import typer
 
-from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, submit_spec, tell
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
-from orchestrator.disk import DEFAULT, MinFree
-from orchestrator.errors import NotServing, ServerError, SpecError, Unreachable
+from orchestrator.control.disk import DEFAULT, MinFree
+from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable
 from orchestrator.home import local_url, muster_home
-from orchestrator.spec_values import seconds_of
+from orchestrator.spec import file as specfile
+from orchestrator.spec.values import seconds_of
 
 StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
 EngineOption = Annotated[

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json
-from orchestrator.errors import ServerError, SpecError
+from orchestrator.domain.errors import ServerError, SpecError
 
 
 def register(app: typer.Typer) -> None:

@@ -19,7 +19,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
-from orchestrator.errors import ServerError, UsageError
+from orchestrator.domain.errors import ServerError, UsageError
 
 TrackArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="A preset (oval), a seed (random:7), or a track of the store.")

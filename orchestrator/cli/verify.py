@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator import specfile
 from orchestrator.cli.jobs import SetOption, SpecArgument, submit_spec
 from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
-from orchestrator.errors import SpecError
-from orchestrator.spec import Spec
-from orchestrator.spec_sections import Resources, Retry
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec import file as specfile
+from orchestrator.spec.model import Spec
+from orchestrator.spec.sections import Resources, Retry
 from shared_store.wording import counted
 
 Connect = Callable[[], Client]

@@ -12,7 +12,7 @@ import typer
 
 from orchestrator.cli.recordings import checkpoint_of, run_worker, source_of
 from orchestrator.cli.serving import CpusOption, StoreOption, controller
-from orchestrator.errors import ServerError, UsageError
+from orchestrator.domain.errors import ServerError, UsageError
 
 _FILES = (".mcap", ".partial", ".rrd")
 

@@ -16,27 +16,29 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from orchestrator.backoff import Backoff
-from orchestrator.engines.base import (
+from orchestrator.domain.hosts import Host
+from orchestrator.engines.api import (
     Engine,
     EngineError,
     EngineFault,
     Gang,
     GangStatus,
-    Host,
+    Handle,
+    NodePhase,
     NodeStatus,
     NotYet,
     Plan,
     Transient,
 )
+from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.engines.transience import is_final
 
 log = logging.getLogger("muster.engines")
 
 OVERDUE = 10.0
-"""Seconds after which an engine whose call has not returned is said not to answer."""
+"""Seconds after which an engine whose call has not returned counts as not answering."""
 _CLOSING = 5.0
 """Seconds that :meth:`Runner.close` gives the call that is being carried out."""
 
@@ -58,13 +60,13 @@ class Runner:
         self.engine, self._changed = engine, changed
         self._lock = threading.Lock()
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._launches: dict[str, Future[str]] = {}
+        self._launches: dict[str, Future[Handle]] = {}
         """By gang: launches whose end has not been collected."""
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
-        self._looks: set[str] = set()
+        self._looks: set[Handle] = set()
         """Handles of the gangs that are being looked at."""
-        self._seen: dict[str, GangStatus] = {}
+        self._seen: dict[Handle, GangStatus] = {}
         """By handle: the newest picture."""
         self._telling: Future[Sequence[Host]] | None = None
         self._hosts: Sequence[Host] = ()
@@ -108,11 +110,11 @@ class Runner:
             wait([telling], patience)
         return self._hosts
 
-    def plan(self, gang: Gang) -> Plan:
+    def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it, on the caller's thread. Raises EngineError."""
         return self._call("plan the gang", lambda: _lasting(lambda: self.engine.plan(gang)))
 
-    def launch(self, gang: str, plan: Callable[[], Plan]) -> str:
+    def launch(self, gang: str, plan: Callable[[], Plan[Any]]) -> Handle:
         """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
 
         ``plan`` is called, on the caller's thread, where the gang's launch is not under way. One thread launches.
@@ -133,10 +135,10 @@ class Runner:
             self._refused[gang] = error
             raise
 
-    def observe(self, handle: str, nodes: int) -> GangStatus | None:
-        """The newest picture of a gang of so many nodes, and a newer one is asked for; None before the first.
+    def observe(self, handle: Handle) -> GangStatus | None:
+        """The newest picture of a gang, and a newer one is asked for; None before the first.
 
-        Nodes that were seen running, or not yet at all, have in ``waiting`` why there is no newer picture.
+        Nodes that were seen running, or not yet at all, are unreachable where there is no newer picture, and say why.
         """
         subject = ("look", handle)
         with self._lock:
@@ -145,16 +147,19 @@ class Runner:
                 self._calls.put(partial(self._look, handle))
         seen = self._seen.get(handle)
         if trouble := self.silence or self._backoff.said(subject):
-            seen = seen or [NodeStatus(True, "")] * nodes
-            return [replace(node, waiting=trouble) if node.running else node for node in seen]
+            away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
+            return [
+                replace(each, phase=away.phase, words=trouble) if each.running else each
+                for each in seen or [away] * handle.nodes
+            ]
         return seen
 
-    def stop(self, handle: str, grace: float) -> GangStatus:
+    def stop(self, handle: Handle, grace: float) -> GangStatus:
         """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
         return self._submit(lambda: self._call("look at the gang", lambda: self.engine.observe(handle))).result()
 
-    def forget(self, gang: str, handle: str | None) -> None:
+    def forget(self, gang: str, handle: Handle | None) -> None:
         """The gang is over; ``handle``: None where it was never launched."""
         with self._lock:
             self._refused.pop(gang, None)
@@ -221,7 +226,7 @@ class Runner:
             self._changed()
         return hosts
 
-    def _start(self, plan: Plan) -> str:
+    def _start(self, plan: Plan[Any]) -> Handle:
         subject = ("launch", plan.gang.name)
         try:
             handle = self._call("start the gang", lambda: _lasting(lambda: self.engine.launch(plan)))
@@ -231,7 +236,7 @@ class Runner:
         self._backoff.worked(subject)
         return handle
 
-    def _look(self, handle: str) -> None:
+    def _look(self, handle: Handle) -> None:
         subject = ("look", handle)
         before = self._seen.get(handle), self._backoff.said(subject)
         try:

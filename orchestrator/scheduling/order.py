@@ -1,4 +1,4 @@
-"""In which order a queue's jobs are offered what is free."""
+"""The order in which free resources are offered to a queue's jobs."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from orchestrator.scheduling.snapshot import FairShare, Queue, Waiting
 _NOMINAL = 60.0
 """Seconds of its resources that a job's share is charged when the job is taken, so that shares take turns in one pass."""
 _DEFAULT_DECAY = 600
-"""What AWS takes for ``shareDecaySeconds`` 0 [s]."""
+"""AWS's value for ``shareDecaySeconds`` 0 [s]."""
 
 
 def decayed(seconds: float, age_seconds: float, decay_seconds: int) -> float:
-    """What is left of past use.
+    """Past use after decay.
 
     Args:
         seconds: Resource-seconds used.
-        age_seconds: How long ago that was counted [s].
+        age_seconds: Age of that count [s].
         decay_seconds: Its half-life, ``shareDecaySeconds``; 0 stands for AWS's default of 600.
     """
     return float(seconds * 0.5 ** (max(0.0, age_seconds) / (decay_seconds or _DEFAULT_DECAY)))
@@ -47,8 +47,10 @@ def dispatch_order(
     return _by_shares(queue, queue.policy, jobs, usage)
 
 
-def turn(queue: Queue, ordered: Iterable[Waiting], job: Waiting, usage: Mapping[tuple[str, str], float]) -> float:
-    """What the job's share has used, weighted, when its turn comes: with what the jobs before it in ``ordered`` are charged."""
+def share_score(
+    queue: Queue, ordered: Iterable[Waiting], job: Waiting, usage: Mapping[tuple[str, str], float]
+) -> float:
+    """Weighted use of the job's share when its turn comes, including the charges of the jobs before it in ``ordered``."""
     share = job.share or ""
     used = score(queue, share, usage)
     charge = _NOMINAL * (weight(queue.policy, share) if queue.policy else 1.0)

@@ -1,24 +1,22 @@
-"""Where the nodes of a gang go."""
+"""Placement of a gang's nodes on hosts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import inf
 
-from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling.snapshot import NodeShape, Shape
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.resources import EPSILON, Resources
 from shared_store.wording import counted
-
-EPSILON = 1e-9
-"""CPUs are fractions that are added and taken away: this much [CPUs] is rounding."""
 
 
 def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[Placement, ...] | None:
-    """Where each node would go: as many nodes as fit between the gang's minimum and its size; None where too few do.
+    """The placement of each node: of as many nodes as fit, between the gang's minimum and its size; None if too few do.
 
     Args:
         shape: The gang.
-        free: What is free of each host, in the order in which hosts are filled.
+        free: The free part of each host, in the order in which hosts are filled.
         most: No more nodes than this; None for the gang's size.
 
     Hosts that are away are taken only where the gang can't start without them.
@@ -32,7 +30,7 @@ def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[
 
 def _place(shape: Shape, free: Sequence[Host], most: int | None) -> tuple[Placement, ...] | None:
     count = len(shape.nodes) if most is None else min(most, len(shape.nodes))
-    if len(shape.groups) == 1:  # equal nodes: how many fit is a sum, and no other number needs to be tried
+    if len(shape.groups) == 1:  # equal nodes: the number that fits is a sum, and no other number needs to be tried
         count = min(count, _seats(shape.nodes[0], free, count))
         return _pack(shape, count, free, tight=False) if count >= shape.minimum else None
     for number in range(count, shape.minimum - 1, -1):
@@ -45,17 +43,17 @@ def _place(shape: Shape, free: Sequence[Host], most: int | None) -> tuple[Placem
 
 
 def never_fits(shape: Shape, hosts: Sequence[Host], elastic: bool = False) -> str | None:
-    """Why the gang could not start even if all that the hosts have were free; None where it could.
+    """Why the gang could not start even on idle hosts; None if it could.
 
-    ``elastic``: more hosts may come, no larger than those that are known.
+    ``elastic``: hosts may be added, no larger than the known ones.
     """
     if place(shape, hosts) or (elastic and not hosts):
         return None
     for node in shape.nodes[: shape.minimum]:
         if not any(_room(node, host) for host in hosts):
             best = max(hosts, key=lambda h: (len(h.gpus) >= node.gpus, h.cpus >= node.cpus, h.memory), default=None)
-            has = amounts(best.cpus, len(best.gpus), best.memory) if best else "nothing: there is no host"
-            return f"each node needs {amounts(*node)}; the largest host has {has}"
+            has = amounts(best.resources) if best else "nothing: there is no host"
+            return f"each node needs {amounts(node)}; the largest host has {has}"
     if elastic:
         return None
     if too_few := _too_few_hosts(shape, hosts):
@@ -64,13 +62,13 @@ def never_fits(shape: Shape, hosts: Sequence[Host], elastic: bool = False) -> st
 
 
 def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
-    """That there are not enough hosts, where each takes one node; None where that is not why."""
+    """A message that there are too few hosts, if each takes one node; None if that is not the reason."""
     if not all(host.single for host in hosts):
         return None
     wanted = {"": (shape.minimum, len(hosts))}
     for node, indices in shape.groups:
         count = sum(index < shape.minimum for index in indices)
-        wanted[f" with {amounts(*node)}"] = count, sum(_room(node, host) for host in hosts)
+        wanted[f" with {amounts(node)}"] = count, sum(_room(node, host) for host in hosts)
     for what, (count, found) in wanted.items():
         if found < count:
             at_least = "at least " if shape.minimum < len(shape.nodes) else ""
@@ -91,34 +89,31 @@ def affordable(shape: Shape, cpus: float = inf, gpus: float = inf) -> int:
 
 
 def less(host: Host, taken: Iterable[Placement]) -> Host:
-    """What is left of the host when these nodes are on it."""
-    cpus, memory, gone = host.cpus, host.memory, set[str]()
+    """The rest of the host beside these nodes."""
+    left, gone = host.resources, set[str]()
     for placement in taken:
-        cpus, memory = cpus - placement.cpus, memory - placement.memory
+        left -= placement.resources
         gone.update(placement.gpus)
-    return host.left(cpus, tuple(gpu for gpu in host.gpus if gpu not in gone) if gone else host.gpus, memory)
+    return host.left(left.cpus, tuple(gpu for gpu in host.gpus if gpu not in gone) if gone else host.gpus, left.memory)
 
 
 def needs(shape: Shape) -> str:
-    """What the gang needs at the least, in words."""
+    """The gang's smallest demand, in words."""
     at_least = "at least " if shape.minimum < len(shape.nodes) else ""
     nodes = counted(shape.minimum, "node")
-    return f"needs {at_least}{nodes} with {amounts(*shape.least)} in all"
+    return f"needs {at_least}{nodes} with {amounts(shape.least)} in all"
 
 
 def together(hosts: Sequence[Host]) -> str:
-    """What the hosts have in all, in words."""
-    return amounts(
-        max(0, sum(host.cpus for host in hosts)),
-        sum(len(host.gpus) for host in hosts),
-        max(0, sum(host.memory for host in hosts)),
-    )
+    """The total of the hosts, in words."""
+    return amounts(sum((host.resources for host in hosts), Resources()))
 
 
-def amounts(cpus: float, gpus: int, memory: int) -> str:
-    """``memory`` [MiB]."""
+def amounts(resources: Resources) -> str:
+    """``4 CPUs, 1 GPU, 2 GiB``; negative amounts are shown as 0."""
+    memory = max(0, resources.memory)
     size = f"{memory / 1024:.3g} GiB" if memory >= 1024 else f"{memory} MiB"
-    return f"{count_of(cpus, 'CPU')}, {count_of(gpus, 'GPU')}, {size}"
+    return f"{count_of(max(0, resources.cpus), 'CPU')}, {count_of(resources.gpus, 'GPU')}, {size}"
 
 
 def count_of(number: float, what: str) -> str:
@@ -127,18 +122,19 @@ def count_of(number: float, what: str) -> str:
     return f"{text} {what}{'s' if text != '1' else ''}"
 
 
-def _room(node: NodeShape, host: Host) -> int:
-    """How many such nodes fit on what is free of the host."""
-    if host.cpus + EPSILON < node.cpus or len(host.gpus) < node.gpus or host.memory < node.memory:
+def _room(node: Resources, host: Host) -> int:
+    """How many such nodes fit on the free part of the host."""
+    free = host.resources
+    if not node <= free:
         return 0
-    by_cpus = (host.cpus + EPSILON) // node.cpus if node.cpus > 0 else inf
-    by_gpus = len(host.gpus) // node.gpus if node.gpus else inf
-    by_memory = host.memory // node.memory if node.memory > 0 else inf
+    by_cpus = (free.cpus + EPSILON) // node.cpus if node.cpus > 0 else inf
+    by_gpus = free.gpus // node.gpus if node.gpus else inf
+    by_memory = free.memory // node.memory if node.memory > 0 else inf
     most = 1 if host.single else 1_000_000
     return int(min(by_cpus, by_gpus, by_memory, most))  # a node that takes nothing fits any number of times
 
 
-def _seats(node: NodeShape, free: Sequence[Host], enough: int) -> int:
+def _seats(node: Resources, free: Sequence[Host], enough: int) -> int:
     """How many such nodes fit on all hosts; counting stops at ``enough``."""
     seats = 0
     for host in free:
@@ -149,7 +145,7 @@ def _seats(node: NodeShape, free: Sequence[Host], enough: int) -> int:
 
 
 def _pack(shape: Shape, count: int, free: Sequence[Host], tight: bool) -> tuple[Placement, ...] | None:
-    """Put the first ``count`` nodes on hosts, the most demanding first; None where one finds no place."""
+    """Put the first ``count`` nodes on hosts, the most demanding first; None if one of them fits nowhere."""
     left = list(free)
     placements: dict[int, Placement] = {}
     for node, indices in shape.groups:

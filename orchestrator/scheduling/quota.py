@@ -1,12 +1,13 @@
-"""What a fair-share queue keeps free for shares that are not active (``computeReservation``)."""
+"""The part of a fair-share queue's capacity that is kept for inactive shares (``computeReservation``)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling.snapshot import Queue, Running, Shape, Waiting
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
+from orchestrator.scheduling.snapshot import Queue, Running, Waiting
 
 _FORGOTTEN = 1.0
 """Past use [resource-seconds] below which a share counts as inactive: decay alone never ends."""
@@ -14,37 +15,37 @@ _FORGOTTEN = 1.0
 
 @dataclass
 class Quota:
-    """What one queue may use of each pool, and what it uses already."""
+    """The limit of one queue in each compute environment, and its present use."""
 
     kept: float
-    """Fraction of a pool that is kept: (reservation / 100) ^ active shares."""
+    """Fraction of a compute environment that stays reserved: (reservation / 100) ^ active shares."""
     active: int
     used: dict[str, list[float]] = field(default_factory=dict)
-    """By pool: CPUs and GPUs of the queue's gangs."""
+    """By compute environment: CPUs and GPUs of the queue's gangs."""
 
-    def take(self, pool: str, placements: Iterable[Placement]) -> None:
-        used = self.used.setdefault(pool, [0.0, 0.0])
+    def take(self, ce: str, placements: Iterable[Placement]) -> None:
+        used = self.used.setdefault(ce, [0.0, 0.0])
         for placement in placements:
             used[0] += placement.cpus
             used[1] += len(placement.gpus)
 
-    def used_of(self, pool: str, gpus: bool) -> float:
-        return self.used.get(pool, [0.0, 0.0])[1 if gpus else 0]
+    def used_of(self, ce: str, gpus: bool) -> float:
+        return self.used.get(ce, [0.0, 0.0])[1 if gpus else 0]
 
     def limit(self, gpus: bool, hosts: Sequence[Host], max_cpus: float) -> float:
-        """How many GPUs (else CPUs) the queue may use in all of a pool that has these hosts."""
+        """The queue's limit in a compute environment with these hosts, in GPUs (else CPUs)."""
         total = sum(len(host.gpus) for host in hosts) if gpus else min(max_cpus, sum(host.cpus for host in hosts))
         return total * (1 - self.kept)
 
-    def left(self, shape: Shape, pool: str, hosts: Sequence[Host], max_cpus: float) -> float:
-        """How many GPUs (CPUs for a gang without) the queue may still take of the pool."""
-        return self.limit(shape.uses_gpus, hosts, max_cpus) - self.used_of(pool, shape.uses_gpus)
+    def left(self, shape: Shape, ce: str, hosts: Sequence[Host], max_cpus: float) -> float:
+        """GPUs (CPUs for a gang without GPUs) that the queue may still take of the compute environment."""
+        return self.limit(shape.uses_gpus, hosts, max_cpus) - self.used_of(ce, shape.uses_gpus)
 
 
 def quota_of(
     queue: Queue, waiting: Iterable[Waiting], running: Sequence[Running], usage: Mapping[tuple[str, str], float]
 ) -> Quota | None:
-    """The queue's quota; None for a queue that keeps nothing.
+    """The queue's quota; None for a queue without a reservation.
 
     A share is active while it has a waiting or running job, or use in the recent past.
 
@@ -61,5 +62,5 @@ def quota_of(
     active |= {share for (name, share), used in usage.items() if name == queue.name and used >= _FORGOTTEN}
     quota = Quota((queue.policy.reservation / 100) ** len(active), len(active))
     for gang in own:
-        quota.take(gang.pool, gang.placements)
+        quota.take(gang.compute_environment, gang.placements)
     return quota

@@ -1,4 +1,4 @@
-"""Why a job waits, in words that a person can act on; put together only for the jobs that somebody asks about."""
+"""Why a job waits, in words that a user can act on; worded only for jobs that are asked about."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from functools import cached_property
 from math import inf
 from typing import Protocol
 
-from orchestrator.scheduling.head import Head
-from orchestrator.scheduling.lane import NO_ROOM, Lane
-from orchestrator.scheduling.placement import EPSILON, count_of, needs, together
-from orchestrator.scheduling.room import Room
-from orchestrator.scheduling.snapshot import Shape, Waiting
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.resources import EPSILON, Resources
+from orchestrator.scheduling.free_resources import FreeResources
+from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
+from orchestrator.scheduling.placement import count_of, needs, together
+from orchestrator.scheduling.reservation import Reservation
+from orchestrator.scheduling.snapshot import Waiting
 
-NO_POOL = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
+NO_COMPUTE_ENVIRONMENT = "ACTION_REQUIRED - CE(s) associated with the job queue are invalid."
 _NAMED = 3
 """How many jobs a reason names."""
 
 
 @dataclass(frozen=True)
-class Line:
+class QueueOrder:
     """The jobs of one queue that wait, in their order."""
 
     jobs: Sequence[Waiting]
-    lane: Lane | None
+    cache: PassCache | None
     """None: there is no such queue."""
 
 
@@ -36,97 +38,102 @@ class _Preemption(Protocol):
     def by(self) -> str: ...
 
 
-class Board:
-    """What a pass leaves behind: each queue's order, and each waiting job's reason. Decided once, worded on request."""
+class WaitReport:
+    """The result of a pass: each queue's order, and each waiting job's reason. Decided once, worded on request."""
 
     def __init__(
         self,
         now: int,
-        lines: Mapping[str, Line],
-        heads: Sequence[Head],
-        room: Room,
+        orders: Mapping[str, QueueOrder],
+        reservations: Sequence[Reservation],
+        free: FreeResources,
         preempts: Sequence[_Preemption],
         drift: int = 0,
     ) -> None:
         """Args:
         now: Time of the pass [ms].
         lines: By queue.
-        heads: In the order in which they came.
-        room: What is free after the pass.
+        reservations: In the order in which they came.
+        free: What is free after the pass.
         preempts: Who is preempted, by whom.
-        drift: What times lack to be Unix time [ms].
+        drift: Difference of Unix time to the pass's clock [ms].
         """
         self._drift = drift
-        self._now, self._lines, self._heads, self._room = now, lines, {head.job.job: head for head in heads}, room
+        self._now, self._queues, self._reservations, self._resources = (
+            now,
+            orders,
+            {reservation.job.job: reservation for reservation in reservations},
+            free,
+        )
         self._preempted = {each.job for each in preempts}
         self._orders: dict[str, tuple[str, ...]] = {}
         self._common: dict[tuple[str, Shape], tuple[bool, str]] = {}
 
     def order(self, queue: str) -> Sequence[str]:
-        """Ids of the queue's waiting jobs, the first to be served first; empty for a queue where none waits."""
+        """Ids of the queue's waiting jobs in the order of service; empty if none waits."""
         if queue not in self._orders:
-            line = self._lines.get(queue)
-            self._orders[queue] = tuple(job.job for job in line.jobs) if line else ()
+            queue_order = self._queues.get(queue)
+            self._orders[queue] = tuple(job.job for job in queue_order.jobs) if queue_order else ()
         return self._orders[queue]
 
     def reason(self, job: str) -> str:
         """The ``statusReason`` of a job that waits. Raises KeyError for one that starts, is cancelled or was not waiting."""
         queue, position = self._positions[job]
-        line = self._lines[queue]
-        if line.lane is None or not line.lane.pools:
-            return NO_POOL
-        if head := self._heads.get(job):
-            return f"{NO_ROOM} - {self._free(head.job.shape, head.seat.pool)}{self._until(head)}"
-        key = (queue, line.jobs[position].shape)
+        queue_order = self._queues[queue]
+        if queue_order.cache is None or not queue_order.cache.compute_environments:
+            return NO_COMPUTE_ENVIRONMENT
+        if reservation := self._reservations.get(job):
+            return f"{NO_ROOM} - {self._free(reservation.job.shape, reservation.allocation.compute_environment)}{self._until(reservation)}"
+        key = (queue, queue_order.jobs[position].shape)
         if key not in self._common:
-            self._common[key] = self._common_reason(queue, line.lane, key[1])
+            self._common[key] = self._common_reason(queue, queue_order.cache, key[1])
         behind, text = self._common[key]
         if not behind:
             return text
-        # AWS gives a code to the first job of a queue only: that is the one that is stuck
+        # AWS gives a code to the first job of a queue only, the one that is stuck
         code = f"{NO_ROOM} - " if position == 0 else ""
         return f"{code}{_ordinal(position + 1)} in queue {queue}, {text}"
 
-    def _common_reason(self, queue: str, lane: Lane, shape: Shape) -> tuple[bool, str]:
-        """What all jobs of a shape in a queue wait for, and whether it is behind another one."""
-        if reason := lane.impossible(shape) or lane.barred(shape):
+    def _common_reason(self, queue: str, cache: PassCache, shape: Shape) -> tuple[bool, str]:
+        """The reason shared by all jobs of a shape in a queue, and whether it is another job."""
+        if reason := cache.impossible(shape) or cache.barred(shape):
             return False, reason
-        before = self._before(queue, lane, shape)
+        before = self._before(queue, cache, shape)
         if before is None:
-            return False, f"{NO_ROOM} - {self._free(shape, lane.possible(shape)[0])}"
+            return False, f"{NO_ROOM} - {self._free(shape, cache.possible(shape)[0])}"
         wants = f"{needs(before.job.shape)}{self._start(before, ' and starts by ')}"
         name = _named(before.job.name, before.job.job)
-        return True, f"behind job {name}, which {wants}{self._hint(shape, lane)}"
+        return True, f"behind job {name}, which {wants}{self._hint(shape, cache)}"
 
     @cached_property
     def _positions(self) -> dict[str, tuple[str, int]]:
         """Queue and place in its order (from 0) of every job that waits."""
-        return {job.job: (queue, i) for queue, line in self._lines.items() for i, job in enumerate(line.jobs)}
+        return {
+            job.job: (queue, i) for queue, queue_order in self._queues.items() for i, job in enumerate(queue_order.jobs)
+        }
 
-    def _before(self, queue: str, lane: Lane, shape: Shape) -> Head | None:
-        """The head that a job waits behind: one of its own queue, else the first that keeps hosts it could use."""
-        hosts = {host for pool in lane.possible(shape) for host in self._room.members[pool]}
-        heads = [head for head in lane.heads if not head.hosts.isdisjoint(hosts)]
-        return next((head for head in heads if head.job.queue == queue), heads[0] if heads else None)
-
-    def _free(self, shape: Shape, pool: str) -> str:
-        """What the shape needs, what is free of the pool, and why that is not enough where it looks as if it were."""
-        hosts = [self._room.hosts[name] for name in self._room.members[pool]]
-        if self._room.cpus[pool] + EPSILON < shape.least.cpus:
-            left = count_of(max(0.0, self._room.cpus[pool]), "CPU")
-            return f"{needs(shape)}; compute environment {pool} may use {left} more at this time"
-        least = shape.least
-        enough = (
-            sum(host.cpus for host in hosts) + EPSILON >= least.cpus
-            and sum(len(host.gpus) for host in hosts) >= least.gpus
-            and sum(host.memory for host in hosts) >= least.memory
+    def _before(self, queue: str, cache: PassCache, shape: Shape) -> Reservation | None:
+        """The reservation that a job waits behind: one of its own queue, else the first that keeps hosts it could use."""
+        hosts = {host for ce in cache.possible(shape) for host in self._resources.members[ce]}
+        reservations = [reservation for reservation in cache.reservations if not reservation.hosts.isdisjoint(hosts)]
+        return next(
+            (reservation for reservation in reservations if reservation.job.queue == queue),
+            reservations[0] if reservations else None,
         )
+
+    def _free(self, shape: Shape, ce: str) -> str:
+        """The shape's demand, the free part of the compute environment, and why that does not suffice although it seems to."""
+        hosts = [self._resources.hosts[name] for name in self._resources.members[ce]]
+        if self._resources.cpus[ce] + EPSILON < shape.least.cpus:
+            left = count_of(max(0.0, self._resources.cpus[ce]), "CPU")
+            return f"{needs(shape)}; compute environment {ce} may use {left} more at this time"
+        enough = shape.least <= sum((host.resources for host in hosts), Resources())
         return f"{needs(shape)}; {together(hosts)} free{', but not in one piece for each node' if enough else ''}"
 
-    def _until(self, head: Head) -> str:
-        """Whose end the head waits for, and when that is at the latest."""
-        preempted = [each for each in head.awaits if each.job in self._preempted]
-        awaited = preempted or list(head.awaits)
+    def _until(self, reservation: Reservation) -> str:
+        """The jobs whose end the reservation waits for, and the latest time of that."""
+        preempted = [each for each in reservation.awaits if each.job in self._preempted]
+        awaited = preempted or list(reservation.awaits)
         if not awaited:
             return ""
         names = [_named(each.name, each.job) for each in awaited[-_NAMED:]]
@@ -137,25 +144,25 @@ class Board:
             return f" until job{plural} {who}, preempted for it, {'have' if plural else 'has'} stopped"
         if all(each.ending for each in awaited):
             return f" until job{plural} {who} {'have' if plural else 'has'} stopped"
-        return f" until job{plural} {who} end{'' if plural else 's'}{self._start(head, ', at the latest at ')}"
+        return f" until job{plural} {who} end{'' if plural else 's'}{self._start(reservation, ', at the latest at ')}"
 
-    def _start(self, head: Head, lead: str) -> str:
-        """When the head starts at the latest; nothing where nobody knows or it is about to."""
-        if not self._now < head.spare.at < inf:
+    def _start(self, reservation: Reservation, lead: str) -> str:
+        """The latest start of its job; empty if unknown or imminent."""
+        if not self._now < reservation.window.at < inf:
             return ""
-        return lead + datetime.fromtimestamp((head.spare.at + self._drift) / 1000, UTC).strftime(
+        return lead + datetime.fromtimestamp((reservation.window.at + self._drift) / 1000, UTC).strftime(
             "%Y-%m-%d %H:%M:%S UTC"
         )
 
-    def _hint(self, shape: Shape, lane: Lane) -> str:
-        """That the shape would fit now, and with which timeout it could start without delaying anybody."""
-        pools = lane.open(shape)
-        if not any(self._room.seat(shape, pool) for pool in pools):
+    def _hint(self, shape: Shape, cache: PassCache) -> str:
+        """A message that the shape would fit now, with the timeout under which it could start without delaying another job."""
+        ces = cache.open(shape)
+        if not any(self._resources.allocation(shape, ce) for ce in ces):
             return ""
         kept = "; it would fit now, but on what is kept for that job"
-        unknown = [head.spare for head in lane.heads if head.spare.at == inf]
-        seconds = int((lane.times[0] - self._now) / 1000) if lane.times else 0
-        if seconds < 1 or not any(self._room.seat(shape, pool, unknown) for pool in pools):
+        unknown = [reservation.window for reservation in cache.reservations if reservation.window.at == inf]
+        seconds = int((cache.times[0] - self._now) / 1000) if cache.times else 0
+        if seconds < 1 or not any(self._resources.allocation(shape, ce, unknown) for ce in ces):
             return kept
         return f"{kept}: with a timeout of at most {seconds} s it could start"
 

@@ -1,68 +1,15 @@
-"""What a scheduling pass looks at: jobs, queues, pools, hosts and the clock. Values only.
+"""The input of a scheduling pass: jobs, queues, compute environments, hosts and the clock. Values only.
 
-Times are in milliseconds, on a clock that never steps (:mod:`orchestrator.clock`).
+Times are in milliseconds, on a clock that never steps (:mod:`orchestrator.control.clock`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple
 
-from orchestrator.engines.base import Host, Placement
-
-
-class NodeShape(NamedTuple):
-    """What one node takes of its host."""
-
-    cpus: float
-    gpus: int
-    memory: int
-    """MiB."""
-
-
-@dataclass(frozen=True)
-class Shape:
-    """What a gang takes; compared by value. Callers share one object between equal jobs, which makes look-ups fast."""
-
-    nodes: tuple[NodeShape, ...]
-    """By node index."""
-    minimum: int
-    """With how few of its first nodes it may start."""
-    main: int
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        return hash((self.nodes, self.minimum, self.main))
-
-    @cached_property
-    def groups(self) -> tuple[tuple[NodeShape, tuple[int, ...]], ...]:
-        """The distinct nodes and their indices, the most demanding first."""
-        indices: dict[NodeShape, list[int]] = {}
-        for index, node in enumerate(self.nodes):
-            indices.setdefault(node, []).append(index)
-        ordered = sorted(indices.items(), key=lambda item: (-item[0].gpus, -item[0].cpus, -item[0].memory))
-        return tuple((node, tuple(each)) for node, each in ordered)
-
-    @cached_property
-    def uses_gpus(self) -> bool:
-        """Whether GPUs are what counts when shares are compared; else it is CPUs."""
-        return any(node.gpus for node in self.nodes)
-
-    @cached_property
-    def demand(self) -> float:
-        """GPUs of the whole gang; CPUs where it has none."""
-        return float(sum(node.gpus if self.uses_gpus else node.cpus for node in self.nodes))
-
-    @cached_property
-    def least(self) -> NodeShape:
-        """What the smallest allowed number of nodes takes in all."""
-        nodes = self.nodes[: self.minimum]
-        return NodeShape(sum(n.cpus for n in nodes), sum(n.gpus for n in nodes), sum(n.memory for n in nodes))
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +39,7 @@ class Running:
     queue: str
     share: str | None
     priority: int
-    pool: str
+    compute_environment: str
     placements: tuple[Placement, ...]
     started_at: int | None
     """[ms]; None while it starts."""
@@ -100,17 +47,17 @@ class Running:
     """Of an attempt [s]."""
     preemptible: bool
     ending: bool
-    """It is being stopped already: what it holds comes free soon."""
+    """Whether it is being stopped: its resources come free soon."""
 
 
 @dataclass(frozen=True)
-class Pool:
-    """An AWS compute environment: which hosts its jobs may use, and how much of them."""
+class ComputeEnvironment:
+    """An AWS compute environment: the hosts that its jobs may use, and a limit of CPUs."""
 
     name: str
     enabled: bool
     hosts: tuple[str, ...] | None
-    """None: all that the engine has."""
+    """None: all of the engine's."""
     max_cpus: float | None
     engine: str | None = None
     """Only hosts of this one; None: of any."""
@@ -141,7 +88,7 @@ class Queue:
 
     name: str
     priority: int
-    pools: tuple[str, ...]
+    compute_environments: tuple[str, ...]
     """Names, in the order in which they are tried."""
     policy: FairShare | None
     """None: first in, first out."""
@@ -154,20 +101,20 @@ class Leading:
 
     job: str
     reason: str
-    """Code of why (``CAPACITY:…``, ``ACTION_REQUIRED…``)."""
+    """Code of its reason (``CAPACITY:…``, ``ACTION_REQUIRED…``)."""
     since: int
-    """Since when it is that, for that reason [ms]."""
+    """Since when it has been first, for that reason [ms]."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that a pass depends on."""
+    """The whole input of a pass."""
 
     now: int
     """[ms]."""
     hosts: Sequence[Host]
-    """With all that they have, free or not."""
-    pools: Mapping[str, Pool]
+    """With their full capacity, free or not."""
+    compute_environments: Mapping[str, ComputeEnvironment]
     queues: Mapping[str, Queue]
     waiting: Iterable[Waiting]
     """In any order."""
@@ -177,4 +124,4 @@ class Snapshot:
     leading: Mapping[str, Leading] = field(default_factory=dict)
     """By queue, of the last pass."""
     drift: int = 0
-    """What a time lacks [ms] to be Unix time, as people read it."""
+    """Difference of Unix time to the pass's clock [ms]."""

@@ -1,4 +1,4 @@
-"""From the policy's actions to joint commands, within limits."""
+"""Turns the policy's actions into joint commands, within limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from muster_policy.errors import Refused
 from muster_policy.messages import Messages
 
 KINDS = ("position", "velocity", "effort")
-"""What a joint can be commanded, named as the fields of a ``sensor_msgs/JointState``."""
+"""Kinds of joint commands, named as the fields of a ``sensor_msgs/JointState``."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Command:
 
     Attributes:
         values: One for each action, in their order [unit of each].
-        limited: How many of them the limits changed.
+        limited: Number of values that the limits changed.
     """
 
     values: np.ndarray
@@ -34,12 +34,12 @@ class Commands:
 
     Args:
         contract: Of the policy.
-        names: Name of a joint on the robot by its name in the contract, where it differs.
-        strict: Keep position targets within the joints' ranges; else beyond them by ``effort_limit / stiffness``, as far as a target
-            can still change the actuator's torque.
+        names: Name of a joint on the robot by its name in the contract, if it differs.
+        strict: Keep position targets within the joints' ranges; otherwise they may exceed them by ``effort_limit / stiffness``, as far
+            as a target can still change the actuator's torque.
 
     Raises:
-        Refused: An action is no joint command, or more than a scale and an offset.
+        Refused: An action is not a joint command, or has a rule beyond a scale and an offset.
     """
 
     def __init__(self, contract: Contract, names: Mapping[str, str] | None = None, strict: bool = False) -> None:
@@ -66,16 +66,16 @@ class Commands:
         self._low, self._high = np.array([limits(action, strict) for action in contract.actions]).T
 
     def command(self, action: np.ndarray) -> Command:
-        """Commands for what the policy asked for, shape ``(actions,)``, finite."""
+        """Commands for the policy's action, shape ``(actions,)``, finite."""
         value = self._offset + self._scale * np.clip(action.astype(np.float64), self._least, self._most)
         limited = np.clip(value, self._low, self._high)
         return Command(limited, int((limited != value).sum()))
 
     def hold(self, positions: Mapping[str, float]) -> Command:
-        """What stops the robot where it is: the measured positions as targets, no velocity, no force.
+        """Commands that hold the robot where it is: the measured positions as targets, no velocity, no force.
 
         Args:
-            positions: Measured, by joint as the contract names it [m, rad].
+            positions: Measured positions, by the joint's name in the contract [m, rad].
         """
         held = [positions[action.name] if action.kind == "position" else 0.0 for action in self.actions]
         return Command(np.array(held), 0)
@@ -90,7 +90,7 @@ class Commands:
         return found
 
     def table(self) -> list[str]:
-        """The joints with their default positions, gains and limits, a line each, for who sets up the robot's controllers."""
+        """The joints with their default positions, gains and limits, a line each, to set up the robot's controllers."""
         width = max(map(len, self.joints))
         lines = []
         for name, action in zip(self.joints, self.actions, strict=True):
@@ -106,7 +106,7 @@ class Commands:
 
 
 def limits(action: Action, strict: bool) -> tuple[float, float]:
-    """Least and greatest command of a joint; infinite where the contract knows none."""
+    """Least and greatest command of a joint; infinite without limits in the contract."""
     if action.kind == "effort":
         most = np.inf if action.effort_limit is None else action.effort_limit
         return -most, most

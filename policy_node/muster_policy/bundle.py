@@ -1,4 +1,4 @@
-"""A policy bundle: read whole, and refused where a byte of it is not as it was sealed."""
+"""A policy bundle: read whole, and refused if a byte of it was altered."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class Bundle:
-    """What the node needs of a bundle, in memory: nothing is read again after it was verified.
+    """The node's files of a bundle, in memory: nothing is read again after the verification.
 
     Attributes:
         path: Of the directory.
@@ -37,18 +37,18 @@ class Bundle:
 
     @property
     def origin(self) -> str:
-        """Run and checkpoint that it is of."""
+        """Its run and checkpoint."""
         return f"{self.manifest.get('run', 'unknown run')}, checkpoint {self.manifest.get('checkpoint', 'unknown')}"
 
 
 def open_bundle(path: Path) -> Bundle:
-    """Read and verify a bundle: every file is listed and as it was sealed, none is missing and none was added.
+    """Read and verify a bundle: every file is listed and unaltered, none is missing and none was added.
 
     Args:
         path: Its directory.
 
     Raises:
-        Refused: It is none, or something in it differs.
+        Refused: It is not a bundle, or a file differs.
     """
     if not path.is_dir():
         raise Refused(f"{path}: it is no directory; name a bundle that `muster export` made")

@@ -34,7 +34,7 @@ episode when std_msgs/Empty comes on ~/reset. docs/policy-node.md says more.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; returns its exit status: 0 after a clean end, 1 where something does not fit, 2 for wrong use."""
+    """The command; returns its exit status: 0 after a clean end, 1 for a mismatch, 2 for wrong use."""
     given = parser().parse_args(arguments)
     try:
         bundle = open_bundle(given.bundle)
@@ -143,7 +143,7 @@ def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
         known: Joints of the policy.
 
     Raises:
-        Refused: A line is of another form or names no joint of the policy, or two joints are one of the robot.
+        Refused: A line has another form or an unknown joint, or two joints of the policy have one name on the robot.
     """
     try:
         lines = path.read_text().splitlines()
@@ -195,7 +195,7 @@ def _remapping(text: str) -> tuple[str, str]:
 
 
 def _ros_name(option: str, text: str) -> str:
-    """A name as ROS has them. Raises Refused."""
+    """A valid ROS name. Raises Refused."""
     parts = text.removeprefix("/").split("/")
     if not all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", part) for part in parts):
         raise Refused(f"{option} {text}: a name of ROS has letters, digits and _ between its slashes, no digit first")

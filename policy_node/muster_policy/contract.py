@@ -1,4 +1,4 @@
-"""What the node reads of a bundle's ``contract.json``: the policy's inputs and outputs, term by term."""
+"""The node's view of a bundle's ``contract.json``: the policy's inputs and outputs, term by term."""
 
 from __future__ import annotations
 

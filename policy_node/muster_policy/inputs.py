@@ -1,4 +1,4 @@
-"""The node's inputs: the newest message of each topic, decoded, checked, and how old it is."""
+"""The node's inputs: the newest message of each topic, decoded and checked, with its age."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from muster_policy.snapshot import JOINTS, Imu, Odometry, Snapshot, matrix
 from muster_policy.snapshot import ODOMETRY as ODOMETRY_TOPIC
 
 COMMAND_TIMEOUT = 0.5
-"""Age from which on a commanded velocity no longer counts: the policy is then asked to stand [s]."""
+"""Age from which a commanded velocity no longer counts: the policy is then commanded to stand [s]."""
 _DIFFERENT = 32
-"""Different complaints that are told, each once."""
+"""Limit of different complaints; each is reported once."""
 
 
 @dataclass
 class Input:
-    """A topic that the node hears.
+    """A topic to which the node subscribes.
 
     Attributes:
         topic: Its name in the node's namespace, before remapping.
         kind: ROS type of its messages.
-        read: Gives the value of a message; raises Refused where it can't be used.
-        command: The command that it is; None of what is measured.
-        value: That of the last good message; None before the first.
-        arrived: When that came [s, monotonic].
-        waiting: The newest message that is not decoded yet, and when it came.
-        count: Good messages so far.
+        read: Returns the value of a message; raises Refused for an unusable one.
+        command: Its command; None for measurements.
+        value: Value of the last good message; None before the first.
+        arrived: Arrival of that message [s, monotonic].
+        waiting: The newest message that is not decoded yet, and its arrival.
+        count: Number of good messages so far.
     """
 
     topic: str
@@ -55,9 +55,9 @@ class Inputs:
     """All inputs of a policy.
 
     Args:
-        observations: What it needs.
+        observations: The policy's needs.
         messages: Types of the distribution.
-        names: Name of a joint on the robot by its name in the contract, where it differs.
+        names: Name of a joint on the robot by its name in the contract, if it differs.
     """
 
     def __init__(self, observations: Observations, messages: Messages, names: Mapping[str, str] | None = None) -> None:
@@ -76,14 +76,14 @@ class Inputs:
         for group in observations.images.values():
             self.all.append(Input(image_topic(group.name), IMAGE, _image_of(group)))
         self.news = threading.Condition()
-        """Told when a joint state has come."""
+        """Notified when a joint state arrives."""
         self.ignored: Counter[str] = Counter()
-        """Messages that could not be used, by topic."""
+        """Count of unusable messages, by topic."""
         self._complaints: deque[str] = deque(maxlen=100)
         self._told: set[str] = set()
 
     def hear(self, each: Input, topic: str) -> Callable[[bytes, str, str], None]:
-        """What to call with each message of an input, on any thread.
+        """The callback for each message of an input, on any thread.
 
         Args:
             each: The input.
@@ -106,13 +106,13 @@ class Inputs:
         return received
 
     def update(self, topics: Mapping[str, str] | None = None) -> None:
-        """Decode what has come since the last call; what can't be used is counted, and the value before stays.
+        """Decode the messages since the last call; unusable ones are counted, and the previous value stays.
 
         Args:
             topics: Full names, for complaints.
         """
         for each in self.all:
-            with self.news:  # a message that comes meanwhile must not be lost: a command may come once
+            with self.news:  # a message that arrives meanwhile must not be lost: a command may come only once
                 waiting, each.waiting = each.waiting, None
             if waiting is None:
                 continue
@@ -124,29 +124,29 @@ class Inputs:
                 self._complain((topics or {}).get(each.topic, each.topic), str(problem))
 
     def complaints(self) -> list[str]:
-        """What could not be used, one line for each different problem, since the last call."""
+        """Unusable messages since the last call, one line for each different problem."""
         found = []
         while self._complaints:
             found.append(self._complaints.popleft())
         return found
 
     def missing(self) -> list[Input]:
-        """Inputs of which no good message has come yet."""
+        """Inputs without a good message yet."""
         return [each for each in self.all if each.value is None]
 
     def stale(self, now: float, timeout: float) -> list[tuple[Input, float]]:
-        """What is measured, and too old, with its age [s]; commands do not count."""
+        """Measurements that are too old, with their age [s]; commands do not count."""
         ages = [(each, now - each.arrived) for each in self.all if each.command is None]
         return [(each, age) for each, age in ages if age > timeout]
 
     def too_slow(self, now: float) -> list[Input]:
-        """Commanded velocities between 0 and all that was commanded in training: the policy would go faster than it is told."""
+        """Commanded velocities between 0 and the training's range: the policy would go faster than commanded."""
         return [
             each for each in self.all if each.command is not None and is_twist(each.command) and _is_too_slow(each, now)
         ]
 
     def snapshot(self, now: float) -> Snapshot:
-        """What is known now; nothing may be missing. A commanded velocity that is too old is 0."""
+        """The current inputs; none may be missing. A commanded velocity that is too old is 0."""
         values = {each.topic: each.value for each in self.all}
         commands = {each.command.name: _limited(each, now) for each in self.all if each.command is not None}
         position, velocity = values[JOINTS]
@@ -184,7 +184,7 @@ class Inputs:
     def _complain(self, topic: str, problem: str) -> None:
         self.ignored[topic] += 1
         line = f"{topic}: message ignored: {problem}"
-        kind = re.sub(r"[0-9.]+", "#", line)  # the same problem with other numbers is told once
+        kind = re.sub(r"[0-9.]+", "#", line)  # the same problem with other numbers is reported once
         if kind not in self._told and len(self._told) < _DIFFERENT:
             self._told.add(kind)
             self._complaints.append(line)
@@ -208,7 +208,7 @@ def _is_too_slow(each: Input, now: float) -> bool:
 
 
 def _limited(each: Input, now: float) -> np.ndarray:
-    """A command within what was commanded in training."""
+    """A command, clipped to its range in training."""
     assert each.command is not None
     value = _asked(each, now)
     ends = [(-np.inf, np.inf) if pair is None else pair for pair in each.command.ranges]
@@ -237,7 +237,7 @@ def _rotation(turn: Any) -> np.ndarray:
 
 
 def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
-    """Reads what these quantities need; a field whose covariance begins with -1 is not measured, as ROS has it."""
+    """A reader of the fields that these quantities need; by ROS's convention, a covariance that begins with -1 means "not measured"."""
     needs_turn = bool(quantities & {"projected_gravity", "root_uprightness", "imu_projected_gravity"})
     needs_rate = bool(quantities & {"imu_angular_velocity", "root_angular_velocity"})
     needs_force = "imu_acceleration" in quantities

@@ -1,4 +1,4 @@
-"""Lines for people, printed by a thread of their own: a terminal that is stopped must not stop the control loop."""
+"""Log lines, printed by a thread of their own: a stopped terminal must not stop the control loop."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import threading
 from collections.abc import Callable
 
 MOST = 1_000
-"""Lines that wait at most; later ones are dropped."""
+"""Greatest number of waiting lines; later ones are dropped."""
 
 
 class Lines:
-    """Hands lines to a thread that prints them.
+    """Passes lines to a thread that prints them.
 
     Args:
         tell: Called with each line.
@@ -24,14 +24,14 @@ class Lines:
         self._thread.start()
 
     def say(self, line: str) -> None:
-        """Have a line printed; does not wait."""
+        """Queue a line for printing; does not wait."""
         try:
             self._waiting.put_nowait(line)
         except queue.Full:
-            pass  # there is nobody to tell
+            pass  # no output is possible
 
     def close(self) -> None:
-        """Wait until all is printed, a second at most."""
+        """Wait until all lines are printed, a second at most."""
         try:
             self._waiting.put_nowait(None)
         except queue.Full:

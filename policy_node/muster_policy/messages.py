@@ -1,4 +1,4 @@
-"""ROS 2's message types: their CDR and their hashes, of one distribution."""
+"""ROS 2's message types of one distribution: their CDR encoding and their hashes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Messages:
         self._hashes: dict[str, str] = {}
 
     def type_hash(self, name: str) -> str:
-        """``RIHS01_…`` of a type; of Humble what stands for none."""
+        """``RIHS01_…`` of a type; for Humble, the placeholder."""
         if self.distribution == "humble":
             return NO_HASH
         if name not in self._hashes:
@@ -50,10 +50,10 @@ class Messages:
         return bytes(self._store.serialize_cdr(message, name))
 
     def decode(self, data: bytes, name: str) -> Any:
-        """A message from CDR. Raises Refused where the bytes are no message of that type."""
+        """A message from CDR. Raises Refused if the bytes are not a message of that type."""
         try:
             return self._store.deserialize_cdr(data, name)
-        except Exception as error:  # whatever the bytes make the reader do
+        except Exception as error:  # malformed bytes can raise any error in the reader
             raise Refused(f"{len(data)} bytes that are no {name} ({type(error).__name__})") from None
 
     def stamp(self, nanoseconds: int) -> Any:

@@ -24,16 +24,16 @@ from muster_policy.wire import Qos
 REPORT = 10.0
 """Time between two lines about the loop [s]."""
 PATIENCE = 5.0
-"""Time between two lines about inputs that are missing [s]."""
+"""Time between two lines about missing inputs [s]."""
 
 
 SLOW = 0.8
-"""Share of the rate below which it is warned."""
+"""Share of the rate below which the node warns."""
 
 
 @dataclass(frozen=True)
 class _Report:
-    """What had happened at a moment [s, monotonic]."""
+    """The counts at a moment [s, monotonic]."""
 
     time: float
     steps: int = 0
@@ -43,16 +43,16 @@ class _Report:
 
 @dataclass(frozen=True)
 class Settings:
-    """How the node runs.
+    """Settings of the node.
 
     Attributes:
-        rate: Control steps a second; None: as in training.
-        trigger: ``timer``: at the rate, by the clock; ``joint_states``: when a joint state has come, at most at the rate.
-        timeout: Age from which on what is measured is too old [s]; None: three control steps, 20 ms at least.
+        rate: Control steps per second; None: as in training.
+        trigger: ``timer``: at the rate, by the clock; ``joint_states``: when a joint state arrives, at most at the rate.
+        timeout: Age from which a measurement is too old [s]; None: three control steps, at least 20 ms.
         strict: Keep position targets within the joints' ranges.
-        controller: Publish to this ros2_control controller, too.
-        joints: Name of a joint on the robot by its name in the contract, where it differs.
-        remap: Other topics by those of the node.
+        controller: Also publish to this ros2_control controller.
+        joints: Name of a joint on the robot by its name in the contract, if it differs.
+        remap: Replacement topics by the node's topics.
         distribution: Of ROS 2.
         domain: ROS domain.
         connect: Endpoint of a router; None: none.
@@ -83,12 +83,12 @@ class PolicyNode:
 
     Args:
         bundle: Verified.
-        settings: How it runs.
+        settings: Its settings.
         policy: Of the bundle, after its self-test.
         tell: Called with each line of text.
 
     Raises:
-        Refused: The policy needs what no message has, or a setting does not fit.
+        Refused: The policy needs a quantity that no message has, or a setting does not fit.
     """
 
     def __init__(self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print) -> None:
@@ -118,7 +118,7 @@ class PolicyNode:
         self._last_report = _Report(time.monotonic())
 
     def run(self) -> None:
-        """Be a node until :attr:`stopping` is set, or the duration is over. Raises Refused where Zenoh can't be opened."""
+        """Run the node until :attr:`stopping` is set, or the duration is over. Raises Refused if Zenoh can't be opened."""
         settings, lines = self.settings, Lines(self._print)
         self._tell = lines.say
         with open_session(settings.connect, settings.listen) as session:
@@ -160,7 +160,7 @@ class PolicyNode:
 
     def _loop(self) -> None:
         gc.collect()
-        gc.freeze()  # what lives for ever is not looked through again and again
+        gc.freeze()  # exempt permanent objects from garbage collection
         begin = time.monotonic()
         ends = begin + (self.settings.duration or float("inf"))
         second, patience, report = begin + 1.0, begin + 1.0, begin + REPORT
@@ -189,10 +189,10 @@ class PolicyNode:
                 self._check_rates(now)
 
     def _wait(self, period: float) -> float | None:
-        """Wait for the next control step; returns when it should have begun, None where no joint state has come for it."""
+        """Wait for the next control step; returns the time at which it was due, None if no joint state has arrived for it."""
         if self.settings.trigger == "timer":
             due, now = self._deadline + period, time.monotonic()
-            self._deadline = now if now > due + period else due  # steps that were missed are not made up for
+            self._deadline = now if now > due + period else due  # missed steps are not made up
             sleep_until(due)
             return due
         joints, earliest = self.inputs.all[0], self._deadline + 0.75 * period
@@ -205,7 +205,7 @@ class PolicyNode:
                 self.inputs.news.wait(left)
             arrived = joints.waiting[1]
         due = self._deadline + period
-        self._deadline = arrived if arrived > due + period else due  # one that comes late does not put off the next
+        self._deadline = arrived if arrived > due + period else due  # a late joint state does not delay the next step
         return arrived
 
     def _measure(self, due: float, now: float) -> None:
@@ -265,7 +265,7 @@ class PolicyNode:
             self._tell(f"waiting for {topic} ({each.kind}): {how}")
 
     def _check_rates(self, now: float) -> None:
-        """Warn where it acts, or joint states come, more rarely than the policy was trained for."""
+        """Warn if control steps or joint states come less often than in the policy's training."""
         counts, before = self.runner.counts, self._last_report
         this = self._last_report = _Report(now, counts.steps, self.inputs.all[0].count, counts.stops)
         if self.runner.mode is not Mode.ACTING or not before.steps or this.stops != before.stops:

@@ -1,4 +1,4 @@
-"""The policy's inputs, made from what is measured as the contract says: scale, clip, offsets, history, frames of a camera."""
+"""The policy's inputs, built from measurements by the contract: scale, clip, offsets, history, frames of a camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _JOINT_OFFSETS = ("joint_offset", "measured_joint_offset")
 
 @dataclass(frozen=True)
 class _Read:
-    """A term and what reads its quantity."""
+    """A term and the reader of its quantity."""
 
     term: Term
     read: Reader
@@ -33,14 +33,14 @@ class Observations:
         contract: Of the policy.
 
     Raises:
-        Refused: A term can't be measured with the inputs that the node has; one line names all such terms.
+        Refused: The node's inputs can't measure a term; one line names all such terms.
 
     Attributes:
         joints: The joints that it reads or drives, by name, in the order of a snapshot.
         needs: Inputs that it reads, by topic.
         commands: Commands that it reads.
         images: Groups that are images.
-        quantities: Those that it reads, by name.
+        quantities: Names of the quantities that it reads.
         unit: Frame of the inertial measurement unit; None: that of the root.
     """
 
@@ -70,7 +70,7 @@ class Observations:
         self._past.clear()
 
     def acted(self, action: np.ndarray) -> None:
-        """Take in what the policy asked for, shape ``(actions,)``."""
+        """Record the policy's action, shape ``(actions,)``."""
         self._last[:] = action
 
     def build(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
@@ -139,7 +139,7 @@ class Observations:
             return _Read(term, lambda snapshot: np.zeros(len(term.names), np.float32))
 
     def _measured(self, term: Term) -> Reader:
-        """What reads the quantity of a term. Raises Refused with what would be needed."""
+        """The reader of a term's quantity. Raises Refused with the missing input."""
         if not term.library:
             if self._contract.format < 2:
                 raise Refused("the contract is of format 1, which does not say what it is; export the policy again")
@@ -218,7 +218,7 @@ def is_twist(command: Command) -> bool:
 
 
 def needed_topics(found: Observations) -> Mapping[str, str]:
-    """Topics of the node's inputs, and what each is for."""
+    """Topics of the node's inputs, and the purpose of each."""
     topics = {name: "measured" for name in (JOINTS, IMU, ODOMETRY) if name in found.needs}
     topics |= {command_topic(command): f"command {name}" for name, command in found.commands.items()}
     return topics | {image_topic(name): f"image {name}" for name in found.images}

@@ -1,4 +1,4 @@
-"""The policy itself: ``policy.onnx`` in onnxruntime on one thread, its memory, and the self-test of the bundle."""
+"""The policy itself: ``policy.onnx`` in onnxruntime on one thread, its recurrent state, and the self-test of the bundle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ another processor."""
 
 
 class Policy:
-    """Acts on one observation at a time, and remembers what a recurrent policy remembers.
+    """Acts on one observation at a time, and keeps the state of a recurrent policy.
 
     Args:
         bundle: Verified.
@@ -50,7 +50,7 @@ class Policy:
         self.reset()
 
     def reset(self, count: int = 1) -> None:
-        """Forget everything; afterwards it acts on ``count`` observations at a time."""
+        """Clear the recurrent state; afterwards the policy acts on ``count`` observations at a time."""
         self._states = {state.name: np.zeros((count, *state.shape), np.float32) for state in self._contract.states}
 
     def act(self, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -61,7 +61,7 @@ class Policy:
         return found
 
     def self_test(self, parity: bytes) -> float:
-        """Repeat what the trained policy did in the bundle's recording; returns the greatest difference, and forgets everything.
+        """Repeat the trained policy's actions in the bundle's recording; returns the greatest difference, and clears the state.
 
         Args:
             parity: ``parity.npz``.

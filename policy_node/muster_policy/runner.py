@@ -1,4 +1,4 @@
-"""The control step: from what is measured to a command, or to none; it knows nothing of clocks and networks."""
+"""The control step: from measurements to a command, or to none; independent of clocks and networks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 
 SETTLED = 0.5
-"""How long all inputs must have been fresh after one was too old, before the node commands again [s]."""
+"""Time for which all inputs must be fresh, after one was too old, before the node commands again [s]."""
 
 
 class Mode(enum.Enum):
-    """What the node does."""
+    """Mode of the node."""
 
     WAITING = "waiting for inputs"
     ACTING = "acting"
@@ -28,7 +28,7 @@ class Mode(enum.Enum):
 
 @dataclass
 class Counts:
-    """What happened so far."""
+    """Counts so far."""
 
     steps: int = 0
     limited: int = 0
@@ -39,16 +39,16 @@ class Counts:
 class Runner:
     """Decides in each control step whether to command, and what.
 
-    It commands only while all that is measured is there and fresh, and the policy's actions are numbers. Where that ends it gives one
-    last command, which holds the robot where it is, and no further one. It goes on when inputs have been fresh for :data:`SETTLED`, so
-    that an input slower than the timeout does not start and stop the robot again and again.
+    It commands only while all measurements exist and are fresh, and the policy's actions are finite. Otherwise it gives one last
+    command, which holds the robot where it is, and then stops. It resumes when inputs have been fresh for :data:`SETTLED`, so that an
+    input slower than the timeout does not start and stop the robot repeatedly.
 
     Args:
-        inputs: What is measured.
-        observations: Builds what the policy sees.
+        inputs: The measurements.
+        observations: Builds the policy's observations.
         policy: After its self-test.
         commands: Makes commands.
-        timeout: Age from which on what is measured is too old [s].
+        timeout: Age from which a measurement is too old [s].
         give: Called with each command.
         say: Called with each line of text, and whether it is a warning.
     """
@@ -68,7 +68,7 @@ class Runner:
         self.mode, self.counts = Mode.WAITING, Counts()
         self._silent: set[str] = set()
         self._settled = -float("inf")
-        """From when on inputs have been fresh for long enough [s, monotonic]."""
+        """Time from which inputs count as settled [s, monotonic]."""
         self._topics: Mapping[str, str] = {}
 
     def name_topics(self, topics: Mapping[str, str]) -> None:
@@ -80,7 +80,7 @@ class Runner:
 
         Args:
             now: [s, monotonic].
-            due: Whether to act; else it only looks whether inputs are too old.
+            due: Whether to act; otherwise it only checks whether inputs are too old.
 
         Returns:
             Whether a command was given.
@@ -112,7 +112,7 @@ class Runner:
         return self._act(now)
 
     def reset(self) -> None:
-        """Begin an episode: forget last action, history and recurrent state; a stopped node goes on."""
+        """Begin an episode: clear last action, history and recurrent state; a stopped node resumes."""
         self._forget()
         self.counts.resets += 1
         if self.mode is Mode.STOPPED:
@@ -120,7 +120,7 @@ class Runner:
             self._say("reset: it waits for its inputs", False)
 
     def end(self, why: str) -> None:
-        """Hold the robot where it is, if the node commands it; then nothing more."""
+        """If the node commands the robot, hold it where it is; then give no further command."""
         if self.mode is Mode.ACTING:
             self._hold()
             self._say(f"{why}: one last command holds the joints where they are", False)
@@ -131,7 +131,7 @@ class Runner:
         for topic in sorted(silent - self._silent):
             self._say(f"{self._topic(topic)} is silent: velocity 0 is asked for", True)
         self._silent = silent
-        with np.errstate(over="ignore"):  # what 32 bits do not hold is found below
+        with np.errstate(over="ignore"):  # a float32 overflow is found below
             seen = self.observations.build(self.inputs.snapshot(now))
         for name, numbers in seen.items():
             if not np.isfinite(numbers).all():
@@ -150,7 +150,7 @@ class Runner:
         return True
 
     def _stop(self, why: str, goes_on: str | None = None) -> None:
-        """Hold the robot, and go on where ``goes_on`` says; None: when it is reset."""
+        """Hold the robot; ``goes_on`` says in words when the node resumes; None: after a reset."""
         self._hold()
         self.mode = Mode.STOPPED if goes_on is None else Mode.WAITING
         self.counts.stops += 1

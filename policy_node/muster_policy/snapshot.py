@@ -1,4 +1,4 @@
-"""What is measured at one moment, and the quantities that follow from it."""
+"""The measurements of one moment, and the quantities derived from them."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Odometry:
 
 @dataclass
 class Snapshot:
-    """What is known now.
+    """The current inputs.
 
     Attributes:
         position: Of the node's joints, in its order [m, rad], shape ``(joints,)``.
-        velocity: Of the same [m/s, rad/s].
-        imu: The unit; None where the policy needs none.
-        odometry: None where the policy needs none.
+        velocity: Of the same joints [m/s, rad/s].
+        imu: The unit; None if the policy needs none.
+        odometry: None if the policy needs none.
         commands: Numbers by the command's name.
         images: The newest image of each group, shape ``(channels, height, width)``, uint8.
     """
@@ -160,7 +160,7 @@ FROM_IMU: Mapping[str, Quantity] = {
     "projected_gravity": _gravity,
     "root_uprightness": lambda snapshot, place: -_gravity(snapshot, place)[2],
 }
-"""Quantities that a ``sensor_msgs/Imu`` gives, by the name of the function in Muster's library."""
+"""Quantities from a ``sensor_msgs/Imu``, by the name of the function in Muster's library."""
 FROM_ODOMETRY: Mapping[str, Quantity] = {
     "imu_linear_velocity": _velocity,
     "root_linear_velocity": _velocity,
@@ -172,6 +172,6 @@ FROM_ODOMETRY: Mapping[str, Quantity] = {
     "root_orientation": _orientation,
     "heading": _heading,
 }
-"""Quantities that a ``nav_msgs/Odometry`` of the root's frame gives."""
+"""Quantities from a ``nav_msgs/Odometry`` of the root's frame."""
 OF_UNIT = frozenset({"imu_angular_velocity", "imu_acceleration", "imu_projected_gravity"})
-"""Quantities in the unit's own frame, for which it may be on any body."""
+"""Quantities in the unit's own frame; for these, the unit may be on any body."""

@@ -1,4 +1,4 @@
-"""A steady loop, and how steady it was."""
+"""A steady loop, and statistics of its timing."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections import deque
 import numpy as np
 
 SPIN = 150e-6
-"""How long before a deadline sleeping ends and looking at the clock begins [s]."""
+"""Time before a deadline at which sleeping turns into polling the clock [s]."""
 KEPT = 5_000
-"""Times of each kind that are kept: to sort more of them would take as long as a control step."""
+"""Number of times of each kind to keep: sorting more would take as long as a control step."""
 
 
 def sleep_until(deadline: float) -> None:
-    """Return at ``deadline`` [s, monotonic]: sleep, then look at the clock until it has come."""
+    """Return at ``deadline`` [s, monotonic]: sleep, then poll the clock."""
     left = deadline - time.monotonic() - SPIN
     if left > 0.0:
         time.sleep(left)
@@ -29,11 +29,11 @@ class Figures:
         self._kept: dict[str, deque[float]] = {}
 
     def add(self, name: str, seconds: float) -> None:
-        """Take in a time [s]."""
+        """Add a time [s]."""
         self._kept.setdefault(name, deque(maxlen=KEPT)).append(seconds)
 
     def percentiles(self, name: str) -> tuple[float, float, float] | None:
-        """Median, 99th percentile and maximum [s]; None where there is none."""
+        """Median, 99th percentile and maximum [s]; None without times."""
         kept = self._kept.get(name)
         if not kept:
             return None
@@ -50,5 +50,5 @@ class Figures:
         return "; ".join(parts) or "no step yet"
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Delete all times."""
         self._kept.clear()

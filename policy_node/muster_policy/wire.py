@@ -18,12 +18,12 @@ _ATTACHMENT = struct.Struct("<qqB16s")
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service of an endpoint; what is not said here is ROS 2's default.
+    """Quality of service of an endpoint; other settings are ROS 2's defaults.
 
     Attributes:
-        depth: Messages that are kept.
+        depth: Number of messages to keep.
         best_effort: Whether messages may be lost; else reliable.
-        transient_local: Whether those who come late get the last messages; else volatile.
+        transient_local: Whether late subscribers get the last messages; else volatile.
     """
 
     depth: int = 10
@@ -39,14 +39,14 @@ class Qos:
 
 @dataclass(frozen=True)
 class Endpoint:
-    """An endpoint, or a node, as a liveliness token tells it.
+    """An endpoint or a node, from a liveliness token.
 
     Attributes:
         kind: ``NN`` node, ``MP`` publisher, ``MS`` subscription, ``SS`` service, ``SC`` client.
         node: Its full name, such as ``/robot/driver``.
-        name: Of the topic or service; empty of a node.
-        type: ROS type, such as ``sensor_msgs/msg/Imu``; empty of a node.
-        type_hash: As in the token; empty of a node.
+        name: Of the topic or service; empty for a node.
+        type: ROS type, such as ``sensor_msgs/msg/Imu``; empty for a node.
+        type_hash: As in the token; empty for a node.
     """
 
     kind: str
@@ -63,7 +63,7 @@ def dds_type(name: str) -> str:
 
 
 def ros_type(name: str) -> str:
-    """``sensor_msgs/msg/Imu`` of ``sensor_msgs::msg::dds_::Imu_``; what is of no such form stays."""
+    """``sensor_msgs/msg/Imu`` of ``sensor_msgs::msg::dds_::Imu_``; other names stay unchanged."""
     parts = name.split("::")
     if len(parts) == 4 and parts[2] == "dds_":
         return f"{parts[0]}/{parts[1]}/{parts[3].removesuffix('_')}"
@@ -130,7 +130,7 @@ def endpoint_token(
 
 
 def parse_token(key: str) -> Endpoint | None:
-    """What a liveliness token tells; None of one that has another form.
+    """The endpoint of a liveliness token; None for any other form.
 
     Further fields at its end are ignored: those of Lyrical have one more, for buffer backends.
     """
@@ -147,23 +147,23 @@ def parse_token(key: str) -> Endpoint | None:
 
 
 def gid_of(token: str) -> bytes:
-    """The 16 bytes by which an endpoint is known: XXH3-128 of its liveliness token, low half first."""
+    """The 16-byte id of an endpoint: XXH3-128 of its liveliness token, low half first."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def attachment(sequence: int, nanoseconds: int, gid: bytes) -> bytes:
-    """What goes with each message, 33 bytes: without it rmw_zenoh drops the message.
+    """The attachment of each message, 33 bytes: rmw_zenoh drops messages without it.
 
     Args:
         sequence: Number of the message, from 1.
-        nanoseconds: When it was put [ns since 1970].
+        nanoseconds: Source time [ns since 1970].
         gid: Of the publisher, 16 bytes.
     """
     return _ATTACHMENT.pack(sequence, nanoseconds, len(gid), gid)
 
 
 def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
-    """Sequence number, source time [ns] and gid of a message; None where it is no attachment of rmw_zenoh."""
+    """Sequence number, source time [ns] and gid of a message; None for other attachments than rmw_zenoh's."""
     if len(data) != _ATTACHMENT.size:
         return None
     sequence, nanoseconds, length, gid = _ATTACHMENT.unpack(data)

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from orchestrator.client import Client
-from orchestrator.errors import ApiError, Unreachable
+from orchestrator.domain.errors import ApiError, Unreachable
 from tests.conftest import MUSTER, REPOSITORY, wait_for
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 from tests.support.worker.ranks import free_port

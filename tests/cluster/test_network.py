@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator import specfile
-from orchestrator.definition import compile_definition, gang_needs
-from orchestrator.engines.base import Placement, node_plans
+from orchestrator.domain.gang import gang_needs
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import node_plans
+from orchestrator.spec import file as specfile
+from orchestrator.spec.compile import compile_definition
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower

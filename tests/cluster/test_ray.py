@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -11,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines.base import EngineError
-from orchestrator.engines.ray import RayEngine
+from orchestrator.engines.api import EngineError
+from orchestrator.engines.ray.engine import RayEngine
+from orchestrator.engines.ray.folder import Folder
 from shared_store import __version__
 from shared_store.outcomes import read_outcome
 from tests.conftest import wait_for
@@ -88,16 +90,27 @@ def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(b
     assert bench.stopped(second, 0.5) == [137, 137]
 
 
+def test_what_the_driver_is_told_is_the_request_of_the_plan(bench: RayBench) -> None:
+    gang = bench.gang(nodes=2, main=1, bus="tcp/127.0.0.1:1", bus_token="the credential")
+    plan = bench.engine.plan(gang)
+    bench.ready(gang)
+    told = json.loads(Folder.of(bench.engine.home, gang.job).plan(gang.name).read_bytes())
+    assert told == json.loads(json.dumps(plan.request.told())) and told["nodes"][0]["contract"]["bus_token"]
+    for node in told["nodes"]:
+        assert f'{{"ray.io/node-id": "{node["pin"]}"}}' in plan.document
+    assert "the credential" not in plan.document
+
+
 def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(bench: RayBench) -> None:
     other = bench.ready(bench.gang(hosts=("n2",), suffix="-other", cpus=2.0))
     handle = bench.launch(bench.gang(nodes=2))
     reason = "waits for room on ray/n2: other work of the Ray cluster holds it"
-    wait_for(lambda: [node.waiting for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
+    wait_for(lambda: [node.words for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
     bench.engine.stop(other, 1.0)
     wait_for(lambda: bench.engine.observe(handle) and bench.log().count("ready") == 2, 60, "it starts")
-    assert not any(node.waiting for node in bench.engine.observe(handle))
+    assert not any(node.words for node in bench.engine.observe(handle))
     waiting = bench.launch(bench.gang(nodes=2, suffix="-third", cpus=2.0))
-    wait_for(lambda: "holds it" in bench.engine.observe(waiting)[0].waiting, 30, "a third one waits")
+    wait_for(lambda: "holds it" in bench.engine.observe(waiting)[0].words, 30, "a third one waits")
     bench.engine.stop(waiting, 1.0)
     assert not any(node.running for node in bench.engine.observe(waiting)), "one that waits can be stopped"
 
@@ -105,7 +118,7 @@ def test_it_waits_in_words_for_room_that_others_hold_and_starts_when_they_leave(
 def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: RayBench) -> None:
     handle = bench.launch(bench.gang(nodes=1, directory="/nowhere/at/all"))
     [node] = bench.ended(handle)
-    assert node.detail == (
+    assert node.words == (
         "node 0 on ray/n1: working directory /nowhere/at/all is not there: it has to be on a volume that all nodes share"
     )
     bench.engine.stop(handle, 1.0)
@@ -114,12 +127,12 @@ def test_what_is_missing_on_a_node_is_one_clear_line_and_nothing_runs(bench: Ray
     (fake / "__init__.py").write_text('__version__ = "0.0.1"\n')
     try:
         status = bench.ended(bench.launch(bench.gang(hosts=("n1", "n3"), attempt=2)))
-        assert status[0].detail == (
+        assert status[0].words == (
             f"node 1 on ray/n3 has Muster 0.0.1, the controller {__version__}: install the same on both"
         )
         (fake / "__init__.py").write_text("raise ImportError('nothing of it')\n")
         [node] = bench.ended(bench.launch(bench.gang(hosts=("n3",), attempt=3, suffix="-third")))
-        assert "Muster is not installed there for " in node.detail
+        assert "Muster is not installed there for " in node.words
         assert bench.lines(attempt=2) == []
     finally:
         shutil.rmtree(fake)
@@ -129,8 +142,8 @@ def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_run
     # what such a node finds: not the epoch that the controller has written
     handle = bench.start(bench.gang(hosts=("n2",), epoch=2))
     [node] = bench.ended(handle)
-    assert node.detail.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
-    assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.detail
+    assert node.words.startswith(f"node 0 on ray/n2: store {bench.store.path} on "), node
+    assert "is not the controller's: run run has epoch 1 there, not 2; mount the same volume" in node.words
     assert bench.lines() == [] and read_outcome(bench.run, bench.job, 1, 0) is None
 
 

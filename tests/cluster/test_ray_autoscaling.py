@@ -95,7 +95,7 @@ def test_machines_are_asked_for_come_and_go(growing: RayCluster, tmp_path: Path)
         assert names() == ["ray/+1", "ray/+2"], "what may be added is there to be planned with"
         handle = bench.launch(bench.gang(hosts=("+1", "+2"), cpus=1.0))
         reason = "waits for 2 more nodes with 1 CPUs, 256 MiB: Ray's autoscaler was asked"
-        wait_for(lambda: [node.waiting for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
+        wait_for(lambda: [node.words for node in bench.engine.observe(handle)] == [reason] * 2, 30, "it says why")
         wait_for(lambda: bench.log().count("ready") == 2, 90, f"machines come: {bench.engine.observe(handle)}")
         assert sorted(names()) == ["ray/+1", "ray/+2"], "as long as it runs there, they are called as it was planned"
         # The watch looks once a second: what has printed may have a machine that it has not seen yet.

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines import slurm
-from orchestrator.engines.base import EngineError, NotYet
-from orchestrator.engines.slurm import SlurmEngine
-from orchestrator.engines.slurm_commands import call
+from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.slurm import engine as slurm
+from orchestrator.engines.slurm.commands import call
+from orchestrator.engines.slurm.engine import SlurmEngine
 from shared_store.checkpoints import list_checkpoints
 from shared_store.outcomes import read_outcome
 from tests.conftest import MUSTER, PATIENCE, Serving, wait_for
@@ -74,7 +74,7 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
     bench.cluster.kill("n2")
     try:
         child = bench.ended(first)[1]
-        assert bench.state(first) == "NODE_FAIL" and child.detail.startswith("Slurm lost a node of n[1-2] (job ")
+        assert bench.state(first) == "NODE_FAIL" and child.words.startswith("Slurm lost a node of n[1-2] (job ")
         bench.engine.stop(first, 5.0)
         alive = bench.processes()
         assert len(alive) == 2, "the shim and the supervisor on n2 live on: Slurm can't reach them"

@@ -1,4 +1,4 @@
-"""Law 2: orchestrator → shared_store ← worker, and no torch outside the worker."""
+"""Law 2: orchestrator → shared_store ← worker, no torch outside the worker, and the rooms of the orchestrator."""
 
 from __future__ import annotations
 
@@ -19,16 +19,38 @@ FORBIDDEN = {
     "worker": {"orchestrator"},
     "policy_node": HEAVY | {"worker", "orchestrator", "shared_store"},
 }
-LIGHT_IN_WORKER = (
-    "supervisor.py",
-    "aws_node.py",
-    "lifeline.py",
-    "slurm_node.py",
-    "rank.py",
-    "processes.py",
-    "network.py",
-    "__init__.py",
-)
+LIGHT_IN_WORKER = ("node", "supervisor.py", "slurm_node.py", "aws_node.py", "__init__.py")
+
+LAYERS = {
+    "domain": set[str](),
+    "spec": {"domain"},
+    "scheduling": {"domain"},
+    "persistence": {"domain"},
+    "engines": {"domain"},
+    "control": {"domain", "spec", "scheduling", "persistence", "engines"},
+    "api": {"domain", "spec", "scheduling", "persistence", "engines", "control", "keys"},
+    "home": {"domain"},
+    "keys": {"domain"},
+    "client": {"domain", "home"},
+    "server": {"domain", "engines", "persistence", "control", "api", "home", "keys"},
+    "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server"},
+}
+"""What each room of the orchestrator may import beside itself."""
+ADAPTERS = {
+    "alembic",
+    "boto3",
+    "botocore",
+    "docker",
+    "fastapi",
+    "httpx",
+    "ray",
+    "sqlalchemy",
+    "starlette",
+    "uvicorn",
+    "zenoh",
+}
+PURE = ("domain", "spec", "scheduling")
+HTTP_SERVER = {"fastapi", "starlette", "uvicorn"}
 
 
 def imported(path: Path) -> set[str]:
@@ -50,10 +72,65 @@ def test_no_module_imports_what_its_room_may_not(package: str) -> None:
         assert not imported(module) & FORBIDDEN[package], module
 
 
+def imported_modules(path: Path) -> set[tuple[str, ...]]:
+    """What the module imports of the orchestrator, name by name, each by its parts."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {tuple(name.split(".")) for name in names if name.startswith("orchestrator.")}
+
+
+def modules_of(room: str) -> list[Path]:
+    path = REPOSITORY / "orchestrator" / room
+    return sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+
+
+def test_every_room_of_the_orchestrator_has_a_layer() -> None:
+    entries = (REPOSITORY / "orchestrator").iterdir()
+    assert {entry.stem for entry in entries if not entry.name.startswith("__")} == set(LAYERS)
+
+
+@pytest.mark.parametrize("room", LAYERS)
+def test_a_room_of_the_orchestrator_imports_only_the_layers_below_it(room: str) -> None:
+    for module in modules_of(room):
+        for parts in imported_modules(module):
+            assert parts[1] in {room, *LAYERS[room]}, (module, ".".join(parts))
+
+
+def test_pure_rooms_import_no_adapter_and_nothing_but_the_api_imports_an_http_server() -> None:
+    for room in LAYERS:
+        for module in modules_of(room):
+            if room in PURE:
+                assert not imported(module) & ADAPTERS, module
+            elif room not in ("api", "server"):
+                assert not imported(module) & HTTP_SERVER, module
+
+
+def test_the_apis_of_aws_import_nothing_of_the_native_one() -> None:
+    for room in ("batch", "logs"):
+        for module in (REPOSITORY / "orchestrator" / "api" / room).glob("*.py"):
+            assert ("api", "native") not in {parts[1:3] for parts in imported_modules(module)}, module
+
+
+def test_an_engine_imports_no_other_engine() -> None:
+    engines = REPOSITORY / "orchestrator" / "engines"
+    rooms = {path.name for path in engines.iterdir() if path.is_dir() and not path.name.startswith("__")}
+    assert {"toolkit", "local", "docker", "ray", "slurm", "aws_batch"} <= rooms
+    for room in rooms:
+        for module in (engines / room).rglob("*.py"):
+            used = {parts[2] for parts in imported_modules(module) if parts[1] == "engines"}
+            assert used <= {"api", "toolkit", room}, module
+
+
 def test_the_supervisor_imports_no_torch() -> None:
     for name in LIGHT_IN_WORKER:
-        assert not imported(REPOSITORY / "worker" / name) & HEAVY, name
-    code = "import sys, worker.supervisor, worker.slurm_node, orchestrator.cli; print(*sys.modules)"
+        path = REPOSITORY / "worker" / name
+        for module in [path] if path.suffix else path.rglob("*.py"):
+            assert not imported(module) & HEAVY, module
+    code = "import sys, worker.supervisor, worker.slurm_node, worker.aws_node, orchestrator.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not set(loaded) & HEAVY
 

@@ -200,7 +200,7 @@ def _publish(
                 "created": time.time(),
             },
         )
-        while True:  # until nobody else has just published the same checkpoint's
+        while True:  # until no other process has just published the same checkpoint's
             with contextlib.suppress(FileNotFoundError):
                 remove_tree(target)
             with contextlib.suppress(FileExistsError):

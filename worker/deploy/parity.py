@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-5
 """Greatest difference of an action, absolute up to 1 and relative beyond."""
 STEPS = 3
-"""Steps on made-up observations: in one step nobody sees what a policy remembers."""
+"""Steps on made-up observations: a single step would not show a policy's memory."""
 
 
 class Runnable(Protocol):
@@ -31,7 +31,7 @@ class Runnable(Protocol):
 
 @dataclass(frozen=True)
 class Recording:
-    """What some worlds showed a policy, step by step."""
+    """The observations of some worlds, step by step."""
 
     inputs: Mapping[str, np.ndarray]
     """By name of the policy's input, shape (steps, worlds, …); its groups in the policy's order."""
@@ -65,7 +65,7 @@ def made_up(exported: ExportedPolicy) -> Recording:
 
 
 def trained_actions(policy: Policy, recording: Recording, groups: Mapping[str, str]) -> np.ndarray:
-    """What the trained policy does, on the CPU; shape (steps, worlds, actions).
+    """Actions of the trained policy, on the CPU; shape (steps, worlds, actions).
 
     Args:
         policy: As it was trained, not as it is exported.
@@ -83,7 +83,7 @@ def trained_actions(policy: Policy, recording: Recording, groups: Mapping[str, s
 
 
 def exported_actions(policy: Runnable, recording: Recording) -> np.ndarray:
-    """What the exported policy does; shape (steps, worlds, actions)."""
+    """Actions of the exported policy; shape (steps, worlds, actions)."""
     actions = []
     policy.reset()
     for step, begins in enumerate(recording.begins):

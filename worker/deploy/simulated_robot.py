@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
 PATIENCE = 5.0
-"""Seconds between two lines while nobody commands it."""
+"""Seconds between two lines while no commands arrive."""
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
 """Covariance of what a sensor does not measure, as ROS has it."""
 
@@ -55,7 +55,7 @@ class SimulatedRobot:
         self._columns = {action.name: index for index, action in enumerate(contract.actions)}
 
     def measured(self, nanoseconds: int) -> list[Message]:
-        """What its sensors say now, the joint states last: who acts when they come has all the rest."""
+        """Its sensors' present values, the joint states last: a policy that acts on their arrival has all the others."""
         found: list[Message] = []
         if self._view.root_coordinate >= 0:
             found += self._root(nanoseconds)
@@ -224,7 +224,7 @@ def play(
             publish(*message)
         deadline = max(deadline + period / speed, time.monotonic())
         time.sleep(max(0.0, deadline - time.monotonic()))
-        if not newest and not begun:  # nobody acts yet
+        if not newest and not begun:  # no commands yet
             if time.monotonic() > patience:
                 patience = time.monotonic() + PATIENCE
                 told("no joint_commands yet; is a policy node there, and on the same router? muster-policy BUNDLE")

@@ -30,12 +30,12 @@ class Acting(Protocol):
 
 
 class Stopped(Exception):
-    """Somebody asked the gang to leave; nothing was recorded."""
+    """The gang was asked to leave; nothing was recorded."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """What is known of each episode, by its number; the same on all ranks.
+    """The record of each episode, by its number; the same on all ranks.
 
     Attributes:
         rows: Shape ``(episodes, 5 + terms)``, float64, on the CPU: return, length [steps], whether the clock ended it, index of its cause

@@ -30,7 +30,7 @@ SIM_TRACE_COLUMNS = (
 """Of a SimTrace file, as DeepRacer's community reads it."""
 COMPLETE = "lap_complete"
 _CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}
-"""What a trial calls how often each mishap happened."""
+"""A trial's names for the counts of mishaps."""
 _STATUS = {"time_out": "time_up"}
 """What SimTrace files call an end otherwise."""
 
@@ -137,7 +137,7 @@ class Race:
         }
 
     def columns(self) -> dict[str, list[Any]]:
-        """What a table has of each trial, by column."""
+        """The columns of a trial in a table."""
         trials = self.summary()["trials"]
         return {name: [trial[name] for trial in trials] for name in trials[0] if name != "seed"}
 

@@ -18,7 +18,7 @@ from shared_store.pairs import LEVEL, quantile, verdict
 
 @dataclass(frozen=True)
 class Sample:
-    """What a comparison needs of a sample: its size, mean and standard deviation (of n - 1)."""
+    """The statistics of a sample for a comparison: its size, mean and standard deviation (of n - 1)."""
 
     count: int
     mean: float

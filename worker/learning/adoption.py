@@ -1,4 +1,4 @@
-"""How a clone begins: from a copy of another run's weights, kept in its own run directory (:mod:`shared_store.parent`)."""
+"""The start of a clone: from a copy of another run's weights in its own run directory (:mod:`shared_store.parent`)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from worker.learning.shards import read_file
 
 
 def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) -> Checkpoint | None:
-    """Give ``algorithm`` the weights with which the run begins; None where it begins with new ones. All ranks call it.
+    """Load the run's initial weights into ``algorithm``; None if the run begins with new ones. All ranks call it.
 
     Args:
         job: The job, whose run has no checkpoint of its own yet.
         gang: The ranks.
-        algorithm: Takes over networks and normalisers; its optimizer stays new.
-        facts: What a manifest of this job says of task, algorithm and policy.
+        algorithm: Receives networks and normalisers; its optimizer stays new.
+        facts: Entries of this job's manifests on task, algorithm and policy.
 
     Raises:
-        UserError: The weights are missing or damaged, or do not fit; the message says which tensor or setting differs.
+        UserError: The weights are missing, damaged or do not fit; the message names the differing tensor or setting.
     """
     name, problem = None, ""
     if gang.is_main:
@@ -69,7 +69,7 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
 
 
 def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: Algorithm) -> None:
-    """What tensors alone would not show, or only in many lines. Raises UserError with the first setting that differs."""
+    """Check settings whose difference tensors would not show, or only in many lines. Raises UserError with the first difference."""
     there = checkpoint.manifest
     if (learnt := there.get("algorithm")) != here["algorithm"]:
         if not any(":" in str(name) for name in (learnt, here["algorithm"])):
@@ -88,7 +88,7 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
 
 
 def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """In what algorithm, or inputs and outputs of the policy, differ, in words; nothing where they are alike."""
+    """The differences in algorithm or in the policy's inputs and outputs, in words; empty without any."""
     if there.get("algorithm") != here["algorithm"]:
         return f"; they are of algorithm {there.get('algorithm')}, and {here['algorithm']} does not read them"
     told = []
@@ -100,7 +100,7 @@ def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def _difference(own: Any, saved: Any) -> str:
-    """The first tensor of the networks that is missing on one side or has another shape; nothing where no such is found."""
+    """The first tensor of the networks that is missing on one side or has another shape; empty without any."""
     if not isinstance(saved, Mapping):
         return f"it holds a {type(saved).__name__} where the state of an algorithm is expected"
     shapes, there = (dict(_shapes(each)) for each in (own, saved))
@@ -114,7 +114,7 @@ def _difference(own: Any, saved: Any) -> str:
 
 
 def _shapes(state: Any, path: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Name and shape of every tensor that is no part of an optimizer."""
+    """Name and shape of every tensor outside the optimizers."""
     if isinstance(state, torch.Tensor):
         yield path, tuple(state.shape)
     items = state.items() if isinstance(state, Mapping) else enumerate(state) if isinstance(state, list | tuple) else ()

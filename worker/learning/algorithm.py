@@ -1,7 +1,7 @@
-"""What an algorithm is to the rest of Muster: the loop, checkpoints, evaluation, the memory estimate and export know only this.
+"""The algorithm protocol: all that the loop, checkpoints, evaluation, the memory estimate and export know of an algorithm.
 
 An iteration calls, in this order: :meth:`Algorithm.begin`; then, ``steps`` times, :meth:`Algorithm.act`, the task's step and
-:meth:`Algorithm.record`; then :meth:`Algorithm.learn`. On CUDA the steps of an iteration become one graph where the algorithm allows
+:meth:`Algorithm.record`; then :meth:`Algorithm.learn`. On CUDA the steps of an iteration become one graph if the algorithm allows
 it, and :meth:`Algorithm.learn` may replay graphs of its own (:class:`worker.learning.cuda_graph.CudaGraphFunction`).
 """
 
@@ -19,12 +19,12 @@ from worker.distributed import Gang
 from worker.learning.cuda_graph import CudaGraphFunction
 
 POLICY = "policy"
-"""Name of the observation group that every task has: what the policy sees."""
+"""Name of the observation group that every task has: the policy's observations."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """Which worlds a rank holds: ``[first, first + count)`` of ``total``, by global index."""
+    """The worlds of a rank: ``[first, first + count)`` of ``total``, by global index."""
 
     first: int
     count: int
@@ -39,12 +39,12 @@ class Share:
 
 @dataclass(frozen=True)
 class Spaces:
-    """What goes into a policy and what comes out of it."""
+    """Shapes of a policy's inputs and outputs."""
 
     observations: Mapping[str, tuple[int, ...]]
     """Shape of one observation of each group: ``(size,)`` of numbers, ``(channels, height, width)`` of an image of bytes."""
     actions: int
-    """Length of one action; of a task with choices, how many there are."""
+    """Length of one action; for a task with discrete actions, the number of choices."""
     discrete: bool = False
     """Whether an action is one of ``actions`` choices: then :meth:`Algorithm.act` returns their numbers, shape (worlds, 1), float32."""
 
@@ -59,30 +59,31 @@ class Spaces:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where an algorithm learns."""
+    """The setting in which an algorithm learns."""
 
     spaces: Spaces
     share: Share
     """The worlds of this rank, and of all."""
     gang: Gang
-    """The ranks that learn together; its ``device`` is where everything is."""
+    """The ranks that learn together; all tensors are on its ``device``."""
     seed: int
-    """Of everything that the algorithm draws. Weights are drawn from torch's own generator, which is seeded alike on all ranks."""
+    """Seed of all random numbers of the algorithm. Weights come from torch's own generator, which has the same seed on all ranks."""
     control_seconds: float = 1.0
     """Length of a control step [s]."""
     rehearsal: bool = False
-    """Whether one iteration is run to see what memory it takes, and nothing else: it has to learn, as if what it waits for (a full
-    replay, a teacher's weights) were there."""
+    """Whether the only purpose is to measure the memory of one iteration: it must learn as if its preconditions (a full replay, a
+    teacher's weights) were met."""
 
 
 @dataclass(frozen=True)
 class Transition:
-    """What one control step of all worlds of the rank did. The tensors are the task's own buffers: copy what is kept."""
+    """The result of one control step of all worlds of the rank. The tensors are the task's own buffers: copy those that you keep."""
 
     observations: TensorDict
-    """After the step, and after the reset of the worlds whose episode ended: where the next step begins. Batch size (worlds,)."""
+    """Observations after the step, and after the reset of the worlds whose episode ended: the input of the next step. Batch size
+    (worlds,)."""
     terminal_observations: TensorDict
-    """Before that reset; valid where ``dones``, and holding vector groups alone: of images none is taken then. Batch size (worlds,)."""
+    """Observations before that reset; valid where ``dones``, and only vector groups: no image is rendered then. Batch size (worlds,)."""
     rewards: torch.Tensor
     """Shape (worlds,), float32."""
     dones: torch.Tensor
@@ -92,29 +93,29 @@ class Transition:
 
 
 class Policy(Protocol):
-    """What was learnt, without anything that learning needs: it is evaluated and exported. It draws no random numbers."""
+    """The learnt policy, without the training state, for evaluation and export. It draws no random numbers."""
 
     def act(self, observations: TensorDict) -> torch.Tensor:
         """The policy's best action for each world.
 
         Args:
-            observations: As the task gives them, batch size (n,); the groups in ``spaces.observations``.
+            observations: From the task, batch size (n,); the groups in ``spaces.observations``.
 
         Returns:
-            Shape (n, actions), float32; of a task with choices (n, 1).
+            Shape (n, actions), float32; for a task with choices (n, 1).
         """
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Forget what is remembered of the running episodes (recurrent policies), of all worlds or where ``worlds`` (n,) is true."""
+        """Clear the recurrent state, if any, of all worlds or where ``worlds`` (n,) is true."""
 
     def module(self) -> ExportedPolicy:
-        """The same policy as a module that can be written as ONNX, on the CPU."""
+        """The same policy as a module for the export to ONNX, on the CPU."""
 
     def state_dict(self) -> Mapping[str, Any]:
         """Tensors and plain values."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Any:
-        """Take over what :meth:`state_dict` gave. Raises RuntimeError where it does not fit."""
+        """Load the result of :meth:`state_dict`. Raises RuntimeError if it does not fit."""
 
 
 @dataclass(frozen=True)
@@ -122,14 +123,13 @@ class ExportedPolicy:
     """A policy as a function of tensors."""
 
     network: nn.Module
-    """Takes the inputs in order; gives the outputs in order: the actions, then the new recurrent state, if any."""
+    """Takes the inputs in order; returns the outputs in order: the actions, then the new recurrent state, if any."""
     inputs: Mapping[str, torch.Tensor]
     """An example of each input, batch size 1: ``obs`` (and one more for each further group), then the recurrent state, if any."""
     outputs: Sequence[str]
     """Names: ``actions``, then the recurrent state, if any, as ``<input>_out``."""
     sample: TensorDict
-    """Observations as the policy has met them, batch size (n,), in the order of the inputs: those on which what was exported is
-    compared."""
+    """Observations typical of the policy's training, batch size (n,), in the order of the inputs, to compare the exported policy on."""
 
     @property
     def states(self) -> list[str]:
@@ -149,87 +149,87 @@ class Algorithm(Protocol):
     """
 
     config_type: ClassVar[Any]
-    """Its settings: a pydantic dataclass that is imported without torch. ``fixed``, where it has that, names those that a resumed run
-    can't change."""
+    """Its settings: a pydantic dataclass that is imported without torch. The optional ``fixed`` names those that a resumed run can't
+    change."""
     captures_rollout: ClassVar[bool]
-    """Whether :meth:`act` and :meth:`record` keep to the rules of :class:`worker.learning.cuda_graph.CudaGraphFunction`.
+    """Whether :meth:`act` and :meth:`record` follow the rules of :class:`worker.learning.cuda_graph.CudaGraphFunction`.
 
-    One more attribute of the class is optional: ``kernels``, modules with Warp kernels, which one rank of each host compiles."""
+    The class may also have an attribute ``kernels``: modules with Warp kernels, which one rank of each host compiles."""
 
     steps: int
     """Control steps of every world in one iteration."""
     graphs: Sequence[CudaGraphFunction]
-    """What :meth:`learn` replays as graphs, for the run's log; the loop releases them in the end."""
+    """The graphs that :meth:`learn` replays, for the run's log; the loop releases them at the end."""
 
     def __init__(self, config: Any, setting: Setting) -> None:
-        """Allocate everything once. Raises ValueError, in one line with the name of the setting, for what it can't do."""
+        """Allocate all buffers once. Raises ValueError for an unsupported setting, in one line with its name."""
 
     def begin(self, iteration: int) -> None:
-        """Called before the steps of an iteration, outside any graph: schedules, and what must be drawn beforehand.
+        """Called before the steps of an iteration, outside any graph: for schedules, and random numbers that must be drawn beforehand.
 
         Args:
-            iteration: How many are done.
+            iteration: Number of finished iterations.
         """
 
     def act(self, observations: TensorDict) -> torch.Tensor:
-        """Actions to take now, shape (worlds, actions), float32; of a task with choices (worlds, 1). Batch size (worlds,)."""
+        """The next actions, shape (worlds, actions), float32; for a task with choices (worlds, 1). Batch size (worlds,)."""
 
     def record(self, step: Transition) -> None:
-        """Take in what the step after :meth:`act` did."""
+        """Record the result of the step after :meth:`act`."""
 
     def learn(self, observations: TensorDict) -> Mapping[str, torch.Tensor]:
-        """Learn from what was recorded; nothing in here waits for the device.
+        """Learn from the recorded steps, without waiting for the device.
 
         Args:
             observations: After the last step, batch size (worlds,).
 
         Returns:
-            Metrics of all ranks by name, each of shape (), on the device: the same names in every iteration, the same values on all
-            ranks, and finite: where one is not, training ends with an error that names it. A ``learning_rate`` is kept in manifests.
+            Metrics of all ranks by name, each of shape (), on the device, with the same names in every iteration and the same values on
+            all ranks. A non-finite value ends training with an error that names it. A ``learning_rate`` is kept in manifests.
         """
 
     def policy(self) -> Policy:
-        """What was learnt so far: a live view, which changes as learning goes on."""
+        """The current policy: a live view, which changes with the learning."""
 
     def state_dict(self) -> Mapping[str, Any]:
-        """All that outlasts an iteration and is the same on all ranks (live tensors and plain values), with the policy under ``policy``."""
+        """The state that outlasts an iteration and is the same on all ranks (live tensors and plain values); its key ``policy`` has the policy."""
 
     def load_state_dict(
         self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
     ) -> Sequence[str]:
-        """Go on from :meth:`state_dict`.
+        """Continue from :meth:`state_dict`.
 
         Args:
-            weights_only: From its networks and normalisers alone, with a fresh optimizer.
-            changed: Settings that this job gives otherwise than the one before it, so that they count, not what was saved.
+            weights_only: Load only networks and normalisers, with a new optimizer.
+            changed: Settings that this job changes, whose new values override the saved ones.
 
         Returns:
-            Lines for the log: what was set in place of what was saved.
+            Lines for the log about overridden values.
 
         Raises:
             RuntimeError, ValueError, KeyError: It does not fit.
         """
 
     def world_state(self) -> Mapping[str, torch.Tensor]:
-        """What is kept for each world from iteration to iteration (recurrent state, replay): live, leading dimension (worlds,)."""
+        """The state of each world between iterations (recurrent state, replay): live tensors, leading dimension (worlds,)."""
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on from :meth:`world_state`, of the same worlds in the same order."""
+        """Continue from :meth:`world_state` of the same worlds in the same order."""
 
     @classmethod
     def build_policy(cls, config: Any, spaces: Spaces, device: str) -> Policy:
-        """A policy that can take over the ``policy`` of a :meth:`state_dict`, without anything that learning needs."""
+        """A policy without the training state, which can load the ``policy`` of a :meth:`state_dict`."""
 
 
 @runtime_checkable
 class Student(Protocol):
-    """What an :class:`Algorithm` has besides, where it may learn from the policy of another run."""
+    """Additional members of an :class:`Algorithm` that can learn from the policy of another run."""
 
     teacher_checkpoint: str | None
-    """That run, ``RUN`` or ``RUN@ITERATION``; None where these settings ask for no teacher. The setting has the same name."""
+    """That run, ``RUN`` or ``RUN@ITERATION``; None without a teacher. The setting has the same name."""
 
     def load_teacher(self, state: Mapping[str, Any]) -> None:
         """Take the teacher's weights from its :meth:`Algorithm.state_dict`; called on all ranks before the first iteration of a run.
 
-        A run that goes on has them in its own checkpoint. Raises ValueError where they do not fit.
+        A resumed run has them in its own checkpoint. Raises ValueError if they do not fit.
         """

@@ -1,4 +1,4 @@
-"""The algorithms by the names that ``train.algorithm`` gives them."""
+"""The algorithms by their names in ``train.algorithm``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DEFAULT = "ppo"
 
 
 def installed() -> dict[str, str]:
-    """Where the class of each installed algorithm is (``module:Class``), by its name: the entry points ``muster.algorithms``."""
+    """The class (``module:Class``) of each installed algorithm, by name, from the entry points ``muster.algorithms``."""
     found = {point.name: point.value for point in entry_points(group="muster.algorithms")}
     source = Path(__file__).parents[2] / "pyproject.toml"
     if not found and source.exists():  # a source tree on the path, not installed
@@ -35,12 +35,12 @@ def installed() -> dict[str, str]:
 
 
 def section_of(name: str) -> str:
-    """The section of ``train`` that has an algorithm's settings: that of its name, or ``settings`` for a user's own."""
+    """The section of ``train`` with an algorithm's settings: its name, or ``settings`` for a user's own."""
     return "settings" if ":" in name else name
 
 
 def find_algorithm(name: str) -> type[Algorithm]:
-    """The class of an algorithm. Raises UserError for a name of none.
+    """The class of an algorithm. Raises UserError for an unknown name.
 
     Args:
         name: One of :func:`installed`, or ``module:Class`` of a user's own, importable from the job's directory.
@@ -54,7 +54,7 @@ def find_algorithm(name: str) -> type[Algorithm]:
             f"train.algorithm: no algorithm is called {shown(name)}; known: {there}, and module:Class of your own"
         )
     if place == name and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # as a task of the user's own is found (worker.tasks)
+        sys.path.append(os.getcwd())  # as for a user's own task (worker.tasks)
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
@@ -67,7 +67,7 @@ _METHODS = [name for name in vars(Algorithm) if not name.startswith("_")]
 
 
 def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
-    """Raises UserError, with the names of those that are missing, where ``found`` has not all ``parts``."""
+    """Raises UserError with the names of the ``parts`` that ``found`` lacks."""
     if missing := [part for part in parts if not hasattr(found, part)]:
         raise UserError(
             f"train.algorithm: {name} is no algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
@@ -75,13 +75,13 @@ def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
 
 
 def check_state(algorithm: Algorithm, name: str) -> None:
-    """Raises UserError where the state of an algorithm has no policy, which evaluation and export read."""
+    """Raises UserError if the state of an algorithm lacks the policy, which evaluation and export read."""
     if not isinstance(algorithm.state_dict().get("policy"), Mapping):
         raise UserError(f'train.algorithm: {name}: state_dict() must hold "policy", the state_dict() of its policy')
 
 
 def check_actions(actions: Any, expected: torch.Size, name: str) -> None:
-    """Raises UserError for actions that are no tensor of the ``expected`` shape."""
+    """Raises UserError for actions other than a tensor of the ``expected`` shape."""
     if not isinstance(actions, torch.Tensor) or actions.shape != expected:
         found = tuple(actions.shape) if isinstance(actions, torch.Tensor) else type(actions).__name__
         raise UserError(
@@ -104,7 +104,7 @@ def check_metrics(metrics: Any, name: str) -> None:
 
 
 def check_names(metrics: Collection[str], record: Collection[str], name: str) -> None:
-    """Raises UserError for a metric that is called like a number of every record."""
+    """Raises UserError for a metric with the name of a number that every record has."""
     if taken := sorted(set(metrics) & set(record)):
         raise UserError(
             f"train.algorithm: {name}: a metric of learn() can't be called {taken[0]}: every record has one"
@@ -112,7 +112,7 @@ def check_names(metrics: Collection[str], record: Collection[str], name: str) ->
 
 
 def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:
-    """The algorithm's settings: the task's own for it, with what the job sets. Raises UserError naming the key.
+    """The algorithm's settings: the task's own for it, with the job's changes. Raises UserError naming the key.
 
     Args:
         section: The job's ``train``: settings stand under the algorithm's name, those of a user's own under ``settings``.
@@ -135,17 +135,17 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
 
 
 def refusal(where: str, error: TypeError | ValueError) -> str:
-    """In one line what settings refuse; ``where``: their section of ``train``."""
+    """The error of refused settings in one line; ``where``: their section of ``train``."""
     if not isinstance(error, ValidationError):
         return f"train.{where}: {' '.join(str(error).split())}"
     first: Any = error.errors(include_url=False)[0]
-    if isinstance(first.get("input"), ArgsKwargs):  # of a rule over several fields the words say it all
+    if isinstance(first.get("input"), ArgsKwargs):  # the message of a rule over several fields is complete
         first["input"] = {}
     return f"{'.'.join(map(str, ('train', where, *path_of(first))))}: {explain(first)}"[:1000]
 
 
 def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
-    """What to say of a setting that an algorithm does not have."""
+    """The error for a setting that an algorithm does not have."""
     if key in elsewhere:
         return f"there is no such setting; {elsewhere[key]}"
     return f"there is no such setting; {nearest(key, sorted(known))}"

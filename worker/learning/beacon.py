@@ -1,4 +1,4 @@
-"""What a rank tells its supervisor as it goes: one JSON line a message on an inherited pipe, never waiting."""
+"""A rank's progress messages to its supervisor: one JSON line each on an inherited pipe, without waiting."""
 
 from __future__ import annotations
 
@@ -28,4 +28,4 @@ class Beacon:
         except BlockingIOError:
             pass
         except OSError:
-            self._descriptor = None  # nobody listens any more
+            self._descriptor = None  # the supervisor no longer listens

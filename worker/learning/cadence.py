@@ -1,4 +1,4 @@
-"""When to save."""
+"""The schedule of saves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 OVERHEAD = 0.01
 """Share of the time that ``every: auto`` spends on saving."""
 _FIRST = 5
-"""Iterations to the first save, and the least between two."""
+"""Iterations to the first save, and the minimum between two saves."""
 _LONGEST = 1000
 
 
@@ -21,7 +21,7 @@ class Cadence:
         self._last = 0
 
     def expects(self, iteration: int) -> bool:
-        """Whether a save after ``iteration`` is likely, as far as can be known before its signals."""
+        """Whether a save after ``iteration`` is likely, before its signals are known."""
         return iteration - self._last >= self.every if self.auto else iteration % self.every == 0
 
     def due(self, iteration: int, signals: Mapping[str, float]) -> bool:
@@ -30,7 +30,7 @@ class Cadence:
             return iteration % self.every == 0
         if signals["stall"] > 0 and signals["iteration_seconds"] > 0:
             wanted = math.ceil(signals["stall"] / (OVERHEAD * signals["iteration_seconds"]))
-            # not at once: where the loop waits for the volume now and then, the next save says nothing of it
+            # not at once: if the loop only sometimes waits for the volume, the next save alone does not show it
             self.every = min(max(wanted, self.every // 2, _FIRST), _LONGEST)
         if iteration - self._last < self.every:
             return False

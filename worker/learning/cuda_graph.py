@@ -1,4 +1,4 @@
-"""Recording a stretch of torch and Warp work as one CUDA graph. On the CPU the same function runs as it is written."""
+"""Capture a sequence of torch and Warp work as one CUDA graph. On the CPU the same function runs eagerly."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from worker.simulation.capture import garbage_collection_paused
 class CudaGraphFunction:
     """A function without arguments that a CUDA device replays as one graph.
 
-    The first call runs it as it is (kernels are loaded, lazy buffers made, and the work is done), the second one records it, and
-    every later call replays the record: one launch, whatever is in it. So the function must
+    The first call runs it eagerly (which loads kernels and allocates lazy buffers), the second call captures it, and every later call
+    replays the graph with a single launch. So the function must
 
-    - touch only tensors that stay where they are, and Python values that stay what they are;
-    - never ask the device for a value, which a recording refuses with an error;
+    - touch only tensors with fixed addresses, and Python values that do not change;
+    - never read a value back from the device, which is an error during a capture;
     - draw no random numbers (fill a buffer with them beforehand).
 
     Args:
-        function: What to do.
+        function: The function.
         device: ``"cpu"``, where :meth:`__call__` always runs ``function``, or ``"cuda:<n>"``.
         name: For the run's log.
     """
@@ -32,16 +32,16 @@ class CudaGraphFunction:
         self._ran = False
         self._graph: torch.cuda.CUDAGraph | None = None
         self.seconds = 0.0
-        """How long recording took [s]."""
+        """Duration of the capture [s]."""
 
     @property
     def can_be_captured(self) -> bool:
-        """Whether it will be, sooner or later."""
+        """Whether a later call can capture it."""
         return self._cuda
 
     @property
     def captured(self) -> bool:
-        """Whether calls replay a graph by now."""
+        """Whether calls now replay a graph."""
         return self._graph is not None
 
     def __call__(self) -> None:
@@ -54,7 +54,7 @@ class CudaGraphFunction:
         self._graph.replay()
 
     def release(self) -> None:
-        """Forget the graph. A process group must not be left while a graph holds its collectives: NCCL would wait for ever."""
+        """Delete the graph. Do so before leaving a process group whose collectives it holds: NCCL would wait forever."""
         if self._graph is not None:
             self._graph.reset()
             self._graph = None
@@ -62,7 +62,7 @@ class CudaGraphFunction:
     def _record(self) -> torch.cuda.CUDAGraph:
         started = time.perf_counter()
         graph = torch.cuda.CUDAGraph()
-        # on the stream of the first call, where autograd expects the gradients; NCCL's watchdog thread asks events meanwhile
+        # on the stream of the first call, where autograd expects the gradients; NCCL's watchdog thread queries events meanwhile
         graphed = torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local")
         with garbage_collection_paused(), graphed:
             self._function()
@@ -78,13 +78,13 @@ class Readback:
         self._pinned: torch.Tensor | None = None
 
     def read(self, numbers: torch.Tensor) -> list[float]:
-        """The values of ``numbers``, shape (n,), once the device has come so far."""
+        """The values of ``numbers``, shape (n,), once the device has computed them."""
         if not self._cuda:
             return numbers.tolist()
         if self._pinned is None:
             self._pinned = torch.empty_like(numbers, device="cpu", pin_memory=True)
         self._pinned.copy_(numbers, non_blocking=True)
-        arrived = torch.cuda.Event(blocking=True)  # the core that waits sleeps
+        arrived = torch.cuda.Event(blocking=True)  # let the waiting core sleep
         arrived.record()
         arrived.synchronize()
         return self._pinned.tolist()

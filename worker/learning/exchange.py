@@ -1,4 +1,4 @@
-"""What the ranks tell each other once an iteration, and the one transfer that brings it to the host."""
+"""The per-iteration exchange between the ranks, and its single transfer to the host."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ class Exchange:
         self._readback = Readback(gang.device)
 
     def gather(self, collected: float, signals: Mapping[str, float]) -> None:
-        """Add up over the ranks what happened in the rollout, and what each rank has to tell; clears the task's statistics.
+        """Sum the rollout's statistics and each rank's signals over the ranks; clears the task's statistics.
 
         Args:
-            collected: How long this rank collected in the iteration before [s].
+            collected: Duration of this rank's previous rollout [s].
             signals: This rank's :data:`SIGNALS`.
         """
         totals, own, rank = self._totals, self._own, self._gang.rank
@@ -49,7 +49,7 @@ class Exchange:
         totals["mishap"][rank].copy_(self._task.mishap[0])
         totals["statistics"].copy_(self._task.statistics)
         self._task.clear_statistics()
-        # the device has copied the values of the iteration before: read() waited for it
+        # the device has copied the previous iteration's values: read() waited for it
         own["collected"].fill_(collected)
         totals["collected"][rank : rank + 1].copy_(own["collected"], non_blocking=True)
         for name in SIGNALS:

@@ -1,4 +1,4 @@
-"""The log's lines on what went wrong in functions that a task was given, such as a learner's reward."""
+"""Log lines about errors in a user's functions, such as a learner's reward."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MOST = 10
 
 
 class Failures:
-    """Tells each failure once, and all of them at the end. Every rank tells its own.
+    """Reports each failure once, and all of them at the end. Every rank reports its own.
 
     Args:
-        task: Whose functions.
+        task: The task with the functions.
         say: Writes a line to the log.
     """
 
@@ -27,7 +27,7 @@ class Failures:
         self._known: set[str] = set()
 
     def tell(self, *, again: bool = False) -> None:
-        """Tell those that are new, or all ``again``; waits for the device."""
+        """Report new failures, or all of them if ``again``; waits for the device."""
         found = [item for item in self._task.failures().items() if again or item[0] not in self._known]
         for told, (count, world) in found[:MOST]:
             self._known.add(told)

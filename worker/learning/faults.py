@@ -1,8 +1,8 @@
-"""Deaths on request, to prove that a run survives them.
+"""Fault injection, to prove that a run survives a crash.
 
 ``MUSTER_KILL_AT=N`` in a training job's environment: in the job's first attempt the main rank kills itself with SIGKILL right
-after iteration N, when the gang has done it and nothing of it is written: no metrics, no checkpoint. ``muster verify-resume`` sets
-it, and a job that comes through the Batch API may.
+after the gang has finished iteration N, before any of it is written: no metrics, no checkpoint. ``muster verify-resume`` sets it,
+and a job from the Batch API may.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from worker.learning.job import Job
 
 
 def kill_at(env: Mapping[str, str], job: Job) -> int | None:
-    """The iteration after which this attempt is to die; None for never. Raises UserError for a value that is no iteration."""
+    """The iteration after which this attempt dies; None: never. Raises UserError for a value other than an iteration."""
     text = env.get("MUSTER_KILL_AT")
     if not text:
         return None
@@ -26,5 +26,5 @@ def kill_at(env: Mapping[str, str], job: Job) -> int | None:
 
 
 def die() -> None:
-    """End this process as a crash would: no handler runs, nothing is flushed."""
+    """End this process like a crash: no handler runs, nothing is flushed."""
     os.kill(os.getpid(), signal.SIGKILL)

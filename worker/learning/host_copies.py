@@ -1,4 +1,4 @@
-"""Copies of a state in host memory, which a device makes without being waited for."""
+"""Asynchronous copies of a device's state in host memory."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _ALIGNED = 16
 class HostCopies:
     """Copies of tensors in host memory, kept from one save to the next.
 
-    A device first gathers its tensors in one piece of its own memory, with a kernel for each dtype, and sends that to pinned memory
-    beside its further work. Sent one by one, in the middle of the work, a hundred small tensors took longer than the whole piece.
+    A device first gathers its tensors into one buffer of its own memory, with a kernel for each dtype, and sends it to pinned memory in
+    parallel with its further work. Sent one by one, in sequence with the work, a hundred small tensors took longer than the whole buffer.
     """
 
     def __init__(self) -> None:
         self._forms: list[tuple[torch.dtype, torch.Size]] = []
         """Of the tensors that the views below are for."""
         self._alike: list[list[int]] = []
-        """Which of them have the same dtype: one kernel copies these."""
+        """Groups of tensors with the same dtype; one kernel copies each group."""
         self._gathered: list[torch.Tensor] = []
         self._received: list[torch.Tensor] = []
         self._piece, self._memory = torch.empty(0, dtype=torch.uint8), torch.empty(0, dtype=torch.uint8)
@@ -46,7 +46,7 @@ class HostCopies:
         return _replaced(copied, lambda tensor: next(received) if tensor.is_cuda else tensor)
 
     def wait(self) -> None:
-        """Until the copies are complete; any thread may call it."""
+        """Wait until the copies are complete; any thread may call it."""
         if self._beside:
             self._beside.synchronize()
 
@@ -54,7 +54,7 @@ class HostCopies:
         if self._beside is None:
             self._beside = torch.cuda.Stream(tensors[0].device)
         here = torch.cuda.current_stream(tensors[0].device)
-        here.wait_stream(self._beside)  # the piece is written over
+        here.wait_stream(self._beside)  # the buffer is overwritten
         forms = [(tensor.dtype, tensor.shape) for tensor in tensors]
         if forms != self._forms:
             self._lay_out(tensors)
@@ -67,7 +67,7 @@ class HostCopies:
         return self._received
 
     def _lay_out(self, tensors: list[torch.Tensor]) -> None:
-        """Make a view of the device's piece and one of the host's memory for each tensor. Both grow when they are too small."""
+        """Make a view of the device's buffer and one of the host's memory for each tensor. Both grow when they are too small."""
         by_dtype: dict[torch.dtype, list[int]] = {}
         for index, tensor in enumerate(tensors):
             by_dtype.setdefault(tensor.dtype, []).append(index)
@@ -77,7 +77,7 @@ class HostCopies:
             starts.append(size)
             size += -(-tensor.nbytes // _ALIGNED) * _ALIGNED
         if size > self._piece.nbytes:
-            self.wait()  # for the copy before: its memory is given back
+            self.wait()  # for the previous copy, whose memory is freed
             self._piece = torch.empty(size, dtype=torch.uint8, device=tensors[0].device)
             self._memory = torch.empty(size, dtype=torch.uint8, pin_memory=True)
         places = list(zip(starts, tensors, strict=True))

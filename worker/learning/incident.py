@@ -1,4 +1,4 @@
-"""The worlds as they were when an iteration began, so that an iteration that went wrong can be done again: ``worker.repeat_incident``."""
+"""The state of the worlds at the start of an iteration, to repeat a failed iteration: ``worker.repeat_incident``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Incident:
-    """Keeps, on the device, what :meth:`write` needs. Costs a copy of the worlds' state an iteration, in the rollout's own graph."""
+    """Keeps the data for :meth:`write` on the device. Costs one copy of the worlds' state per iteration, in the rollout's own graph."""
 
     def __init__(self, task: Task, share: Share, steps: int, section: dict[str, Any], seed: int) -> None:
         self._share, self._section, self._seed = share, section, seed
@@ -27,15 +27,15 @@ class Incident:
         self._began: tuple[int, float | None, float | None] = (0, None, None)
 
     def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """What the task's ``begin_iteration`` is told now, for its curriculum."""
+        """Keep the arguments of the task's ``begin_iteration``, for its curriculum."""
         self._began = iteration, reward, episode_length
 
     def keep(self) -> None:
-        """The worlds are about to be stepped."""
+        """Keep the worlds' state before the first step."""
         torch._foreach_copy_(list(self._kept.values()), list(self._live.values()))
 
     def note(self, step: int, actions: torch.Tensor) -> None:
-        """What the worlds are about to do, shape (worlds, actions)."""
+        """Keep the next actions, shape (worlds, actions)."""
         self._actions[step].copy_(actions)
 
     def write(self, path: Path, iteration: int) -> None:

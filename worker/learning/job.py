@@ -1,4 +1,4 @@
-"""What a rank was started to do (``MUSTER_*`` variables), and how it ends: exit codes and the error file."""
+"""A rank's job (``MUSTER_*`` variables), and its end: exit codes and the error file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EX_ERROR, EX_USAGE = 1, 2
 
 
 class StopRequest:
-    """Requests by signal: SIGTERM and SIGINT save a checkpoint and leave after the iteration; SIGUSR2 saves and goes on."""
+    """Requests by signal: SIGTERM and SIGINT save a checkpoint and exit after the iteration; SIGUSR2 saves and continues."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -68,7 +68,7 @@ class Job:
     checkpoint: str | None = None
     """Name of a checkpoint that a person chose to start from."""
     parent: str | None = None
-    """``RUN@ITERATION`` whose weights a clone begins with."""
+    """``RUN@ITERATION`` with a clone's initial weights."""
     section: dict[str, Any] = field(default_factory=dict)
     """The part of the YAML for this command: ``train``, ``evaluate`` or ``export``."""
 
@@ -98,7 +98,7 @@ class Job:
         return cls(spec, store, run, epoch, job_epoch, env.get("MUSTER_JOB_ID", ""), chosen, parent, section)
 
     def named_run(self) -> Run:
-        """The run that the section names (of ``evaluate`` and ``export``), else the job's own."""
+        """The run that the section (``evaluate``, ``export``) names, else the job's own."""
         return self.store.run(self.section["run"]) if self.section.get("run") else self.run
 
     def setting(self, name: str, default: int, *, least: int = 1) -> int:
@@ -110,7 +110,7 @@ class Job:
 
 
 def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
-    """A job that came through the Batch API was not checked when it was submitted. Raises UserError for a section that is none."""
+    """Check sections, since the submission of a Batch API job does not. Raises UserError for a malformed section."""
     from worker.tasks.overrides import training_sections
 
     section = spec[kind]
@@ -156,7 +156,7 @@ def user_errors(where: str | None = None) -> Iterator[None]:
 
 def run_command(body: Callable[[], int]) -> None:
     """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
-    # Importing the simulation parses hundreds of kernels; garbage collection would make that half as long again.
+    # Importing the simulation parses hundreds of kernels; garbage collection would make that 50 % slower.
     gc.disable()
     try:
         code = body()
@@ -183,12 +183,12 @@ def _fail(message: str, code: int) -> int:
 
 
 def _write_error_file(message: str, trace: str) -> None:
-    """What ``torch.distributed.elastic``'s ``@record`` writes, without importing it."""
+    """Write the file of ``torch.distributed.elastic``'s ``@record``, without importing it."""
     path = os.environ.get("TORCHELASTIC_ERROR_FILE")
     if not path:
         return
     now = time.time()
-    # torch writes whole seconds; "time" is ours, so that the first failure of a gang is told from those that it caused
+    # torch writes whole seconds; "time" is ours, to tell the first failure of a gang from those that it caused
     extra = {"py_callstack": trace, "timestamp": str(int(now)), "time": now}
     try:
         Path(path).write_text(json.dumps({"message": {"message": message, "extraInfo": extra}}))

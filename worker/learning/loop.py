@@ -1,4 +1,4 @@
-"""The training loop: collect, learn, log, checkpoint, leave when asked, evaluate at the end."""
+"""The training loop: collect, learn, log, checkpoint, exit on request, evaluate at the end."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ EVALUATED = 256
 WARNINGS = 10
 """Resets of worlds are logged for at most this many iterations; later ones are only counted."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
-"""Those of a task's statistics that become reward, episode length and score; the others are told by their names."""
+"""The task's statistics that become reward, episode length and score; the others are reported by their names."""
 
 
 class Loop:
     """Trains one task on the worlds of one rank, in step with the other ranks."""
 
     def __init__(self, training: Training, gang: Gang, stop: StopRequest) -> None:
-        """Build worlds and learner, and go on from the run's newest checkpoint where there is one. All ranks call it.
+        """Build worlds and learner, and resume from the run's newest checkpoint, if any. All ranks call it.
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
         """
@@ -83,7 +83,7 @@ class Loop:
         self.state = TrainingState(job, gang, self.share, self.task, self.algorithm, facts, training.keep, self.gate)
         self.resumed = self.state.restore()
         self.adopted = None if self.resumed else self._begin_run(facts)
-        """Whose weights a clone begins with; None of a run that began with new ones, or has a checkpoint of its own."""
+        """Checkpoint with a clone's initial weights; None for a run that began with new ones, or has a checkpoint of its own."""
         if gang.is_main:
             write_contract(job, facts["contract"])
         self.task.clear_statistics()
@@ -112,16 +112,16 @@ class Loop:
         return task, made
 
     def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
-        """The first start of a run, which may be a clone: returns the checkpoint with whose weights it begins."""
+        """Start a run for the first time; returns a clone's checkpoint with the initial weights."""
         adopted = adopt(self.job, self.gang, self.algorithm, facts)
         give_teacher(self.job, self.gang, self.algorithm, adopted)
         self.task.set_random_episode_length()
         return adopted
 
     def train(self) -> int:
-        """Train to the end; returns the exit code: 0 done, 75 left on request with a checkpoint.
+        """Train to the end; returns the exit code: 0 done, 75 exited on request with a checkpoint.
 
-        Raises TrainingError where a loss is not finite; the last checkpoint stands.
+        Raises TrainingError for a non-finite loss; the last checkpoint remains valid.
         """
         progress = self.state.progress
         report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
@@ -154,7 +154,7 @@ class Loop:
                 attending.close()
 
     def close(self) -> None:
-        """Leave the gang, and end what saves; nothing can be trained afterwards."""
+        """Leave the gang and end the saver; the loop can't train afterwards."""
         self.state.saver.close()
         for part in (self._collecting, *self.algorithm.graphs):
             part.release()
@@ -175,7 +175,7 @@ class Loop:
             )
 
     def _handle(self, signals: dict[str, float]) -> bool:
-        """Save when a save is due, and log how earlier saves ended; returns whether the gang leaves (then everything is saved)."""
+        """Save when a save is due, and log the results of earlier saves; returns whether the gang exits (then everything is saved)."""
         state, iteration = self.state, self.state.progress.iteration
         stopping = signals["stopping"] > 0
         if signals["failed_saves"] > 0:
@@ -183,10 +183,10 @@ class Loop:
         if self.cadence.due(iteration, signals) or signals["save_now"] > 0:
             self._save_is_due = True
         is_last = stopping or iteration == self.training.iterations
-        # While the volume hangs, a save is put off and training goes on. All ranks decide alike.
+        # While the volume hangs, a save is postponed and training continues. All ranks decide alike.
         if is_last or (self._save_is_due and not signals["busy"]):
             self._save_is_due = False
-            # what needs no more of the device is ordered once that has its next work
+            # order a save that no longer needs the device after the device has its next work
             self._order_is_due = self._collecting.can_be_captured and state.is_copied and not is_last
             if not self._order_is_due:
                 self._order(wait=is_last)
@@ -220,7 +220,7 @@ class Loop:
             self.beacon.tell(said=line)
 
     def _iterate(self) -> tuple[dict[str, Any], dict[str, float]]:
-        """One iteration; the numbers of it (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""
+        """One iteration; its numbers (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""
         progress, algorithm = self.state.progress, self.algorithm
         self._stopwatch.start()
         algorithm.begin(progress.iteration)
@@ -262,7 +262,7 @@ class Loop:
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}")
 
     def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
-        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError where they are too many."""
+        """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError if they are too many."""
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
@@ -283,7 +283,7 @@ class Loop:
                 self.incident.write(files[self.gang.rank], iteration)
             except OSError as error:
                 problem = f" (it could not be written: {error.strerror})"
-        self.gang.greatest(0)  # nobody ends the gang before every rank has written
+        self.gang.greatest(0)  # no rank ends the gang before every rank has written
         where = "" if self.gang.device == "cpu" else " --device cuda:0"
         raise self._failure(
             f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
@@ -353,7 +353,7 @@ class Loop:
             "collect_seconds": self._stopwatch.collect,
             "learn_seconds": self._stopwatch.learn,
             "iteration_seconds": took,
-            "stall_seconds": stall,  # of the save before this iteration, 0 where there was none
+            "stall_seconds": stall,  # of the save before this iteration, 0 without one
             "total_seconds": self.state.seconds,
             **{
                 f"curriculum_{name}": value_at(points, progress.iteration - 1)
@@ -364,7 +364,7 @@ class Loop:
         }
 
     def _finish(self) -> None:
-        """Wait for the last save, evaluate what was learnt, draw the curve, say where everything is."""
+        """Wait for the last save, evaluate the policy, plot the curve, print the paths."""
         if self.state.ordered_at != self.state.progress.iteration:
             self.state.save(self.reporter if self.gang.is_main else None)
         self._tell_saved(self.state.finish())
@@ -399,7 +399,7 @@ class Loop:
             self._show(glance)
 
     def _glance(self, worlds: Task) -> Glance | None:
-        """What looks on while the policy is evaluated, where a picture is wanted."""
+        """The observer of the evaluation, if the job asks for a picture."""
         if not self.gang.is_main or os.environ.get("MUSTER_PICTURE") == "0":
             return None
         from worker.telemetry.picture import Glance
@@ -407,7 +407,7 @@ class Loop:
         return Glance(worlds)
 
     def _show(self, glance: Glance) -> None:
-        """Write the picture. Whatever goes wrong with it, the training has succeeded."""
+        """Write the picture. An error here does not fail the training."""
         path = self.job.run.metrics / "policy.png"
         try:
             write_atomic(path, glance.picture(self.config))
@@ -416,7 +416,7 @@ class Loop:
             self._say(f"warning: there is no picture of the policy ({type(error).__name__}: {error})")
 
     def held_out_worlds(self) -> Task:
-        """The worlds on which the policy is evaluated: those of training, or, where worlds were drawn at random, others of another seed."""
+        """The worlds of the evaluation: those of training, or, if worlds are drawn at random, others with another seed."""
         worlds, began = self.task, max(0, self.state.progress.iteration - 1)
         if self.config.randomize.draws_worlds:
             total = min(self.share.total, EVALUATED * self.gang.size)
@@ -436,7 +436,7 @@ def _print(text: str) -> None:
 
 
 def straggler(seconds: list[float]) -> dict[str, float]:
-    """The rank that collected longest in the iteration before, and its excess over the median: all others wait for it.
+    """The rank with the longest rollout in the previous iteration, and its excess over the median: all others wait for it.
 
     Args:
         seconds: By rank; empty figures for a gang of one.

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 Learner = tuple[type[Algorithm], Any]
 """An algorithm, and its settings."""
 FEW, MORE = 64, 2048
-"""Worlds of the builds that are measured, after one that loads kernels and libraries: what both take is not the worlds' (networks, a
-batch of fixed size)."""
+"""Numbers of worlds in the measured builds, after a build that loads kernels and libraries; the memory that both have in common is not
+the worlds' (networks, a batch of fixed size)."""
 CHECKED = {"cpu": 4 * MORE, "cuda": 64 * MORE}
 """Number of worlds from which memory is checked beforehand: on CPU the OOM killer strikes without a message; on GPU a too large build
 fails only after minutes."""
 SPARE = 0.9
-"""Share of the free memory that may be taken: graphs and kernels take some more."""
+"""Usable share of the free memory: graphs and kernels take some more."""
 
 
 @contextmanager
@@ -46,14 +46,14 @@ def within_memory(
     gang: Gang,
     starting: Callable[[], bool] = lambda: True,
 ) -> Iterator[None]:
-    """In here, worlds for which the memory does not suffice are the user's error, which says how many would do.
+    """In this context, too little memory for the worlds is the user's error, which says how many would fit.
 
     Args:
         task_type: The task, with its ``config``.
         learner: The algorithm, and its settings.
-        worlds: The most that a rank has; the same number on all ranks.
-        gang: On whose devices they are to be.
-        starting: Whether memory that runs out now is that of the worlds; else its error passes.
+        worlds: The greatest number on any rank; the same value on all ranks.
+        gang: The ranks, with their devices.
+        starting: Whether an out-of-memory error now is due to the worlds; otherwise it passes.
     """
     free = free_bytes(gang)
     if worlds >= CHECKED[gang.device.partition(":")[0]]:
@@ -65,16 +65,16 @@ def within_memory(
     except (RuntimeError, MemoryError) as error:
         if not starting() or not is_out_of_memory(error):
             raise
-        traceback.clear_frames(error.__traceback__)  # what was built so far goes
+        traceback.clear_frames(error.__traceback__)  # free the partial build
         try:
             need = measure(task_type, config, learner, gang)
-        except Exception:  # on a device that is full, or in the middle of a recording: the first error is what counts
+        except Exception:  # on a full device, or during a capture: the first error counts
             need = Need(0.0, 0.0)
         raise UserError(_explain(task_type, worlds, gang, free, need)) from error
 
 
 def free_bytes(gang: Gang) -> int:
-    """Memory that this rank can still take: of its GPU, or its part of the host's (of the control group's that it is in)."""
+    """Memory that this rank can still take: of its GPU, or its share of the host's memory (or of its control group's)."""
     if gang.device != "cpu":
         return torch.cuda.mem_get_info(gang.device)[0]
     fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
@@ -84,26 +84,26 @@ def free_bytes(gang: Gang) -> int:
         limit = int((group / "memory.max").read_text())
         used = int((group / "memory.current").read_text())
         found = re.search(r"^inactive_file (\d+)$", (group / "memory.stat").read_text(), re.MULTILINE)
-        free = min(free, limit - used + (int(found[1]) if found else 0))  # pages of files are given back
+        free = min(free, limit - used + (int(found[1]) if found else 0))  # pages of files can be reclaimed
     return max(free, 0) // gang.placement.local_world_size
 
 
 @dataclass(frozen=True)
 class Need:
-    """What a rank takes [bytes]."""
+    """Memory need of a rank [bytes]."""
 
     fixed: float
-    """Whatever its worlds: networks, optimizer, an update with a batch of fixed size."""
+    """Independent of the worlds: networks, optimizer, an update with a batch of fixed size."""
     world: float
     """Of each world, with its part of rollout, replay and update."""
 
     def of(self, worlds: int) -> float:
-        """For so many worlds [bytes]."""
+        """Total for this number of worlds [bytes]."""
         return self.fixed + worlds * self.world
 
 
 def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: Gang) -> Need:
-    """What the worlds of this task take with this algorithm. Takes some seconds; every rank calls it."""
+    """Measure the memory of this task's worlds with this algorithm. Takes some seconds; every rank calls it."""
     load_kernels(learner[0], gang)
     _taken(task_type, config, learner, FEW, gang)
     few, more = (_taken(task_type, config, learner, worlds, gang) for worlds in (FEW, MORE))
@@ -112,7 +112,7 @@ def measure(task_type: type[Task], config: TaskConfig, learner: Learner, gang: G
 
 
 def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: int, gang: Gang) -> int:
-    """Peak memory [bytes] of building ``worlds``, learning once from an iteration in which they are not stepped, and saving."""
+    """Peak memory [bytes] of building ``worlds``, learning once from an iteration without steps, and saving."""
     alone = Gang(gang.placement, gang.device, None, ["here"])
     alone.size, alone.rank = 1, 0
     gc.collect()
@@ -137,10 +137,10 @@ def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: 
 
 
 def _start_measuring(device: str) -> int:
-    """Forget the most that was taken before; what is taken now [bytes]."""
+    """Reset the peak; returns the current use [bytes]."""
     if device == "cpu":
         with contextlib.suppress(AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed, and would build from that
+            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed memory, and would build from it
         with contextlib.suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM
         return _status("VmRSS")
@@ -163,10 +163,10 @@ def _status(name: str) -> int:
 
 
 def _explain(task_type: type[Task], worlds: int, gang: Gang, free: int, need: Need) -> str:
-    """One line; ``need`` is 0 where it could not be measured."""
+    """The error in one line; ``need`` is 0 if it could not be measured."""
     where = "memory" if gang.device == "cpu" else f"memory of {gang.device}"
     start = f"worlds: {worlds:,} worlds of {task_type.__name__} on rank {gang.placement.rank} need more {where} than"
-    if need.of(worlds) <= SPARE * free:  # others took what was free at the start
+    if need.of(worlds) <= SPARE * free:  # other processes took the memory that was free at the start
         return f"{start} there is; set fewer `worlds`, or free some"
     room = SPARE * free - need.fixed
     short = f"{start} the {_gb(free)} that are free: about {_gb(need.of(worlds))}"

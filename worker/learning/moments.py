@@ -27,8 +27,8 @@ def merge(normalizer: Any, count: torch.Tensor, sums: torch.Tensor) -> None:
 
     Args:
         normalizer: Changed in place.
-        count: How many observations there were, shape (), float64.
-        sums: What :func:`gather` gave, of all ranks.
+        count: Number of observations, shape (), float64.
+        sums: From :func:`gather`, summed over all ranks.
     """
     size = len(sums) // 2
     offset = sums[:size] / count

@@ -1,4 +1,4 @@
-"""Observations beside those that a task gives: images as numbers, and made-up ones on which an exported policy is compared."""
+"""Helpers for observations: images as numbers, and synthetic observations to compare an exported policy on."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def to_numbers(images: torch.Tensor) -> torch.Tensor:
 
 
 def made_up(shapes: Mapping[str, Sequence[int]], normalizer: nn.Module | None) -> TensorDict:
-    """Observations as a policy has met them, by its normaliser's moments, a few far outside; images of any bytes.
+    """Synthetic observations: drawn from the normaliser's moments, a few far outside; random bytes for images.
 
     Args:
-        shapes: Of one observation of each group, in the order in which the policy sees them: one dimension, or three of an image.
-        normalizer: Of all the groups of numbers, one behind the other; any other module than rsl_rl's is passed over.
+        shapes: Of one observation of each group, in the policy's order: one dimension, or three for an image.
+        normalizer: Of the concatenated groups of numbers; modules other than rsl_rl's are ignored.
 
     Returns:
         The same in each call, batch size (:data:`SAMPLES` or :data:`IMAGES`,), on the CPU.

@@ -1,7 +1,7 @@
-"""PPO in one file, to be read from top to bottom: what algorithm ``ppo`` computes, one thing after the other.
+"""PPO in one file, to be read from top to bottom: the computation of algorithm ``ppo``, step by step.
 
-It is here to be read, copied and changed, and ``ppo`` is tested against it. It is slower, most of all on a GPU, which it waits for at
-every minibatch. In a job: ``algorithm: worker.learning.plain_ppo:PlainPPO``, with the settings of ``ppo`` under ``settings``.
+Read it, copy it and change it; the tests compare ``ppo`` with it. It is slower, especially on a GPU, for which it waits at every
+minibatch. In a job: ``algorithm: worker.learning.plain_ppo:PlainPPO``, with the settings of ``ppo`` under ``settings``.
 In comments, S steps of the W worlds of this rank are a rollout, and N = S · W its samples: step s of world w is row s · W + w.
 """
 
@@ -25,7 +25,7 @@ from worker.learning.ppo.settings import PPOConfig
 
 
 class Network(nn.Module):
-    """A multi-layer perceptron behind a normaliser: numbers of any size come in, about one standard deviation of them goes on."""
+    """A multi-layer perceptron after a normaliser, which scales its inputs to about unit variance."""
 
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int, config: PPOConfig) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Network(nn.Module):
 
 
 class Actor(Network):
-    """The policy: the network's output is the mean of the actions, and each action has a standard deviation that is learnt, too."""
+    """The policy: the network's output is the mean of the actions; the standard deviation of each action is also learnt."""
 
     def __init__(self, spaces: Spaces, config: PPOConfig) -> None:
         if spaces.discrete or len(spaces.observations[POLICY]) != 1:
@@ -76,10 +76,10 @@ class Actor(Network):
         return self(observations[POLICY])
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Nothing is remembered of an episode."""
+        """Do nothing: the policy has no recurrent state."""
 
     def module(self) -> ExportedPolicy:
-        """The network as it is, with observations such as it has met to compare the exported file on."""
+        """The network itself, with typical observations to compare the exported file on."""
         network = copy.deepcopy(self).cpu().eval()
         seen = torch.randn(256, len(network.mean), generator=torch.Generator().manual_seed(0))
         seen.mul_(network.variance.sqrt()).add_(network.mean)
@@ -114,7 +114,7 @@ class PlainPPO:
         self._rollout: list[dict[str, torch.Tensor]] = []
 
     def begin(self, iteration: int) -> None:
-        """Random numbers depend on the seed, the iteration and the world, and on nothing else."""
+        """Seed the random numbers, which depend only on the seed, the iteration and the world."""
         self._draws.begin(iteration)
         self._rollout.clear()
 
@@ -128,7 +128,7 @@ class PlainPPO:
         return actions
 
     def record(self, step: Transition) -> None:
-        """Keep what came of the actions. The tensors are the task's own, and change in the next step: hence copies."""
+        """Keep the result of the actions, in copies, since the task's own tensors change in the next step."""
         ends = step.terminal_observations[self.config.critic_observations]
         came = {"rewards": step.rewards, "dones": step.dones, "time_outs": step.time_outs, "ends": ends}
         self._rollout[-1] |= {name: tensor.clone() for name, tensor in came.items()}
@@ -137,12 +137,12 @@ class PlainPPO:
         """Several passes over the rollout, each in minibatches of its own. ``observations`` are those after the last step."""
         config, worlds, device = self.config, self.setting.share.count, self.gang.device
         samples, old_deviation = self._estimate(observations), self.actor.deviation().detach().clone()
-        # which samples each minibatch has: equally many steps of every world, shape (epochs · minibatches, steps, W)
+        # samples of each minibatch: the same number of steps of every world, shape (epochs · minibatches, steps, W)
         shape = config.epochs * config.minibatches, self.steps // config.minibatches, worlds
         orders = torch.zeros(shape, dtype=torch.long, device=device)
         scratch = torch.zeros(config.epochs, worlds, self.steps, dtype=torch.int32, device=device)
         self._draws.order(orders, scratch)
-        # a rank's mean counts as much as it has worlds, so that the sum over the ranks is the mean over all samples
+        # each rank's mean is weighted by its share of worlds, so that the sum over the ranks is the mean over all samples
         weight = worlds / self.setting.share.total
         sums = torch.zeros(4, device=device)
         for rows in orders.flatten(1):
@@ -172,8 +172,8 @@ class PlainPPO:
         config = self.config
         rollout = {name: torch.stack([step[name] for step in self._rollout]) for name in self._rollout[0]}  # (S, W, …)
         values = self.critic(rollout["judged"]).squeeze(-1)
-        # the clock ended an episode that would have gone on: what it would have brought belongs to the last reward
-        future = self.critic(rollout["ends"]).squeeze(-1)  # means nothing, and may be NaN, where no episode ended
+        # after a time-out, the value of the future belongs to the last reward
+        future = self.critic(rollout["ends"]).squeeze(-1)  # meaningless, perhaps NaN, where no episode ended
         rewards = rollout["rewards"] + config.gamma * torch.where(rollout["time_outs"], future, 0.0)
         next_values = self.critic(observations[config.critic_observations]).squeeze(-1)
         advantages, advantage = torch.zeros_like(values), torch.zeros_like(next_values)
@@ -183,7 +183,7 @@ class PlainPPO:
             advantage = surprise + config.gamma * config.lam * going_on * advantage
             advantages[step], next_values = advantage, values[step]
         returns = advantages + values
-        # an advantage is only better or worse than the others: mean 0 and deviation 1 over the samples of all ranks
+        # normalise the advantages: mean 0 and standard deviation 1 over the samples of all ranks
         count = self.setting.share.total * self.steps
         mean = self.gang.sum(advantages.double().sum()) / count
         variance = self.gang.sum((advantages - mean).square().sum()) / (count - 1)
@@ -194,10 +194,10 @@ class PlainPPO:
         return {name: tensor.flatten(0, 1) for name, tensor in known.items()}
 
     def _loss(self, batch: dict[str, torch.Tensor], old_deviation: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and what is told of it, shape (4,)."""
+        """Proximal policy optimisation's (arXiv:1707.06347) loss of one minibatch, shape (), and its metrics, shape (4,)."""
         config, clip = self.config, self.config.clip
         policy = Normal(self.actor(batch["seen"]), self.actor.deviation(), validate_args=False)
-        # how much likelier is the action than when it was taken? What lies beyond the clip range is no reason to go further
+        # probability ratio of the action, new over old policy; no gradient beyond the clip range
         ratio = (policy.log_prob(batch["actions"]).sum(-1) - batch["log_probs"]).exp()
         gain, clipped_gain = batch["advantages"] * ratio, batch["advantages"] * ratio.clamp(1.0 - clip, 1.0 + clip)
         surrogate = -torch.minimum(gain, clipped_gain).mean()
@@ -212,7 +212,7 @@ class PlainPPO:
         return loss, torch.stack((surrogate, error.mean(), entropy, kl)).detach()
 
     def _adapted_rate(self, kl: float) -> float:
-        """Smaller steps where the policy has gone too far from the old one, greater ones where it has hardly moved (rsl-rl's rule)."""
+        """A smaller rate if the policy has moved too far from the old one, a greater one if it has hardly moved (rsl-rl's rule)."""
         (least, greatest), desired = self.config.learning_rate_limits, self.config.desired_kl
         if kl > 2.0 * desired:
             return max(self.rate / 1.5, least)
@@ -228,7 +228,7 @@ class PlainPPO:
         return {**{name: part.state_dict() for name, part in parts.items()}, "learning_rate": self.rate}
 
     def load_state_dict(self, state: Any, *, weights_only: bool = False, changed: Collection[str] = ()) -> list[str]:
-        """Go on from :meth:`state_dict`: with the saved learning rate where the schedule adapts it, unless the job sets another one."""
+        """Continue from :meth:`state_dict`; an adaptive schedule keeps the saved learning rate, unless the job sets another one."""
         self.actor.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
         if weights_only:
@@ -239,11 +239,11 @@ class PlainPPO:
         return [] if self.rate == state["learning_rate"] else [f"learning rate set to {self.rate:g}"]
 
     def world_state(self) -> dict[str, torch.Tensor]:
-        """Nothing is kept for a world from iteration to iteration."""
+        """There is no state per world."""
         return {}
 
     def load_world_state(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Nothing to go on from."""
+        """There is no state per world."""
 
     @classmethod
     def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> Actor:

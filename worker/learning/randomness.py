@@ -15,7 +15,7 @@ def mix_seed(*parts: int) -> int:
 
 
 def held_out_seed(seed: int) -> int:
-    """The seed of the worlds on which a policy is evaluated that was trained with ``seed``: they are none of those of its training."""
+    """The seed of the evaluation's worlds for a policy trained with ``seed``; they differ from the training's."""
     return mix_seed(seed, 4)
 
 

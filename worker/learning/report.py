@@ -1,4 +1,4 @@
-"""What a run tells people and programs: a line an iteration, the metrics file, TensorBoard events."""
+"""A run's reports: a log line per iteration, the metrics file, TensorBoard events."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Stopwatch:
         self._marks: list[Any] = []
         self._read_at = time.perf_counter()
         self.iteration = self.collect = self.learn = 0.0
-        """Seconds of the iteration that was read last, by the clock, and of its two parts."""
+        """Wall-clock seconds of the last iteration that was read, and of its two parts."""
 
     def begin(self) -> None:
         """The first iteration begins now."""
@@ -58,18 +58,18 @@ class Stopwatch:
 
 
 LONG_HOURS = 6.0
-"""A training without a GPU that is to take longer than this is warned of."""
+"""Estimated duration of a training without a GPU above which a warning is logged."""
 WARMED = 2
-"""The iteration of an attempt from which on its rate is told: the first one also loads kernels."""
+"""The first iteration of an attempt whose rate is reported: the very first one also loads kernels."""
 
 
 class Report:
     """Writes the records of one attempt. Main rank only. A volume that refuses a record costs the record, not the run.
 
     Args:
-        training: What is trained.
-        resumed_from: The last iteration that is done already.
-        device: Where it is trained, ``"cpu"`` or ``"cuda:<n>"``.
+        training: The training.
+        resumed_from: The last finished iteration.
+        device: Its device, ``"cpu"`` or ``"cuda:<n>"``.
     """
 
     def __init__(self, training: Training, resumed_from: int, device: str) -> None:
@@ -112,7 +112,7 @@ class Report:
             self._warned = True
 
     def _long(self, record: dict[str, float | int | None]) -> str:
-        """What to know of a training that takes days without a GPU; empty where it does not."""
+        """A warning about a training that takes very long without a GPU; empty for others."""
         left = self._iterations - int(record["iteration"] or 0)
         hours = left * float(record["iteration_seconds"] or 0.0) / 3600.0
         if hours <= LONG_HOURS:
@@ -135,8 +135,8 @@ class Report:
 def figures_of(
     totals: Mapping[str, float], episodes: float, steps: float, final: Sequence[str]
 ) -> dict[str, float | None]:
-    """What a record has of a task's statistics: a reward term and a ``final`` metric as the mean over the finished episodes, another
-    metric over their steps, a count as it is. None where no episode has finished.
+    """A task's statistics for a record: reward terms and ``final`` metrics as means over the finished episodes, other metrics as means
+    over their steps, counts as they are. None if no episode has finished.
     """
     by = {
         name: episodes if name.startswith("reward_") or name in final else steps
@@ -147,7 +147,7 @@ def figures_of(
 
 
 def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """What a record has for people who follow the training: ``metrics``, of each its unit, in words; nothing where there are none."""
+    """The part of a record for people who follow the training: ``metrics`` with their units, as text; empty without any."""
     if not metrics:
         return {}
     return {
@@ -163,7 +163,7 @@ def _shown(record: Mapping[str, Any]) -> str:
 
 
 def _learnt(record: dict[str, float | int | None]) -> str:
-    """The figures of learning that tell most at a glance, those of them that the algorithm has."""
+    """The most telling learning metrics among those of the algorithm."""
     shown = {
         "learning_rate": ("lr", ".1e"),
         "kl": ("kl", ".3f"),
@@ -174,7 +174,7 @@ def _learnt(record: dict[str, float | int | None]) -> str:
 
 
 def _slow(record: dict[str, float | int | None]) -> str:
-    """The rank for which the others wait, where that costs a tenth of the time, and a time that a person would notice."""
+    """The rank for which the others wait, if that costs a tenth of the time, and a noticeable time."""
     excess = record.get("slowest_excess") or 0.0
     is_slow = excess > _SLOW and excess * (record["collect_seconds"] or 0.0) > _NOTICED
     return f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)" if is_slow else ""

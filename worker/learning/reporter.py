@@ -1,6 +1,6 @@
 """The threads that read and write the volume for a training, so that the training thread waits for neither disk nor network.
 
-A volume that is away for an hour costs the run nothing but its newest metrics.
+If the volume is away for an hour, the run loses only its newest metrics.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from shared_store.wording import counted
 _EVERY = 1.0
 """Seconds between two reads of the epoch."""
 _LATE = 2.0
-"""Seconds since the last look from which on a record waits for the next one."""
+"""Age of the last read of the epoch [s] from which a record waits for the next one."""
 _PATIENT = 2.0
-"""Seconds that a record waits for a look at most: a volume that hangs answers none."""
+"""Longest wait of a record for that read [s]: a hanging volume never answers."""
 _MOST = 10_000
-"""Calls that are kept while the volume does not take them; later ones are dropped."""
+"""Calls that wait while the volume does not take them; later ones are dropped."""
 _HELD = 0.02
-"""Seconds that a thread waits at most at the :class:`Gate`."""
+"""Longest wait of a thread at the :class:`Gate` [s]."""
 _FAREWELL = 30.0
-"""Seconds that the end of a training waits for the volume to take the last records."""
+"""Longest wait at the end of a training for the volume to take the last records [s]."""
 
 
 class Fence:
@@ -42,14 +42,14 @@ class Fence:
         threading.Thread(target=self._watch, name="fence", daemon=True).start()
 
     def check(self) -> None:
-        """Does not wait. Raises StaleEpoch where a newer attempt owned the run at the last read, and whatever else ended the reading."""
+        """Does not wait. Raises StaleEpoch if a newer attempt owned the run at the last read, or the error that ended the reading."""
         if self._problem is not None:
             raise self._problem
 
     def guard(self, write: Callable[..., object], *arguments: Any) -> None:
-        """Call ``write``, unless a newer attempt owns the run. Waits for a look where the last one is long ago, on the caller's thread.
+        """Call ``write`` on the caller's thread, unless a newer attempt owns the run. If the last read of the epoch is old, wait for a new one.
 
-        A process that was stopped, and goes on, would otherwise write before its next look.
+        A stopped process that continues would otherwise write before its next read.
         """
         patience = time.monotonic() + _PATIENT
         while self._problem is None and not self._over.is_set() and self._is_late(patience):
@@ -62,13 +62,13 @@ class Fence:
         return now - self._looked > _LATE and now < patience
 
     def close(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self._over.set()
 
     def _watch(self) -> None:
         while not self._over.is_set():
             try:
-                # a volume that is away for a while: the next read will tell
+                # the volume is away for a while: try again at the next read
                 with contextlib.suppress(OSError, ValueError):
                     check_epoch(self._run, self._epoch)
             except Exception as error:  # StaleEpoch; a defect must not end the fence unseen
@@ -79,7 +79,7 @@ class Fence:
 
 
 class Gate:
-    """Keeps other threads from the interpreter for a moment: the training thread needs it to give a device its work."""
+    """Keeps other threads off the interpreter while the training thread launches a device's work."""
 
     def __init__(self) -> None:
         self._open = threading.Event()
@@ -94,7 +94,7 @@ class Gate:
         self._open.set()
 
     def wait(self) -> None:
-        """Until it is open, at most :data:`_HELD` seconds."""
+        """Wait until it is open, at most :data:`_HELD` seconds."""
         self._open.wait(_HELD)
 
 
@@ -109,14 +109,14 @@ class Reporter:
         threading.Thread(target=self._run, name="reporter", daemon=True).start()
 
     def do(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Have ``function`` called; does not wait. A call that raises is lost; the first one is warned of."""
+        """Queue a call of ``function``; does not wait. A call that raises is lost; the first such call is logged as a warning."""
         try:
             self._calls.put_nowait((function, arguments))
-        except queue.Full:  # there is nobody to tell: what would print it is what hangs
+        except queue.Full:  # no report is possible: the thread that would print it hangs
             self._dropped += 1
 
     def close(self) -> None:
-        """Wait for the calls that are left, at most :data:`_FAREWELL` seconds, and print how many were lost."""
+        """Wait for the remaining calls, at most :data:`_FAREWELL` seconds, and print how many were lost."""
         done = threading.Event()
         self.do(done.set)
         if not done.wait(_FAREWELL) or self._dropped:

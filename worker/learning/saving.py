@@ -1,4 +1,4 @@
-"""Asynchronous saving, seen from the training loop: it stops only while the state is copied to host memory."""
+"""Asynchronous saving: the training loop stops only while the state is copied to host memory."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from worker.learning.reporter import Gate
 _BUFFERS = 2
 """One save is written while the next one is copied; a third waits."""
 PATIENCE = 2.0
-"""For how long after the order of the oldest save a third one waits for it [s]: the volume hangs, and training goes on without."""
+"""Time after the order of the oldest save for which a third one waits [s]; after it, the volume counts as hanging, and training goes on."""
 RECORDS_SECONDS = 10.0
-"""How long a commit waits for the metrics records before it [s]: a checkpoint is worth more than records that are never written."""
+"""Longest wait of a commit for the earlier metrics records [s]: a checkpoint is worth more than records that are never written."""
 
 
 class _Save(NamedTuple):
-    """A save that is under way."""
+    """A save in progress."""
 
     iteration: int
     since: float
-    """When it was ordered (``time.perf_counter``)."""
+    """Time of its order (``time.perf_counter``)."""
     ordered: Future[None]
     """Done once the writer has its order."""
 
 
 class Saver:
-    """Hands snapshots to the writer process of this rank (:mod:`worker.checkpoint_writer`), in order, and tells how they ended.
+    """Passes snapshots in order to the writer process of this rank (:mod:`worker.checkpoint_writer`), and reports their results.
 
-    The loop waits while the state is copied. A thread puts the copies into the form of a file, and the process writes the file.
+    The loop waits while the state is copied. A thread serialises the copies, and the process writes the file.
     """
 
     def __init__(self, run: Run, epoch: int, rank: int, ranks: int, keep: int | None, gate: Gate | None = None) -> None:
@@ -50,9 +50,9 @@ class Saver:
         self.committed: str | None = None
         """Name of the newest checkpoint that is durable (main rank)."""
         self.failures = 0
-        """Saves of this rank that failed and that the gang has not been told of."""
+        """Failed saves of this rank that the gang does not know of yet."""
         self.stall = 0.0
-        """How long the last save stopped the loop [s]."""
+        """Time for which the last save stopped the loop [s]."""
         self._copying = 0.0
         self._gate = gate or Gate()
         self._copies = HostCopies()
@@ -64,24 +64,24 @@ class Saver:
         self._process: subprocess.Popen[bytes] | None = None
         self._answers = b""
         self._lines: list[str] = []
-        """What is still to be told of saves that ended."""
+        """Unreported lines about finished saves."""
 
     def start(self) -> None:
-        """Start the writer before it is needed: it would otherwise be the first save that waits for its start."""
+        """Start the writer in advance, so that the first save does not wait for it."""
         if self._process is None:
             self._start()
 
     @property
     def is_busy(self) -> bool:
-        """Whether the volume hangs: no save can be ordered, and an earlier one has been under way for :data:`PATIENCE`."""
+        """Whether the volume hangs: no save can be ordered, and an earlier one has been in progress for :data:`PATIENCE`."""
         return len(self._pending) >= _BUFFERS and self._patience() == 0.0
 
     def note_records(self, iteration: int) -> None:
-        """Let the writer know that the metrics records up to ``iteration`` are written. Any thread may call it."""
+        """Tell the writer that the metrics records up to ``iteration`` are written. Any thread may call it."""
         os.pwrite(self._records.fileno(), iteration.to_bytes(8, "little"), 0)
 
     def copy(self, state: Any) -> Any:
-        """Copies of all tensors in ``state``, to be saved. A device may still be at work on them: it is not waited for.
+        """Copies of all tensors in ``state``, for a save. A device may still be computing them; this does not wait for it.
 
         They are valid until the next call.
         """
@@ -101,14 +101,14 @@ class Saver:
         after_records: bool = False,
         wait: bool = True,
     ) -> None:
-        """Order the saving of copies of the state; returns before anything is on the volume.
+        """Order a save of copies of the state; returns before any write to the volume.
 
         Args:
-            iteration: Iterations done.
-            files: Name of each file and its content: dictionaries of what :meth:`copy` gave and of plain values, which stay as they are.
-            facts: What the manifest says besides; the main rank gives it, and commits.
+            iteration: Number of finished iterations.
+            files: Name and content of each file: dictionaries of copies from :meth:`copy` and of plain values, which must not change.
+            facts: Further entries of the manifest; the main rank passes them, and commits.
             after_records: Commit only after :meth:`note_records` of this iteration, or after :data:`RECORDS_SECONDS`.
-            wait: For earlier saves, as long as they take; else the save fails where they take longer than :data:`PATIENCE`.
+            wait: Wait for earlier saves, however long; otherwise the save fails if they take longer than :data:`PATIENCE`.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.
@@ -144,7 +144,7 @@ class Saver:
         self._gate.wait()
         self._copies.wait()
         layout = []
-        memory.seek(0)  # what an earlier save left behind the end stays, and is not read
+        memory.seek(0)  # an earlier save's bytes beyond the end stay, unread
         for name, snapshot in files.items():
             begin = memory.tell()
             torch.save(snapshot, memory)
@@ -153,13 +153,13 @@ class Saver:
         _send(writer, {**order, "files": layout})
 
     def poll(self) -> list[str]:
-        """What has become of earlier saves, a line for each that ended; does not wait. Raises StaleEpoch."""
+        """Results of earlier saves, a line for each that ended; does not wait. Raises StaleEpoch."""
         while self._pending and self._take_answer(0.0):
             pass
         return self._told()
 
     def wait(self) -> list[str]:
-        """As :meth:`poll`, for all that are under way. Raises StaleEpoch."""
+        """As :meth:`poll`, but waits for all saves in progress. Raises StaleEpoch."""
         while self._pending:
             self._take_answer(None)
         return self._told()
@@ -171,7 +171,7 @@ class Saver:
                 _send(self._process, {"abandon": each.iteration})
 
     def close(self) -> None:
-        """End the writer; what is under way is waited for. Raises StaleEpoch."""
+        """End the writer, after all saves in progress. Raises StaleEpoch."""
         self.wait()
         self._thread.shutdown()
         if self._process and self._process.stdin:
@@ -182,7 +182,7 @@ class Saver:
             file.close()
 
     def _patience(self) -> float:
-        """How long a save still waits for the oldest one [s]."""
+        """Remaining time for which a save waits for the oldest one [s]."""
         return max(0.0, self._pending[0].since + PATIENCE - time.perf_counter())
 
     def _told(self) -> list[str]:
@@ -190,7 +190,7 @@ class Saver:
         return lines
 
     def _writer(self) -> subprocess.Popen[bytes]:
-        """The writer's process, a new one where it died: what it had answered counts, the rest is lost."""
+        """The writer's process, a new one if it died: saves that it had answered count, the others are lost."""
         if self._process is not None and self._process.poll() is not None:
             while self._process is not None:
                 self._take_answer(None)
@@ -200,7 +200,7 @@ class Saver:
         return self._process
 
     def _start(self) -> None:
-        """Start the writer: tied to this process's life, and in a session of its own, where the group's SIGTERM does not reach it."""
+        """Start the writer: it dies with this process, and has a session of its own, out of reach of the group's SIGTERM."""
         self._answers = b""
         self._process = start_tied(
             [sys.executable, "-P", "-m", "worker.checkpoint_writer"],
@@ -212,7 +212,7 @@ class Saver:
         )
 
     def _take_answer(self, seconds: float | None) -> bool:
-        """Note the next answer, waiting for it up to ``seconds`` (None: for ever); False where none came. Raises StaleEpoch."""
+        """Process the next answer, after a wait of up to ``seconds`` (None: forever); False without an answer. Raises StaleEpoch."""
         if self._pending:
             try:
                 self._pending[0].ordered.result(seconds)
@@ -249,7 +249,7 @@ class Saver:
         self._lines.append(f"warning: iteration {iteration} could not be saved ({why}); training goes on")
 
     def _lost(self) -> None:
-        """The writer died: all that it had is lost, and the next save starts another."""
+        """The writer died: all its saves are lost, and the next save starts another."""
         assert self._process is not None
         code = self._process.wait()
         self._process = None
@@ -264,4 +264,4 @@ def _send(writer: subprocess.Popen[bytes], order: Mapping[str, Any]) -> None:
         writer.stdin.write(json.dumps(order).encode() + b"\n")
         writer.stdin.flush()
     except BrokenPipeError:
-        pass  # it has just died: the answer that does not come says so
+        pass  # it has just died: the missing answer shows it

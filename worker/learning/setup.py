@@ -1,4 +1,4 @@
-"""What a training is made of, before it begins: the worlds of this rank, how many the gang has, and what checkpoints say of them."""
+"""The parts of a training, before it begins: this rank's worlds, the gang's number of worlds, and their description in checkpoints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int) -> Task:
-    """This rank's worlds, with kernels compiled once a cache. Raises UserError for what the task refuses, and for a mistake in the user's own code."""
+    """This rank's worlds; kernels are compiled once per cache. Raises UserError for refused settings and for mistakes in the user's own code."""
     marker = warm_marker(task_type, gang.device)
     if gang.is_main and marker is not None and not marker.exists():
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
@@ -43,16 +43,16 @@ def build_task(task_type: type[Task], config: TaskConfig, share: Share, gang: Ga
 
 
 def load_kernels(algorithm: type[Algorithm], gang: Gang) -> None:
-    """Compile the algorithm's own Warp kernels, once a cache, or take them from there. All ranks call it."""
+    """Compile the algorithm's own Warp kernels once per cache, or load them from it. All ranks call it."""
     with gang.build_in_turn(what="algorithm"):
         for module in getattr(algorithm, "kernels", ()):
             warp.load_module(module, gang.device)
 
 
 def total_worlds(job: Job, gang: Gang) -> int:
-    """How many worlds the whole gang has: a run's number, which does not change with the ranks that it has just now.
+    """Number of worlds of the whole gang, a constant of the run that does not depend on the current number of ranks.
 
-    ``train.worlds`` is each rank's share of a gang of full size; a run that is resumed has the worlds of its checkpoint.
+    ``train.worlds`` is each rank's share in a gang of full size; a resumed run has the worlds of its checkpoint.
     """
     if given := os.environ.get("MUSTER_WORLDS"):
         if not given.isdecimal() or int(given) < gang.size:
@@ -64,13 +64,13 @@ def total_worlds(job: Job, gang: Gang) -> int:
 
 
 def spaces_of(task: Task) -> Spaces:
-    """What the task's policies see and do."""
+    """Shapes of the observations and actions of the task's policies."""
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
     return Spaces(shapes, task.action_size, task.discrete)
 
 
 def spaces_from(policy: dict[str, Any]) -> Spaces:
-    """What :func:`describe` wrote of them into a manifest."""
+    """The spaces that :func:`describe` wrote into a manifest."""
     groups = {name: tuple(shape) for name, shape in policy["groups"].items()}
     return Spaces(groups, policy["action_size"], policy.get("discrete", False))
 

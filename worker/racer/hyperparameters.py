@@ -5,6 +5,7 @@ Whoever submits a job reads of each of them that means something else here, or n
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -105,7 +106,9 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
 
 def _checked(where: str, name: str, value: Any) -> Any:
     if name not in KNOWN:
-        raise Refused((where, name), f"DeepRacer has no such hyperparameter; {nearest(name, list(KNOWN))}")
+        near = difflib.get_close_matches(name, _ALSO, n=1, cutoff=0.8)
+        meant = f"did you mean {_ALSO[near[0]]}?" if near else nearest(name, list(KNOWN))
+        raise Refused((where, name), f"DeepRacer has no such hyperparameter; {meant}")
     try:
         return KNOWN[name].check(value)
     except ValueError as error:
@@ -244,6 +247,15 @@ def _sac_alpha(value: float, job: Job) -> Meaning:
 
 _ENDS = "it ends no training; train.iterations says how long it is"
 _GREEDY = "it is not used without e-greedy exploration"
+
+_ALSO = {
+    "learning_rate": "lr",
+    "gamma": "discount_factor",
+    "epochs": "num_epochs",
+    "entropy": "beta_entropy",
+    "loss": "loss_type",
+}
+"""Hyperparameters by the names that other trainers give them."""
 
 KNOWN: Mapping[str, Hyperparameter] = {
     "batch_size": Hyperparameter(_one_of(32, 64, 128, 256, 512), _batch_size),

@@ -1,7 +1,7 @@
-"""Tasks: how they are found by name, and all that a task of one's own is made of.
+"""Tasks: find one by name, and the public parts of a task of your own.
 
-What is named here is public: ``from worker.tasks import DeclaredTask, Declaration, Robot, terms``. Names are imported when they are
-first used, since most of them bring the simulation with them.
+The names here are public: ``from worker.tasks import DeclaredTask, Declaration, Robot, terms``. Each is imported on first use,
+because most of them import the simulation.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _PUBLIC = {
     "worker.simulation.terrain_arrays": ("TerrainArrays",),
     "worker.simulation.worlds": ("WorldArrays",),
 }
-"""Public names by the module that has them."""
+"""Public names by their module."""
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 
 
@@ -95,11 +95,11 @@ BUILT_IN = {
     "LiftCube": "worker.tasks.lift:LiftCube",
     "LiftCubes": "worker.tasks.lift_cubes:LiftCubes",
 }
-"""Tasks that are there even where the distribution's metadata is not (a source tree on the path)."""
+"""Tasks found even without the distribution's metadata (a source tree on the path)."""
 
 
 def task_names() -> dict[str, str]:
-    """Every known task: its name and where its class is (``module:Class``), sorted by name."""
+    """Every known task: its name and its class (``module:Class``), sorted by name."""
     found = {point.name: point.value for point in entry_points(group="muster.tasks")}
     return dict(sorted((BUILT_IN | found).items()))
 
@@ -112,7 +112,7 @@ def find_task(name: str) -> type[Task]:
             ``module:Class``.
 
     Raises:
-        ValueError: There is no such task, what is there is not a task, or the user's module can't be imported.
+        ValueError: The task does not exist, the class is not a task, or the user's module can't be imported.
     """
     known = task_names()
     where = name if ":" in name else known.get(name)
@@ -120,7 +120,9 @@ def find_task(name: str) -> type[Task]:
         raise ValueError(f"no task is called {name!r}; {nearest(name, known)} (your own: module:Class)")
     module_name, _, class_name = where.partition(":")
     if name == where and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a user's module lies where the job was submitted; ours are never hidden by it
+        sys.path.append(
+            os.getcwd()
+        )  # a user's module is in the submitter's directory; last, so that it hides none of ours
     try:
         with task_mistakes(name):
             module = importlib.import_module(module_name)

@@ -1,4 +1,4 @@
-"""``python -m worker.tasks [NAME …]``: what tasks there are, as JSON. ``muster tasks`` runs it, since it imports no torch itself."""
+"""``python -m worker.tasks [NAME …]`` lists tasks as JSON. ``muster tasks`` runs it, since it imports no torch itself."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def describe(name: str, whole: bool = False) -> dict[str, Any]:
-    """What a task sees, does and is rewarded for.
+    """A task's observations, actions and rewards.
 
     Args:
         name: As :func:`worker.tasks.find_task` takes it.
-        whole: Of a declared task its terms, too: their tables, and the numbers that a job can change.
+        whole: For a declared task, include the tables of its terms and the numbers that a job can change.
 
     Raises:
-        ValueError: There is no such task, or its own code is wrong.
+        ValueError: The task does not exist, or its own code is wrong.
     """
     kind = find_task(name)
     with task_mistakes(name):
@@ -46,7 +46,7 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
 
 
 def _observations(task: Task, config: Any) -> list[str]:
-    """Name of each observation; of each camera one line says what its image is."""
+    """Name of each observation; for each camera, one line that describes its image."""
     camera = getattr(config, "camera", None)
     if camera is not None:
         return [f"image: {camera.frames} x RGB of {camera.width} x {camera.height} bytes, the present one first"]
@@ -57,9 +57,9 @@ def _observations(task: Task, config: Any) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Print the tasks ``names``, or all; returns the exit code: 2 where there is no task of a given name.
+    """Print the tasks ``names``, or all; returns the exit code: 2 if a name is unknown.
 
-    Without names, one that can't be imported (of a package that is broken) is listed with its ``error``.
+    Without names, a task that can't be imported (of a broken package) is listed with its ``error``.
     """
     found = []
     for name in names or task_names():
@@ -79,5 +79,5 @@ def main(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    gc.disable()  # Importing the simulation parses hundreds of kernels; garbage collection would make that half as long again.
+    gc.disable()  # Importing the simulation parses hundreds of kernels; garbage collection would make that 50 % slower.
     sys.exit(main(sys.argv[1:]))

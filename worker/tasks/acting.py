@@ -1,4 +1,4 @@
-"""What the terms of actions drive: joints, one action each, or a frame of a robot whose inverse kinematics drive joints."""
+"""What action terms drive: joints, with one action each, or a frame of a robot, by inverse kinematics."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from worker.tasks.binding import Bound
 
 
 def frame_of(bound: Bound, sensors: Mapping[str, Any]) -> DifferentialIK | None:
-    """What an action term moves, where it is called for the columns of a frame; None where it is called for joints."""
+    """The frame that an action term moves; None: the term drives joints."""
     found = next(_frames(bound, sensors), None)
     return sensors[found] if found and bound.takes("index") else None
 
 
 def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
-    """Names of the inverse kinematics that a term is given."""
+    """Names of a term's inverse kinematics."""
     given = {
         variable.removeprefix("sensor_") for variable in bound.arguments.values() if variable.startswith("sensor_")
     }
@@ -25,7 +25,7 @@ def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
 
 
 def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
-    """Refuse a term that drives neither joints nor a frame, or joints without an actuator; name the columns of a frame.
+    """Refuse a term that drives neither joints nor a frame, or joints without an actuator; fill in the names of a frame's columns.
 
     Raises:
         ValueError: In one line with its place.
@@ -54,7 +54,7 @@ def check_action(bound: Bound, views: Mapping[str, RobotView], sensors: Mapping[
 
 
 def check_driven(acting: Sequence[Bound], views: Mapping[str, RobotView], sensors: Mapping[str, Any]) -> None:
-    """Refuse two actions for one thing, and inverse kinematics that no action asks.
+    """Refuse two actions for one joint or frame, and inverse kinematics that no action uses.
 
     Args:
         acting: The terms of the actions.

@@ -1,4 +1,4 @@
-"""Numbers that follow how well the policy does, and what of them is part of a run's state."""
+"""Numbers that adapt to the policy's performance, and their part of a run's state."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Adapting:
         device: Of the state.
 
     Attributes:
-        state: The same row for every world, so that worlds can be dealt out again: the last iteration that was begun, then the step of
+        state: The same row for every world, so that worlds can be resharded: the last iteration that has begun, then the step of
             each rule; float32, shape ``(worlds, 1 + rules)``.
     """
 
@@ -36,7 +36,7 @@ class Adapting:
         self.read()
 
     def read(self) -> None:
-        """Take the steps from :attr:`state`, at the beginning and after it was loaded, and set the numbers."""
+        """Take the steps from :attr:`state`, at the start and after a load, and set the numbers."""
         begun, *steps = self.state[0].tolist()
         self._begun, self._steps = int(begun), steps
         self._write()
@@ -47,7 +47,7 @@ class Adapting:
         return dict(zip(self._names, self._steps, strict=True))
 
     def hold(self, iteration: int, steps: Mapping[str, float]) -> None:
-        """Set the numbers as a checkpoint has them, up to and with ``iteration``: :meth:`begin` moves them only after it.
+        """Set the numbers of a checkpoint and hold them through ``iteration``; :meth:`begin` moves them only after it.
 
         Args:
             iteration: The checkpoint's last.
@@ -59,10 +59,10 @@ class Adapting:
         self._write()
 
     def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Before an iteration: go on or back, once an iteration.
+        """Move each number forward or back, once per iteration, before it begins.
 
         Args:
-            iteration: How many are done.
+            iteration: Number of finished iterations.
             reward: Mean return of the episodes that ended last; None before the first.
             episode_length: Their mean length [steps].
         """
@@ -80,21 +80,21 @@ class Adapting:
 
 
 def adaptive_steps(task: Task) -> dict[str, float]:
-    """How far the adaptive numbers of a task have gone, by name: what a checkpoint's manifest keeps of them."""
+    """The step of each adaptive number of a task, by name, as in a checkpoint's manifest."""
     return task.adapting.steps if task.adapting else {}
 
 
 def begin_evaluation(
     task: Task, iteration: int, reward: float | None, episode_length: float | None, steps: Mapping[str, float]
 ) -> None:
-    """As :meth:`Task.begin_iteration`, where a policy is judged: adaptive numbers are as in the training, and do not move.
+    """As :meth:`Task.begin_iteration`, for an evaluation: adaptive numbers are as in the training, and do not move.
 
     Args:
-        task: The worlds in which it is judged; they may be those of the training.
-        iteration: The training's last, and so the next two.
+        task: The worlds of the evaluation; they may be those of the training.
+        iteration: The training's last, as are the next two.
         reward: Mean return of the episodes that ended last; None before the first.
         episode_length: Their mean length [steps].
-        steps: What :func:`adaptive_steps` gave in the training; a number that it lacks is at its start.
+        steps: From :func:`adaptive_steps` in the training; a number that it lacks is at its start.
     """
     if task.adapting:
         task.adapting.hold(iteration, steps)

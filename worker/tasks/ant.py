@@ -20,7 +20,7 @@ class Ant(Running):
         # The worst case: 12 capsules with two contacts and one sphere with one, four rows each, and eight joint limits.
         "nconmax": 25,
         "njmax": 108,
-        # Falls and heights are those of the file's 50 iterations at 1e-10, for a fraction of the time.
+        # Falls and heights match those of the file's 50 iterations at 1e-10, in a fraction of the time.
         "iterations": 3,
         "ls_iterations": 6,
         "tolerance": 1.0e-3,

@@ -1,4 +1,4 @@
-"""A term bound to a robot's model: which elements it is called for, and what each of its parameters is in a kernel."""
+"""A term bound to a robot's model: its elements, and the value of each of its parameters in a kernel."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from worker.tasks.term_needs import Needs, needs_of
 
 @dataclass
 class Bound:
-    """A term and all that a kernel has to know of it.
+    """A term, with all that a kernel needs to call it.
 
     Attributes:
         place: Section and name, such as ``rewards.track_linear``.
         term: As declared.
-        signature: Of its function; None of a torch term.
-        elements: What its function is called with, one call each; None: it has no such parameter.
+        signature: Of its function; None for a torch term.
+        elements: The elements that its function is called with, one call each; None: it has no such parameter.
         element_names: Of the elements.
-        arguments: What each of its parameters is in the kernel; the others (``world``, elements) are variables of the kernel.
-        memory: First column of its own memory, -1 where it has none.
-        external: First column of what a torch term gives, -1 where it is none.
+        arguments: Its parameters as expressions of the kernel; the others (``world``, elements) are variables of the kernel.
+        memory: First column of its own memory, -1 without any.
+        external: First column of a torch term's result, -1 for a Warp function.
         width: Numbers of one result.
     """
 
@@ -59,24 +59,24 @@ class Bound:
 
 
 class Binder:
-    """Binds terms one after the other, and collects what they need.
+    """Binds terms one by one, and collects the memory, numbers and structs that they need.
 
     Args:
         views: The robots and objects by name.
         sensors: The sensors as declared, by name.
-        actions: Names of the actions, in order; filled before terms are bound that want them.
+        actions: Names of the actions, in order; filled before binding the terms that need them.
         has_terrain: Whether the task has a terrain.
 
     Attributes:
         numbers: All numbers of the bound terms.
         structs: Variables of structs in the kernels, and their types.
         commands: First column in memory of each command, by name.
-        told: How many numbers of each command the policy is told.
-        hidden: How many numbers of each command are behind those.
-        memory: Columns of ``episodes.memory`` that are given away.
-        lasting: Columns of ``episodes.lasting`` that are given away.
+        told: Count of the numbers of each command that the policy sees.
+        hidden: Count of the hidden numbers of each command, which follow those.
+        memory: Number of allocated columns of ``episodes.memory``.
+        lasting: Number of allocated columns of ``episodes.lasting``.
         external: Columns of torch terms.
-        indices: Elements that no range of whole numbers gives, one selection after the other.
+        indices: Elements that are not a range of whole numbers, one selection after the other.
     """
 
     def __init__(self, views: Mapping[str, RobotView], sensors: Mapping[str, Any], has_terrain: bool) -> None:
@@ -99,7 +99,7 @@ class Binder:
             place: Section and name.
             term: As declared.
             element: Whether its function may be called for several elements.
-            own: Parameters that the kernel fills itself, and how.
+            own: Parameters that the kernel itself fills, and their expressions.
 
         Raises:
             ValueError: The function or its parameters do not fit, in one line that names the place.
@@ -143,7 +143,7 @@ class Binder:
         return bound
 
     def _indices(self, place: str, term: Term, found: Signature, given: Mapping[str, Any]) -> list[str]:
-        """What a parameter ``index`` counts, by name: columns of sensors, numbers of a command, or what ``size`` says."""
+        """Names of the elements that a parameter ``index`` counts: columns of sensors, numbers of a command, or ``size`` of them."""
         needed = needs_of(term.function)
         names, what = self._counted(place, found, given, needed)
         if term.size is None:
@@ -155,7 +155,7 @@ class Binder:
         return [str(index) for index in range(term.size)]
 
     def _counted(self, place: str, found: Signature, given: Mapping[str, Any], needed: Needs) -> tuple[list[str], str]:
-        """The names of all that an index may be, and what they are; none where the function does not say."""
+        """Names of the values of an index, and a word for what they are; none if the function does not say."""
         if needed.size:
             return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
@@ -183,7 +183,7 @@ class Binder:
 
     @staticmethod
     def _frames_of(place: str, sensor: str, rows: list[str], points: str, given: Mapping[str, Any]) -> list[str]:
-        """The frames of a height scan, of which each has as many columns as the number ``points`` says."""
+        """The frames of a height scan; each has as many columns as the number ``points`` says."""
         count = given.get(points)
         if isinstance(count, bool) or not isinstance(count, int) or count < 1 or len(rows) % count:
             raise ValueError(
@@ -207,7 +207,7 @@ class Binder:
         """How many numbers of its own a term keeps.
 
         Raises:
-            ValueError: Nobody says how many, or the declaration says too few.
+            ValueError: Neither function nor declaration says how many, or the declaration says too few.
         """
         needed, term = needs_of(bound.term.function), bound.term
         count = needed.memory
@@ -274,13 +274,13 @@ class Binder:
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
         if name not in given:
             raise ValueError(f"{place}: {term.function_name} needs {name}={shown_type(kind)}")
-        # what a scan's columns are divided by is part of the kernel's bounds
+        # the divisor of a scan's columns is part of the kernel's bounds
         check = stays(given[name]) if name == needs_of(term.function).points else None
         first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind], check)
         return EXPRESSIONS[kind].format(*range(first, first + WIDTHS[kind]))
 
     def reserve_command(self, name: str, term: Command) -> None:
-        """Give a command its columns in memory: what the policy is told, what is hidden, and its countdown.
+        """Reserve a command's columns in memory: the numbers for the policy, the hidden ones, and its countdown.
 
         Raises:
             ValueError: Its function draws another count of numbers, or keeps more of them hidden.
@@ -344,7 +344,7 @@ class Binder:
         return variable
 
     def _sensor(self, place: str, parameter: str, kind: Any, name: Any) -> str:
-        """The sensor that a parameter is given: the named one, or the only one of its kind."""
+        """The sensor for a parameter: the named one, or the only one of its kind."""
         fitting = [key for key, each in self.sensors.items() if each.arrays_type is kind]
         if name is None and len(fitting) == 1:
             return fitting[0]
@@ -358,7 +358,7 @@ class Binder:
 
 
 def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> tuple[list[int], list[str]]:
-    """The elements of a robot that fit a pattern, as a function takes them, and their names.
+    """The elements of a robot that fit a pattern, as indices for a function, and their names.
 
     Raises:
         ValueError: None fits, or none was named.
@@ -389,10 +389,10 @@ def is_named(name: str, kind: Any, found: Signature) -> bool:
 
 
 def _is_sensor(kind: Any) -> bool:
-    """Whether a parameter wants what a sensor measured."""
+    """Whether a parameter is a sensor's measurement."""
     return is_struct(kind) and kind not in STRUCTS and not is_robot(kind) and shown_type(kind) != "TerrainArrays"
 
 
 def _has_columns(kind: Any) -> bool:
-    """Whether a sensor's struct has a column for each of what it measures, besides the row of each world."""
+    """Whether a sensor's struct has a column for each measured element, besides the row of each world."""
     return any(isinstance(each.type, wp.array) and each.type.ndim > 1 for each in kind.vars.values())

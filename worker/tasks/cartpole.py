@@ -38,7 +38,7 @@ def place(
 
 @wp.func
 def effort(world: int, episodes: EpisodeArrays, action: int) -> float:
-    """Square of the action that the motor felt."""
+    """Square of the clipped action."""
     felt = clipped_action(episodes, world, action)
     return felt * felt
 

@@ -1,4 +1,4 @@
-"""Whether the arguments of a task, and what it says of itself and declares, can be right."""
+"""Checks of a task's arguments, interface and declaration."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def checked_interface(task: Task) -> Interface:
     """The task's interface, or the names of its observations alone.
 
     Raises:
-        ValueError: It is of other numbers than the task's, or in another order.
+        ValueError: Its names or their order differ from the task's.
     """
     interface = task.interface() or Interface(tuple(map(Observation, task.observation_names)), ())
     for what, declared, names in (
@@ -59,7 +59,7 @@ def checked_interface(task: Task) -> Interface:
 
 
 def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:
-    """Replay the captured step once and check that it writes rewards: an empty graph would step for ever without an error; returns True.
+    """Replay the captured step once and check that it writes rewards, since an empty graph would step without an error; returns True.
 
     Raises:
         RuntimeError: The replay left a reward as it was.
@@ -73,7 +73,7 @@ def assert_replays(task: Task, steps: Sequence[Callable[[], None]]) -> bool:
 
 
 def check_observation(place: str, term: declaration.Observation, columns: int) -> None:
-    """Raise ValueError for options of an observation that are none, or do not fit its columns."""
+    """Raise ValueError for invalid options of an observation, or options that do not fit its columns."""
     if term.noise_kind not in ("uniform", "normal") or not _is_number(term.noise) or term.noise < 0:
         found = term.noise if term.noise_kind == "uniform" else (term.noise_kind, term.noise)
         raise ValueError(
@@ -91,7 +91,7 @@ def check_observation(place: str, term: declaration.Observation, columns: int) -
 
 
 def check_command(place: str, term: declaration.Command) -> None:
-    """Raise ValueError for names or units of a command that can't be."""
+    """Raise ValueError for invalid names or units of a command."""
     if not term.names or not all(isinstance(name, str) for name in term.names):
         raise ValueError(f"{place}: names are {shown(term.names)}; name each number that the policy is told")
     if len(term.units) != len(term.names):
@@ -103,17 +103,17 @@ def check_command(place: str, term: declaration.Command) -> None:
 def check_randomized(
     entries: Mapping[str, Randomize], place: str, value: Any, where: str, *, fill: bool = False
 ) -> None:
-    """Refuse numbers that a job gives a place of ``randomize``.
+    """Check the numbers that a job sets at a place of ``randomize``.
 
     Args:
         entries: As declared.
         place: Such as ``randomize.mass.range``.
         value: The numbers.
-        where: What gives them, for the error.
+        where: Their source, for the error.
         fill: Whether all numbers of the place become ``value``.
 
     Raises:
-        ValueError: There is no such place, or the entry can't have these numbers.
+        ValueError: The place does not exist, or the entry can't have these numbers.
     """
     name, _, own = place.removeprefix("randomize.").partition(".")
     known = [f"randomize.{key}.{each}" for key, entry in entries.items() for each in entry.places]

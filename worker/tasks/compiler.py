@@ -1,7 +1,7 @@
-"""Kernels made of a plan: one for the actions, one that judges, resets and observes (two where observations need bodies or sensors).
+"""Kernels generated from a plan: one for actions; one for rewards, resets and observations (two if observations need bodies or sensors).
 
-The text of the kernels is generated and compiled as Warp code under the name of the task. Numbers are read from an array, so that
-the text, and with it the compiled module, is the same whatever they are.
+The source of the kernels is generated and compiled as Warp code under the name of the task. Numbers are read from an array, so that
+the source, and with it the compiled module, does not depend on their values.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ COMMON = (
     "numbers: wp.array(dtype=wp.float32), indices: wp.array(dtype=wp.int32), past: wp.array2d(dtype=wp.float32), "
     "external: wp.array2d(dtype=wp.float32), seconds: float, worlds: WorldArrays, episodes: EpisodeArrays"
 )
-"""Parameters of every kernel, behind its own."""
+"""Parameters of every kernel, after its own."""
 
 
 class Kernels:
@@ -32,17 +32,17 @@ class Kernels:
 
     Args:
         name: Of the task.
-        plan: What they are made of.
-        apart: Whether observations come in a kernel of their own, after bodies and sensors are brought up to date.
+        plan: Their contents.
+        apart: Whether observations have a kernel of their own, after the update of bodies and sensors.
 
     Attributes:
         act: ``(common, structs)``: from actions to controls.
-        judge: ``(mode, max_age, rows of further groups, common, structs)``: rewards, ends, resets, commands, and observations where
-            they are not apart.
-        observe: As ``judge``; None where observations are not apart.
-        startup: ``(common, structs)``: what happens once; None where nothing does.
+        judge: ``(mode, max_age, rows of further groups, common, structs)``: rewards, ends, resets, commands, and observations unless
+            they are apart.
+        observe: As ``judge``; None unless observations are apart.
+        startup: ``(common, structs)``: the startup events; None without any.
         structs: Variables of the structs that each takes, in order.
-        source: The text of all of them.
+        source: The source of all of them.
     """
 
     def __init__(self, name: str, plan: Plan, apart: bool) -> None:
@@ -69,27 +69,27 @@ def happening(plan: Plan, when: str) -> list[Bound]:
 
 
 def title(text: str) -> str:
-    """Name of the function in a text."""
+    """Name of the function in a source."""
     found = re.match(r"def (\w+)", text)
     assert found
     return found[1]
 
 
 _COMPILED: dict[tuple[str, str, tuple[Any, ...]], dict[str, Any]] = {}
-"""Kernels of this process: a second task of the same text loads nothing anew."""
+"""Kernels of this process: a second task with the same source loads nothing again."""
 
 
 def compiled(name: str, text: str, scope: dict[str, Any], functions: list[str], kernels: list[str]) -> dict[str, Any]:
-    """Warp kernels of a text, by name."""
+    """Warp kernels of a source, by name."""
     key = (name, text, tuple(id(value) for value in scope.values()))
     if key in _COMPILED:
         return _COMPILED[key]
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     label = re.sub(r"\W", "_", name)
-    # the same from process to process, whatever was built before: else Warp's cache on the disk would not find it
+    # equal in every process, whatever was built before, so that Warp finds it in its cache on the disk
     alike = sum(known[:2] == key[:2] for known in _COMPILED)
     file = f"<task {label} {digest}-{alike}>"
-    # a reader of a traceback, and Warp itself, find the text here
+    # tracebacks and Warp itself find the source here
     linecache.cache[file] = (len(text), None, [f"{line}\n" for line in text.split("\n")], file)
     exec(compile(text, file, "exec"), scope)
     module = wp.get_module(f"muster.{label}.{digest}.{alike}")
@@ -152,7 +152,7 @@ def judge(source: Source, apart: bool) -> str:
 
 
 def own(plan: Plan) -> str:
-    """Parameters of the kernels that observe: mode, longest age, the rows of groups besides the policy's, and what all have."""
+    """Parameters of the observing kernels: mode, longest age, the rows of groups besides the policy's, and the common ones."""
     rows = [row for group in further(plan) for row in rows_of(group)]
     return "".join(["mode: int, max_age: int, ", *[f"{row}: wp.array2d(dtype=wp.float32), " for row in rows], COMMON])
 
@@ -163,21 +163,21 @@ def further(plan: Plan) -> list[str]:
 
 
 def rows_of(group: str) -> tuple[str, str]:
-    """Where a kernel finds the rows of a group, and those of episodes that ended."""
+    """A kernel's names for the rows of a group, and for those of episodes that ended."""
     if group == "policy":
         return "episodes.observations", "episodes.terminal_observations"
     return f"group_{group}", f"ended_group_{group}"
 
 
 def observe(source: Source) -> str:
-    """The kernel of the observations alone: worlds that were just placed afresh are of age 0."""
+    """The kernel of the observations alone: worlds that were just reset have age 0."""
     lines = ["world = wp.tid()", "restart = mode != STEP or episodes.ages[world] == 0"]
     lines += [line for group in source.plan.groups for line in write(source, group)]
     return kernel("observe", own(source.plan), source, lines)
 
 
 def startup(source: Source) -> str:
-    """The kernel of what happens once in a world's life, with streams that nothing else draws from."""
+    """The kernel of the startup events, with random streams of their own."""
     lines = ["world = wp.tid()"]
     for number, bound in enumerate(happening(source.plan, "startup")):
         lines += [f"stream = numbered_stream(episodes, world, {-100_000 - number})"]
@@ -186,7 +186,7 @@ def startup(source: Source) -> str:
 
 
 def terminations(source: Source) -> list[str]:
-    """``ended_0``, …, and from them ``terminated`` and ``cut``; a world whose physics failed ends by no termination."""
+    """``ended_0``, …, and from them ``terminated`` and ``cut``; no termination counts in a world whose physics failed."""
     plan = source.plan
     lines = ["terminated = bool(False)", "cut = bool(False)"]
     lines += [f"ended_{number} = bool(False)" for number in range(len(plan.terminations))]
@@ -200,7 +200,7 @@ def terminations(source: Source) -> list[str]:
 
 
 def cuts(plan: Plan) -> list[Bound]:
-    """The terminations that count as the clock's."""
+    """The terminations that count as time-outs."""
     return [bound for bound in plan.terminations if isinstance(bound.term, Termination) and bound.term.time_out]
 
 
@@ -218,7 +218,7 @@ def rewards(source: Source) -> list[str]:
             value = f"seconds * total_{number}" if bound.term.per_second else f"total_{number}"
             lines += [f"add_reward(episodes, world, {number}, {value})"]
         else:
-            # one that is not finite would spoil the figure of all worlds
+            # a non-finite value would spoil the mean over all worlds
             column = f"episodes.sums[world, TERMS + {number}]"
             kept = f"total_{number}" if getattr(bound.term, "at_end", False) else f"{column} + total_{number}"
             lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {kept}"]
@@ -261,10 +261,10 @@ def remember_actions(plan: Plan, value: str) -> list[str]:
 
 
 def count_ends(plan: Plan) -> list[str]:
-    """Note and count by what the episode ended, where its end counts at all."""
+    """Record and count the cause of the episode's end, if the end counts."""
     first = f"TERMS + {len(plan.rewards) + len(plan.metrics)} + 4"
     lines = []
-    for number in reversed(range(len(plan.terminations))):  # of several at once the first one is the cause
+    for number in reversed(range(len(plan.terminations))):  # of several at once, the first is the cause
         lines += [f"if ended_{number}:", f"    episodes.causes[world] = TERMINATED + {number + 1}"]
     for number, _ in enumerate(plan.terminations):
         lines += [
@@ -280,7 +280,7 @@ def count_ends(plan: Plan) -> list[str]:
 
 
 def running(source: Source) -> list[str]:
-    """What happens to a world whose episode goes on: commands and events at intervals."""
+    """Commands and interval events of a world whose episode goes on."""
     lines: list[str] = []
     for told in source.plan.commands:
         column = f"episodes.memory[world, {told.countdown}]"
@@ -303,7 +303,7 @@ def running(source: Source) -> list[str]:
 
 
 def drawn(source: Source, bound: Bound, countdown: str, seconds: int) -> list[str]:
-    """Call a term with a stream of its own, and draw for how long it holds."""
+    """Call a term with a random stream of its own, and draw its duration."""
     return [
         "stream = random_stream(episodes, world)",
         *wait(countdown, seconds),
@@ -312,7 +312,7 @@ def drawn(source: Source, bound: Bound, countdown: str, seconds: int) -> list[st
 
 
 def updated(source: Source, told: Told) -> list[str]:
-    """What a command's update does in every step."""
+    """Call a command's update, in every step."""
     if told.update is None:
         return []
     stream = ["stream = random_stream(episodes, world)"] if told.update.takes("stream") else []
@@ -328,7 +328,7 @@ def wait(countdown: str, seconds: int) -> list[str]:
 def reset(source: Source) -> list[str]:
     """Begin an episode: events, then commands, then the first waits.
 
-    What no event places is where the model has it: a world whose physics failed would otherwise fail for ever.
+    Joints that no event places take the model's position: a world whose physics failed would otherwise fail again and again.
     """
     plan = source.plan
     lines = ["begin_episode(episodes, world)", "restore_start(worlds, world)"]
@@ -346,7 +346,7 @@ def reset(source: Source) -> list[str]:
 
 
 def each(source: Source, bounds: Iterable[Bound]) -> list[str]:
-    """One call after the other, each with a stream of its own where it draws."""
+    """One call after the other, with a random stream of its own for each that draws."""
     lines: list[str] = []
     for bound in bounds:
         lines += ["stream = random_stream(episodes, world)"] if bound.takes("stream") else []
@@ -355,7 +355,7 @@ def each(source: Source, bounds: Iterable[Bound]) -> list[str]:
 
 
 def write(source: Source, group: str, terminal: bool = False) -> list[str]:
-    """Write a group: the observation that comes next, or the last one of the episode that ended."""
+    """Write a group: the next observation, or the last one of the episode that ended."""
     now, ended = rows_of(group)
     out = ended if terminal else now
     fresh, commit = ("False", "False") if terminal else ("restart", "True")
@@ -366,10 +366,10 @@ def write(source: Source, group: str, terminal: bool = False) -> list[str]:
 
 
 def kernel(name: str, own: str, source: Source, lines: list[str]) -> str:
-    """The text of a kernel."""
+    """The source of a kernel."""
     return "\n".join([f"def {name}({own}{parameters_of(source)}):", *indent(lines)])
 
 
 def indent(lines: Iterable[str]) -> list[str]:
-    """One level further in."""
+    """Indent lines by one level."""
     return [f"    {line}" for line in lines]

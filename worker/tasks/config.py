@@ -1,4 +1,4 @@
-"""What can be set of a task from its job's YAML: times, reward weights, training. Imported without torch, Warp and Newton."""
+"""The settings of a task in a job's YAML: times, reward weights, training. Imported without torch, Warp and Newton."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from worker.learning.ppo.settings import PPOConfig
 from worker.tasks.overrides import Refused, configured, expecting, from_mapping, training_sections
 
 STRICT = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
-"""How the classes of configurations check: no unknown field, and no value of another type."""
+"""Validation of configuration classes: no unknown field, and no value of another type."""
 
 FACTORS = ("mass", "friction", "damping", "gains", "gravity")
 """Factors on the physics of each world."""
@@ -63,13 +63,13 @@ class Randomization:
     """How the worlds of a task differ from one another. Factors are uniform in ``[least, greatest]``, one for each world.
 
     Raises:
-        ValueError: A range is no range, or a number is out of range.
+        ValueError: A range is malformed, or a number is out of range.
     """
 
     mass: PositiveFactors = (1.0, 1.0)
     """Factor on masses and inertias."""
     friction: Factors = (1.0, 1.0)
-    """Factor on the friction of everything that touches."""
+    """Factor on the friction of all contacts."""
     damping: Factors = (1.0, 1.0)
     """Factor on the damping of the joints."""
     gains: Factors = (1.0, 1.0)
@@ -77,32 +77,32 @@ class Randomization:
     gravity: Factors = (1.0, 1.0)
     """Factor on gravity."""
     push_interval: Amount = 0.0
-    """Mean simulated time between two pushes of a world, which come at random [s]; 0: none."""
+    """Mean simulated time between two pushes of a world, at random times [s]; 0: none."""
     push_velocity: Amount = 0.0
-    """A push adds velocities uniform in +- this to the robot's, along the world's x and y [m/s]."""
+    """A push adds to the robot's velocity, uniformly within +- this along the world's x and y [m/s]."""
     observation_noise: Annotated[Amount | Mapping[str, Amount], WrapValidator(_check_noise)] = 0.0
-    """Standard deviation of the normal noise on what is measured; the policy's last action and its command stay exact. A number: of
-    each observation, as the policy sees it. A mapping: by name of the observation, with ``*`` for any letters, in the unit of the
-    measured quantity [m, rad, m/s, rad/s]; where several names fit, the last one counts, and where none does there is no noise."""
+    """Standard deviation of the normal noise on measured observations; the policy's last action and its command stay exact. A number:
+    for each observation, in the policy's units. A mapping: by name of the observation, with ``*`` for any letters, in the unit of the
+    measured quantity [m, rad, m/s, rad/s]; if several names fit, the last one counts; if none does, there is no noise."""
     camera_position: Amount = 0.0
-    """Each camera stands up to this far from its place, along each axis [m]."""
+    """Greatest offset of each camera from its place, along each axis [m]."""
     camera_angle: Amount = 0.0
-    """Each camera is turned up to this far about each of its axes [rad]."""
+    """Greatest rotation of each camera about each of its axes [rad]."""
     colors: Amount = 0.0
-    """Red, green and blue of each shape differ by up to this from their usual value, of 1."""
+    """Greatest change of the red, green and blue of each shape, of 1."""
     light: Factors = (1.0, 1.0)
-    """Factor on the brightness of what a camera sees."""
+    """Factor on the brightness of camera images."""
     action_latency: Annotated[int, Field(ge=0, le=64)] = 0
-    """Greatest number of control steps by which controls reach the actuators late; each episode draws its own, from 0."""
+    """Greatest latency of controls [control steps]; each episode draws its own, from 0."""
 
     @property
     def scene(self) -> list[str]:
-        """What is on that only a camera sees."""
+        """The active settings that only a camera sees."""
         return [name for name in _SCENE if getattr(self, name)] + (["light"] if self.light != (1.0, 1.0) else [])
 
     @property
     def draws_worlds(self) -> bool:
-        """Whether physics or scene of each world are drawn when it is built."""
+        """Whether the physics or scene of each world is drawn when it is built."""
         return bool(self.scene) or any(getattr(self, name) != (1.0, 1.0) for name in FACTORS)
 
     def __post_init__(self) -> None:
@@ -166,29 +166,29 @@ class _Common:
     episode_seconds: Positive = 10.0
     """Simulated time after which the clock ends an episode [s]."""
     rewards: Mapping[str, Finite] = reward_weights()
-    """Weight of each reward term. Who gives some names changes those; the others keep the task's defaults."""
+    """Weight of each reward term. Terms that are not named keep the task's defaults."""
     randomize: Annotated[Randomization, from_mapping(Randomization)] = Randomization()
-    """How the worlds differ from one another; not at all by default. A mapping of its fields will do."""
+    """How the worlds differ from one another; by default not at all. A mapping of its fields is accepted."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
-    """What changes in the course of training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated
-    and held constant outside their range. By the name of a reward term: its weight; by the place of a number of a declared task, such as
-    ``events.push.speed`` (of several numbers, all of them): that number; ``level``: how hard the
-    task is to be, from 0 to 1 (that of pushes and of the Quadruped's commands; a task of one's own reads ``episodes.level``)."""
+    """Changes during training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated and held constant
+    outside their range. Each is named after a reward term, whose weight it sets; the place of a number of a declared task, such as
+    ``events.push.speed`` (at a place with several numbers, it sets all); or ``level``, the difficulty of the task from 0 to 1 (of
+    pushes and of the Quadruped's commands; a task of your own reads ``episodes.level``)."""
     numbers: Mapping[str, Finite | Sequence[Finite]] = field(default_factory=lambda: MappingProxyType({}))
     """Numbers of a declared task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
     fastest: Positive = 1000.0
-    """Velocity of a joint from which on the physics has failed [m/s, rad/s]: the world is reset, as if something were NaN."""
+    """Joint velocity at which the physics counts as failed [m/s, rad/s]: the world is reset, as after a NaN."""
     nan_limit: Amount = 0.1
-    """Training stops when worlds that failed had to be reset more often in one iteration than this, times the number of worlds."""
+    """Training stops when one iteration has more resets of failed worlds than this share of the number of worlds."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """How the task is trained."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class TaskConfig(_Common):
-    """What every task has; a task adds its own fields.
+    """The settings of every task; a task adds its own fields.
 
-    A subclass is a dataclass of pydantic's with ``config=STRICT``, or a plain one, whose own fields are checked only where they come
+    A subclass is a pydantic dataclass with ``config=STRICT``, or a plain one, whose own fields are checked only when they come
     from a job's YAML.
 
     Raises:
@@ -197,16 +197,16 @@ class TaskConfig(_Common):
     """
 
     further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
-    """Observation groups besides ``policy`` and ``critic``, and of each whether it is of images, such as ``{"camera": True}``; ``policy``,
-    too, where a declaration makes it an image. Jobs are checked against these names when they are submitted."""
+    """Observation groups besides ``policy`` and ``critic``, and whether each holds images, such as ``{"camera": True}``; also ``policy``,
+    if a declaration makes it an image. Submission checks jobs against these names."""
     races: ClassVar[bool] = False
-    """Whether an episode is a lap of a race, as a job's ``race`` has it run."""
+    """Whether an episode is a lap of a race, as a job with ``race`` runs it."""
     other_rewards: ClassVar[Mapping[str, float]] = MappingProxyType({})
-    """Reward terms, with their weights, that take the place of the default ones where :attr:`has_other_rewards`."""
+    """Reward terms and weights that replace the default ones if :attr:`has_other_rewards`."""
 
     @classmethod
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
-        """What is wrong with a job's ``train.config``: keys to the value, and one line; None where nothing is."""
+        """The error in a job's ``train.config``: the keys to the value, and one line; None: it is valid."""
         try:
             cls.configured(overrides)
         except Refused as refused:
@@ -220,16 +220,16 @@ class TaskConfig(_Common):
 
     @classmethod
     def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-        """A job's ``train`` section with plain settings in the place of its ``hyperparameters``, which a task may know by other names.
+        """A job's ``train`` section with plain settings in place of its ``hyperparameters``, for which a task may have other names.
 
         Args:
-            train: As a YAML has it: its other keys are not checked yet.
+            train: From the YAML; its other keys are not checked yet.
 
         Returns:
-            The section, and a line for each of them that is not meant, or not done, exactly so.
+            The section, and a line for each hyperparameter whose setting is not exactly equivalent.
 
         Raises:
-            Refused: A hyperparameter can't be used, or the task knows none.
+            Refused: A hyperparameter can't be used, or the task has none.
         """
         raise Refused(("hyperparameters",), f"{cls.__name__} has none; settings of PPO stand under train.ppo")
 
@@ -240,12 +240,12 @@ class TaskConfig(_Common):
 
     @property
     def observation_groups(self) -> Mapping[str, bool]:
-        """The task's observation groups, and of each whether it is of images."""
+        """The task's observation groups, and whether each holds images."""
         return {"policy": getattr(self, "camera", None) is not None, "critic": False, **self.further_groups}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """JSON Schema of ``train.config``: the names of the terms, without what stands in sections of its own."""
+        """JSON Schema of ``train.config``: the names of the terms, without the fields that have sections of their own."""
         document: dict[str, Any] = handler.resolve_ref_schema(handler(core_schema))
         properties, known = document["properties"], {**default_rewards(cls), **cls.other_rewards}
         for name in training_sections():
@@ -259,13 +259,13 @@ class TaskConfig(_Common):
         return document
 
     def __post_init__(self) -> None:
-        # once more, without the types that a subclass gives these fields; of a plain dataclass nothing has been checked
+        # again, without a subclass's types of these fields; a plain dataclass has not been checked at all
         checked = _Common(**{item.name: getattr(self, item.name) for item in fields(_Common)})
         for item in fields(_Common):
             object.__setattr__(self, item.name, getattr(checked, item.name))
         known = default_rewards(type(self))
         if self.has_other_rewards:
-            if self.rewards == known:  # nobody gave any
+            if self.rewards == known:  # none were given
                 object.__setattr__(self, "rewards", self.other_rewards)
             known = self.other_rewards
         for name in self.rewards:
@@ -274,7 +274,7 @@ class TaskConfig(_Common):
                     ("rewards", name), f"{type(self).__name__} has no term {shown(name)}; {nearest(name, known)}"
                 )
         for name, points in self.curriculum.items():
-            # only the task itself knows its places
+            # only the built task has the places
             if name != "level" and name not in known and "." not in name:
                 raise Refused(("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}")
             if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):

@@ -1,4 +1,4 @@
-"""The policy's contract that follows from a declaration: what each observation and each action means on a robot."""
+"""The policy's contract, derived from a declaration: the meaning of each observation and action on a robot."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from worker.tasks.plan import Column, Driven, Plan, Seen
 
 UNITS: Mapping[str, tuple[str, str]] = {"effort": ("N m", "N"), "position": ("rad", "m"), "velocity": ("rad/s", "m/s")}
-"""Unit of an actuator's input on a joint that turns, and on one that slides."""
+"""Unit of an actuator's input on a revolute joint, and on a prismatic one."""
 
 
 DIRECT = frozenset({"effort", "position_target", "velocity_target"})
-"""Functions that act as their value says."""
+"""Functions that pass their value on unchanged."""
 Explicit = Mapping[str, Sequence[float]]
 """``stiffness``, ``damping`` and ``effort_limit`` of each actuator of one world, and whether its force is computed ``explicit``ly."""
 
@@ -34,7 +34,7 @@ def contract(plan: Plan, model: Any, motors: Explicit | None = None) -> Interfac
     Args:
         plan: The task's.
         model: MuJoCo's, of one world: gains and limits of the actuators are read from it.
-        motors: Those of actuators whose force is computed explicitly; None where there is none.
+        motors: Gains and limits of the actuators whose force is computed explicitly; None without any.
     """
     observations = [
         column for seen in plan.groups["policy"] for back in backs(seen) for column in described(plan, seen, back)
@@ -48,12 +48,12 @@ def contract(plan: Plan, model: Any, motors: Explicit | None = None) -> Interfac
 
 
 def backs(seen: Seen) -> range:
-    """How many steps ago each part of a term's history is, the oldest first."""
+    """Age in steps of each part of a term's history, the oldest first."""
     return range(seen.term.history - 1, -1, -1)
 
 
 def described(plan: Plan, seen: Seen, back: int = 0) -> list[Observation]:
-    """What each column of a term is, of the present step or of ``back`` steps ago."""
+    """Description of each column of a term, at the present step or ``back`` steps ago."""
     term, names = seen.term, seen.names
     units = [term.unit] * len(names) if isinstance(term.unit, str) else list(term.unit)
     kind = term.kind or ("command" if seen.bound.takes("command") else None)
@@ -85,7 +85,7 @@ def value_of(plan: Plan, column: Column | None, index: int, otherwise: float) ->
 
 
 def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], list[Any]]:
-    """Units and ranges of a command's columns, where the term gives them all."""
+    """Units and ranges of a command's columns, if the term uses them all."""
     name = seen.bound.term.parameters.get("command") or next(iter(plan.declaration.commands))
     command: Command = plan.declaration.commands[name]
     if len(command.names) != len(seen.names):
@@ -95,7 +95,7 @@ def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], lis
 
 
 def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[float, float] | None:
-    """Least and greatest value of a column of a command in training; None where that is not known."""
+    """Least and greatest value of a column of a command in training; None if unknown."""
     if column in command.ranges:
         return command.ranges[column]
     first, count = plan.numbers.places.get(f"commands.{name}.{column}", (0, 0))
@@ -144,7 +144,7 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
 
 
 def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[float, float] | None) -> list[Action]:
-    """One action for each column of a frame that inverse kinematics move."""
+    """One action for each column of a frame that inverse kinematics moves."""
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)
     return [
@@ -199,7 +199,7 @@ def _both(first: tuple[float, float] | None, second: tuple[float, float] | None)
 
 
 def _rule(term: DeclaredAction) -> str:
-    """What a function makes of its value where a scale and an offset do not say it: its own words, and its numbers."""
+    """Description of a function's effect where a scale and an offset do not suffice: its docstring and its numbers."""
     if term.function_name in DIRECT | {"share_of_range_target", "limited_effort"}:
         return ""
     text = (

@@ -1,7 +1,7 @@
-"""What a declared task is made of: named terms for actions, observations, rewards, terminations, commands, events and curricula.
+"""The parts of a declared task: named terms for actions, observations, rewards, terminations, commands, events and curricula.
 
-A term is a small Warp function with annotated parameters, see :mod:`worker.tasks.functions`. Its numbers are data: changing one
-compiles nothing, and a job's YAML changes them under ``train.config.numbers`` by their place, such as
+A term is a small Warp function with annotated parameters, see :mod:`worker.tasks.functions`. Its numbers are data: a change
+compiles nothing, and a job's YAML sets them under ``train.config.numbers`` by their place, such as
 ``rewards.track_linear.std``.
 """
 
@@ -15,25 +15,25 @@ from typing import Any, Literal
 from worker.tasks.randomize import Randomize
 
 Pattern = str | Sequence[str]
-"""Names of joints, bodies or sites: one or several, with ``*`` for any letters, in the order of the model."""
+"""Names of joints, bodies or sites, one or several, with ``*`` for any letters; they are selected in the order of the model."""
 
 
 class Term:
-    """A function, what it is applied to, and its numbers.
+    """A function, the elements that it is applied to, and its numbers.
 
     Args:
         function: A ``@wp.func``; or a Python function ``(task, **parameters) -> torch.Tensor``, whose launches are captured.
-        robot: Name of the robot or object that ``RobotArrays`` and patterns are of.
-        joints: Where the function has a parameter ``joint``: which joints.
-        bodies: Where it has a parameter ``body``: which bodies.
-        sites: Where it has a parameter ``site``: which sites.
-        size: Where it has a parameter ``index``: it is called with 0 to ``size - 1``, by default for each column of its sensor; of a
-            torch term: the columns that it gives, 1 by default.
-        memory: How many numbers of its own it has in ``episodes.memory``, from the column that its parameter ``memory`` says; they are
+        robot: Name of the robot or object to which ``RobotArrays`` and patterns refer.
+        joints: The joints, for a function with a parameter ``joint``.
+        bodies: The bodies, for a function with a parameter ``body``.
+        sites: The sites, for a function with a parameter ``site``.
+        size: For a function with a parameter ``index``, which is called with 0 to ``size - 1``: by default the number of columns of
+            its sensor. For a torch term: the number of columns that it returns, 1 by default.
+        memory: Count of its own numbers in ``episodes.memory``, from the column that its parameter ``memory`` gives; they are
             0 when an episode begins.
         lasting: As ``memory``, in ``episodes.lasting``, where they survive episodes.
-        **parameters: Its numbers (float, or a tuple for a vector), and by name the sensors, commands and further robots that its
-            parameters of these kinds want.
+        **parameters: Its numbers (float, or a tuple for a vector), and by name the sensors, commands and further robots for
+            parameters of these kinds.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class Reward(Term):
 
 
 class Metric(Term):
-    """A float, summed over its elements, that is logged and rewards nothing: its mean over the steps of the episodes that ended.
+    """A float, summed over its elements, that is logged but not rewarded: the mean over the steps of the finished episodes.
 
     Args:
         function: As for :class:`Term`.
-        at_end: It is the mean over the episodes that ended, of each what its last step says.
-        shown: Its unit, such as ``"%"``, where it is to be seen in a training's progress; None: it is not.
+        at_end: Log the mean of the values at the last step of each finished episode instead.
+        shown: Its unit, such as ``"%"``, to show it in a training's progress; None: don't show it.
         **options: As for :class:`Term`.
     """
 
@@ -95,11 +95,11 @@ class Metric(Term):
 
 
 class Termination(Term):
-    """A bool, true where it is for any element, that ends the episode; how often each did is logged by its name.
+    """A bool that ends the episode if it is true for any element; the number of episodes that each ends is logged by its name.
 
     Args:
         function: As for :class:`Term`.
-        time_out: It cuts the episode off as the clock does: what would have come after counts for the value of its last state.
+        time_out: Truncate the episode, as the clock does: the value of its last state still includes future rewards.
         **options: As for :class:`Term`.
     """
 
@@ -109,17 +109,17 @@ class Termination(Term):
 
 
 class Command(Term):
-    """What the policy is asked to do: numbers in ``episodes.memory`` that the function draws, at a reset and when their time is over.
+    """A command to the policy: numbers in ``episodes.memory`` that the function draws at a reset and when their time is up.
 
     Args:
         function: Has the parameter ``command`` (first column), and draws with ``stream``.
         names: Of the numbers, in order.
         units: Of the numbers; ``"1"`` by default.
-        ranges: Least and greatest value of each in training, for the policy's contract; by default the numbers of the function that
-            are called like them.
-        seconds: Least and greatest time for which a command holds [s].
-        update: A term that is called in every step after that, such as one that turns a heading into a turning velocity.
-        hidden: Further numbers behind those, which the policy is not told.
+        ranges: Least and greatest value of each in training, for the policy's contract; by default the function's parameters of
+            the same names.
+        seconds: Least and greatest duration of a command [s].
+        update: A term that is called in every later step, for example to turn a heading into a turning velocity.
+        hidden: Count of further numbers after those, which the policy does not see.
         **options: As for :class:`Term`.
     """
 
@@ -145,12 +145,12 @@ class Command(Term):
 
 
 class Event(Term):
-    """Something that happens to a world: when it is placed afresh (``reset``), now and then (``interval``), once (``startup``).
+    """A change of a world: at its reset (``reset``), at intervals (``interval``), or once (``startup``).
 
     Args:
         function: As for :class:`Term`; it draws with ``stream``.
         when: ``"reset"``, ``"interval"`` or ``"startup"``.
-        seconds: Of an interval: least and greatest time between two [s].
+        seconds: For an interval: least and greatest time between two events [s].
         **options: As for :class:`Term`.
     """
 
@@ -167,27 +167,27 @@ class Event(Term):
 
 
 class Curriculum(Term):
-    """A rule that is applied to a world whose episode ended, before it is placed afresh, such as a terrain's next level.
+    """A rule that is applied to a world between the end of its episode and its reset, such as a terrain's next level.
 
-    It keeps what it needs in ``lasting`` numbers.
+    It keeps its state in ``lasting`` numbers.
     """
 
 
 @dataclass(frozen=True)
 class Adaptive:
-    """A number that follows how well the policy does: the same in all worlds of all ranks, and part of a run's state.
+    """A number that adapts to the policy's performance: the same in all worlds of all ranks, and part of a run's state.
 
-    Before each iteration it goes one step from ``start`` towards ``end`` where the mean of the episodes that ended last is above
-    ``above``, and one step back where it is below ``below``. An evaluation of a checkpoint has it as the training had.
+    Before each iteration it goes one step from ``start`` towards ``end`` if the mean of the episodes that ended last is above
+    ``above``, and one step back if it is below ``below``. An evaluation of a checkpoint uses the training's value.
 
     Args:
-        place: Of the number, such as ``events.push.speed``; of several numbers, all of them.
-        start: Its value at first.
+        place: Place of the number, such as ``events.push.speed``; at a place with several numbers, all change.
+        start: Its first value.
         end: Its last value.
-        steps: Number of steps from one to the other.
-        above: From which mean on it goes on.
-        below: Under which mean it goes back; None: never.
-        of: Whether the mean is that of the ``"return"`` or of the ``"length"`` [steps].
+        steps: Number of steps between the two.
+        above: Mean above which it takes a step forward.
+        below: Mean below which it takes a step back; None: never.
+        of: The quantity of the mean, ``"return"`` or ``"length"`` [steps].
     """
 
     place: str
@@ -228,15 +228,15 @@ class Observation(Term):
 
     Args:
         function: As for :class:`Term`.
-        scale: Factor; one number, one for each column, or a mapping from patterns of the columns' names.
+        scale: Factor: one number, one for each column, or a mapping from patterns of the columns' names.
         offset: Subtracted from the value before all else, as ``scale``; ``"default"``: each joint's default position.
         noise: Half the width of uniform noise [the value's unit]; or ``("normal", deviation)``.
         clip: Least and greatest value [the value's unit].
-        delay: Greatest number of control steps by which it comes late; each episode draws its own, from 0, or from the first of two.
-        history: Number of steps seen, the present one among them; the oldest comes first.
+        delay: Greatest delay [control steps]; each episode draws its own, from 0 or from the first of two numbers.
+        history: Number of observed steps, including the present one; the oldest comes first.
         names: Of the columns; by default the term's name, with those of its elements and of its axes.
         unit: Of the value.
-        kind: Whether it is ``"measured"``, a ``"command"``, or the ``"previous_action"``; by default what its parameters tell.
+        kind: ``"measured"``, ``"command"`` or ``"previous_action"``; by default it follows from the parameters.
         **options: As for :class:`Term`.
     """
 
@@ -268,7 +268,7 @@ class Observation(Term):
 
 @dataclass(frozen=True)
 class Image:
-    """An observation group that is what a camera sees: bytes, shape ``(worlds, channels * frames, height, width)``.
+    """An observation group with a camera's images: bytes, shape ``(worlds, channels * frames, height, width)``.
 
     Args:
         sensor: Name of a :class:`worker.simulation.sensors.camera.CameraSensor` among the declaration's sensors.
@@ -278,16 +278,16 @@ class Image:
 
 
 class Action(Term):
-    """What a part of the policy's output does: ``offset + scale * action``, of the clipped action, is the function's ``value``.
+    """The effect of a part of the policy's output: the function's ``value`` is ``offset + scale * action``, of the clipped action.
 
     Args:
-        function: Has the parameters ``joint`` and ``value``, and writes ``worlds.controls``; or, of a frame that a ``DifferentialIK``
+        function: Has the parameters ``joint`` and ``value``, and writes ``worlds.controls``; or, for a frame that a ``DifferentialIK``
             moves, ``index``, ``value`` and one of the type ``IkArrays``.
-        scale: Factor; one number, or a mapping from patterns of joints or columns.
+        scale: Factor: one number, or a mapping from patterns of joints or columns.
         offset: One number, a mapping from patterns of joints, or ``"default"``: each joint's default position.
-        clip: Least and greatest action; None: the policy's output as it is.
-        kind: What the actuator's input is: an ``"effort"``, a ``"position"`` or a ``"velocity"``.
-        unit: Of the actuator's input; by default what ``kind`` has on a joint that turns or slides, such as N m or N.
+        clip: Least and greatest action; None: no clipping.
+        kind: The actuator's input: ``"effort"``, ``"position"`` or ``"velocity"``.
+        unit: Of the actuator's input; by default that of ``kind`` on a revolute or prismatic joint, such as N m or N.
         **options: As for :class:`Term`.
     """
 
@@ -307,7 +307,7 @@ class Action(Term):
 
 
 class Choice(Term):
-    """The action is one of several: the function's parameter ``choice`` is its number, from 0.
+    """A discrete action, one of several choices: the function's parameter ``choice`` is its number, from 0.
 
     Args:
         function: Has the parameter ``choice``, and writes ``worlds.controls``.
@@ -321,7 +321,7 @@ class Choice(Term):
 
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
-"""What a term may be called: it becomes part of a place, of a column of the log and of a variable in a kernel."""
+"""Valid names of terms: a name becomes part of a place, of a column of the log and of a variable in a kernel."""
 
 
 @dataclass(frozen=True)
@@ -333,30 +333,30 @@ class Declaration:
     """
 
     actions: Mapping[str, Action] | Choice
-    """Terms of the action, in order; or the one choice that the action is."""
+    """Terms of the action, in order; or one discrete choice."""
     observations: Mapping[str, Observation] | Mapping[str, Mapping[str, Observation] | Image]
-    """Terms of what the policy sees, in order; or of several groups: ``policy``, and ``critic`` for what only the simulation knows.
-    Without a group ``critic``, it sees what the policy sees, without noise and delay. A group that is an :class:`Image` is named in the
-    configuration's ``further_groups``, too; where ``policy`` is one, ``critic`` has the terms."""
+    """Terms of the policy's observations, in order; or of several groups: ``policy``, and ``critic`` for privileged observations.
+    Without a group ``critic``, the critic sees the policy's observations without noise and delay. An :class:`Image` group must also be
+    named in the configuration's ``further_groups``; if ``policy`` is an image, ``critic`` has the terms."""
     rewards: Mapping[str, Reward]
-    """By the names of ``config.rewards``, all of them."""
+    """One for each name in ``config.rewards``."""
     terminations: Mapping[str, Termination] = field(default_factory=dict)
-    """What ends an episode besides the clock."""
+    """Ends of an episode other than the clock."""
     commands: Mapping[str, Command] = field(default_factory=dict)
-    """What the policy is asked to do."""
+    """Commands to the policy."""
     events: Mapping[str, Event] = field(default_factory=dict)
-    """What happens at a reset, at intervals, at startup, in this order of the terms."""
+    """Changes at a reset, at intervals and at startup, in the order of the terms."""
     curricula: Mapping[str, Curriculum | Adaptive] = field(default_factory=dict)
-    """Rules by which a world becomes harder or easier, and numbers that follow how well the policy does."""
+    """Rules that make a world harder or easier, and numbers that adapt to the policy's performance."""
     metrics: Mapping[str, Metric] = field(default_factory=dict)
-    """What is logged besides."""
+    """Further logged values."""
     sensors: Mapping[str, Any] = field(default_factory=dict)
-    """Sensors by the names by which terms ask for them."""
+    """Sensors by the names that terms use."""
     randomize: Mapping[str, Any] = field(default_factory=dict)
     """Quantities of the model that differ from world to world."""
     success: str | None = None
-    """When an evaluated episode is a success: the name of a metric, which must be greater than 0 in its last step, or of the termination
-    that must have ended it. None: where only the clock ended it, which means nothing in a task without terminations."""
+    """Criterion for a successful evaluated episode: the name of a metric, which must be greater than 0 in its last step, or of the
+    termination that must have ended it. None: only the clock ended it, which means nothing in a task without terminations."""
 
     def __post_init__(self) -> None:
         for section, kind in SECTIONS.items():
@@ -405,7 +405,7 @@ class Declaration:
 
     @property
     def groups(self) -> Mapping[str, Mapping[str, Observation]]:
-        """The terms of each observation group that has terms; where the policy sees an image, those of the critic are under ``policy``."""
+        """The terms of each observation group that has terms; if the policy sees an image, the critic's terms are under ``policy``."""
         if not self._nested:
             return {"policy": self.observations}  # type: ignore[dict-item]
         groups = {name: each for name, each in self.observations.items() if isinstance(each, Mapping)}
@@ -431,13 +431,13 @@ SECTIONS: Mapping[str, type[Term]] = {
     "curricula": Curriculum,
     "metrics": Metric,
 }
-"""The sections of a declaration and what their terms are."""
+"""The sections of a declaration and the types of their terms."""
 
 TorchFunction = Callable[..., Any]
 
 
 def _several(names: Any) -> tuple[Any, ...]:
-    """Names as a tuple; one that stands alone is one."""
+    """Names as a tuple; a single name becomes a tuple of one."""
     return tuple(names) if isinstance(names, Sequence) and not isinstance(names, str) else (names,)
 
 

@@ -52,19 +52,19 @@ class DeclaredTask(Task):
     1. ``actions``: from the policy's output to the actuators.
     2. Physics: ``config.substeps`` steps; after it sensors measure.
     3. ``terminations``, then ``rewards`` and ``metrics``, of worlds whose physics did not fail.
-    4. The end of the step: clock, sums, statistics; which worlds begin a new episode.
-    5. Of an episode that ended, the last observation, then ``curricula``.
-    6. In a world that goes on: ``commands`` whose time is over are drawn anew, ``events`` at intervals.
-    7. In a world that begins: memory and solver forget the old episode, and every joint is where the model has it; ``events`` at a
+    4. The end of the step: clock, sums, statistics; selection of the worlds that begin a new episode.
+    5. For an episode that ended, the last observation, then ``curricula``.
+    6. In a world that goes on, ``commands`` whose time is up are drawn again, then ``events`` at intervals.
+    7. In a world that begins, memory and solver are cleared and every joint is at the model's position; ``events`` at a
        reset place it, then ``commands`` are drawn.
     8. ``observations`` of every world, with noise, clip, scale, delay and history.
 
     Attributes:
         views: Joints, bodies, sites and geoms of each robot and object, by its name.
-        declaration: What :meth:`declare` gave.
-        plan: It, bound to the robots.
-        sensors: Those that were declared, by name.
-        randomizations: What the declaration makes differ from world to world.
+        declaration: The result of :meth:`declare`.
+        plan: The declaration, bound to the robots.
+        sensors: The declared sensors, by name.
+        randomizations: The declared quantities that differ from world to world.
     """
 
     solver_options: ClassVar[Mapping[str, Any]] = {}
@@ -75,15 +75,15 @@ class DeclaredTask(Task):
         raise NotImplementedError
 
     def objects(self, config: Any) -> Mapping[str, Any]:
-        """What else is in each world, by name: further robots, boxes, spheres, capsules."""
+        """Further objects in each world, by name: robots, boxes, spheres, capsules."""
         return {}
 
     def terrain(self, config: Any) -> Any:
-        """What the worlds stand on, a :class:`worker.simulation.terrain.Terrain`; None: a plane where ``ground`` is true."""
+        """The ground, a :class:`worker.simulation.terrain.Terrain`; None: a plane if ``ground`` is true."""
         return None
 
     def declare(self, config: Any) -> Declaration:
-        """The terms. :attr:`views` has the robots already."""
+        """The terms. :attr:`views` already has the robots."""
         raise NotImplementedError
 
     def build(self, builder: newton.ModelBuilder) -> None:
@@ -101,13 +101,13 @@ class DeclaredTask(Task):
         self.ground_terrain = self.terrain(config)
         sensors = self.declaration.sensors
         for name, sensor in sensors.items():
-            if hasattr(sensor, "rows"):  # one of a task's own may have no columns
+            if hasattr(sensor, "rows"):  # a task's own sensor may have no columns
                 with _placed(f"task {type(self).__name__}: sensors.{name}"):
                     sensor.rows(self.views)
         try:
             self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
         except ValueError as error:
-            # what a job sets is named by its place in the job alone
+            # an error in a job's setting names its place in the job alone
             where = "" if str(error).startswith("config.") else f"task {type(self).__name__}: "
             raise ValueError(f"{where}{error}") from error
         self._name()
@@ -121,11 +121,11 @@ class DeclaredTask(Task):
             dataclasses.replace(entity, name=name).add_to(builder)
 
     def stands_on(self) -> bool | Terrain:
-        """The terrain that :meth:`terrain` gave, or whether there is a plane."""
+        """The result of :meth:`terrain`, or whether there is a plane."""
         return self.ground_terrain or self.ground
 
     def _name(self) -> None:
-        """Everything that is called after the terms."""
+        """Take names from the terms."""
         plan = self.plan
         self.observation_names, self.action_names = plan.names, plan.actions
         self.discrete = isinstance(self.declaration.actions, Choice)
@@ -138,7 +138,7 @@ class DeclaredTask(Task):
         self.termination_names = tuple(f"termination_{name}" for name in (*self.declaration.terminations, "time_out"))
 
     def interface(self) -> Interface:
-        """The policy's contract, which follows from the declaration."""
+        """The policy's contract, derived from the declaration."""
         attributes = getattr(self.worlds.model, "muster", None)
         motors = None
         if attributes is not None and self.worlds.drives is not None:
@@ -148,15 +148,15 @@ class DeclaredTask(Task):
         return contract(self.plan, self.worlds.solver.mj_model, motors)
 
     def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
-        """JSON documents that a bundle of a policy has besides, by the names of their files.
+        """Further JSON documents of a policy's bundle, by file name.
 
         Args:
-            algorithm: Name of the algorithm that has learnt it.
+            algorithm: Name of the algorithm that trained the policy.
         """
         return {}
 
     def _prepare(self) -> None:
-        """Everything on the device that the kernels take."""
+        """Prepare the kernels' inputs on the device."""
         plan, device, count = self.plan, self.device, self.world_count
         self._numbers = wp.array(plan.numbers.values or [0.0], dtype=wp.float32, device=device)
         self._past = wp.zeros((count, plan.past), dtype=wp.float32, device=device)
@@ -187,7 +187,7 @@ class DeclaredTask(Task):
         self._torch_terms = TorchTerms(self, plan, self._external)
         self._needs = _Needs(plan, self.sensors, self._torch_terms)
         self._kernels = Kernels(type(self).__name__, plan, self._needs.apart)
-        # selections that no range gives are collected while the text is made
+        # generating the source collects the selections that are not ranges
         self._indices = wp.array(plan.binder.indices or [0], dtype=wp.int32, device=device)
         self._common = [self._numbers, self._indices, self._past, self._external, 1.0 / self.config.control_hz]
         self._common += [self.worlds.arrays, self._episodes, *(structs[name] for name in self._kernels.structs)]
@@ -197,7 +197,7 @@ class DeclaredTask(Task):
             return declared.build(dataclasses.replace(context, name=name))
 
     def _begin(self) -> None:
-        """What happens once, when random streams are seeded: physics of each world, its patch of terrain, events at startup."""
+        """Once the random streams are seeded: draw each world's physics and patch of terrain, and run the startup events."""
         if self.randomizations is None:
             if self._cameras and not self._camera:
                 paint(self.worlds, self._episodes, self.config.randomize.colors)
@@ -225,7 +225,7 @@ class DeclaredTask(Task):
             wp.launch(self._kernels.startup, dim=self.world_count, inputs=self._common, device=self.device)
 
     def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        """The observation groups, and those before the reset; without a group of its own the critic sees what the policy sees."""
+        """The observation groups, and those before the reset; without a group of its own the critic sees the policy's."""
         seen = {"policy": self.observations, "critic": self.states}
         ended = {"policy": self.terminal_observations, "critic": self.terminal_observations}
         for group, (rows, last) in self._rows.items():
@@ -243,7 +243,7 @@ class DeclaredTask(Task):
         """A live view of the numbers of a place, such as ``events.push.speed``; writing to it changes the task from the next step on.
 
         Raises:
-            ValueError: There is no such place.
+            ValueError: The place does not exist.
         """
         if place.startswith("randomize."):
             known = self.randomizations.numbers() if self.randomizations else {}
@@ -255,7 +255,7 @@ class DeclaredTask(Task):
         return view
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Set the adaptive numbers, then what ``config.curriculum`` names. See :meth:`Task.begin_iteration`."""
+        """Set the adaptive numbers, then those of ``config.curriculum``. See :meth:`Task.begin_iteration`."""
         if self.adapting:
             self.adapting.begin(iteration, reward, episode_length)
         super().begin_iteration(iteration, reward, episode_length)
@@ -264,12 +264,12 @@ class DeclaredTask(Task):
         return self.numbers(name) if "." in name else super()._number(name)
 
     def _noise(self) -> list[float]:
-        """None by the randomizer: the kernels add what the configuration asks for."""
+        """No noise from the randomizer: the kernels add the configured noise."""
         checked_interface(self)
         return [0.0] * len(self.observation_names)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """As :meth:`Task.state_tensors`, with what delays, actions of the past and sensors keep."""
+        """As :meth:`Task.state_tensors`, with the buffers of delays, past actions and sensors."""
         tensors = super().state_tensors()
         tensors |= {"last_actions": self._last_actions, "earlier_actions": self._earlier_actions}
         if self.adapting:
@@ -287,7 +287,7 @@ class DeclaredTask(Task):
         return tensors
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """As :meth:`Task.load_state_dict`; the physics of each world becomes what was drawn for it."""
+        """As :meth:`Task.load_state_dict`; restores the physics that was drawn for each world."""
         super().load_state_dict(state)
         if self.adapting:
             self.adapting.read()
@@ -298,7 +298,7 @@ class DeclaredTask(Task):
                 self.worlds.update_bodies()
 
     def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
-        """The control step in order, each part with whether it is to be captured; torch's terms are not, unless torch captures all."""
+        """The parts of the control step, in order, and whether to capture each; torch terms are not captured, unless torch captures all."""
         if not self._torch_terms.any:
             return [(True, self._whole)]
         parts: list[tuple[bool, Callable[[], None]]] = [(True, self._simulate), (False, self._torch_terms.judge)]
@@ -326,18 +326,18 @@ class DeclaredTask(Task):
         self._measure()
 
     def move(self) -> None:
-        """Advance all worlds by one control step: by physics; a task whose robot moves by a rule of its own says how. Launches alone."""
+        """Advance all worlds by one control step, by kernel launches alone: physics, or a subclass's own rule of motion."""
         self.worlds.simulate()
 
     def _measure(self) -> None:
-        """Bodies and sensors as they are after the physics."""
+        """Update bodies and sensors after the physics."""
         if self._needs.bodies:
             self.worlds.update_bodies()
         for sensor in self.sensors.values():
             sensor.advance()
 
     def _launch_observe(self, mode: int) -> None:
-        """Judge or reset, and observe, by launches alone."""
+        """Compute rewards or reset, and observe, by kernel launches alone."""
         if mode == STEP:
             self._measure()
         if not self._torch_terms.any:
@@ -355,7 +355,7 @@ class DeclaredTask(Task):
         self._observe_alone(mode)
 
     def _judge_alone(self, mode: int) -> None:
-        """Rewards, ends, resets; then what has to follow in the worlds that begin: drives, bodies, sensors."""
+        """Rewards, terminations, resets; then update the worlds that begin: drives, bodies, sensors."""
         rows = [array for group in further(self.plan) for array in self._rows[group]]
         inputs = [mode, self.max_episode_length, *rows, *self._common]
         wp.launch(self._kernels.judge, dim=self.world_count, inputs=inputs, device=self.device)
@@ -384,7 +384,7 @@ class DeclaredTask(Task):
 
 @contextmanager
 def _placed(where: str) -> Iterator[None]:
-    """Say where in the task a ValueError arose."""
+    """Prefix a ValueError with its place in the task."""
     try:
         yield
     except ValueError as error:
@@ -392,12 +392,12 @@ def _placed(where: str) -> Iterator[None]:
 
 
 class _Needs:
-    """What a step has to bring up to date besides the joints.
+    """The data, besides the joints, that a step must update.
 
     Attributes:
         bodies: Poses of bodies, after the physics.
-        apart: Whether observations have a kernel of their own: they read what is stale in a world that was just placed afresh.
-        placed: Poses of bodies once more, after worlds were placed afresh: observations or the next step's actions read them.
+        apart: Whether observations have a kernel of their own: they read data that is stale right after a reset.
+        placed: Poses of bodies again after the reset of worlds: observations or the next step's actions read them.
     """
 
     def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:

@@ -1,4 +1,4 @@
-"""What a task tells of an episode once it has ended: sums of its reward terms and metrics, by what it ended, whether it was a success."""
+"""Records of finished episodes: sums of reward terms and metrics, cause of the end, success."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ CLOCK = "time_out"
 
 @dataclass(frozen=True)
 class Ended:
-    """The last episode of each world that ended: live views, valid in every world where one has.
+    """The last finished episode of each world: live views, valid in every world that has finished one.
 
     Attributes:
-        sums: Return, steps, the weighted sum of each reward term, the sum of each metric (of those in ``final`` the last value), shape
+        sums: Return, steps, the weighted sum of each reward term, the sum of each metric (for those in ``final`` the last value), shape
             ``(worlds, 2 + terms)``, float32.
-        causes: Index into ``names`` of what ended it, shape ``(worlds,)``, int32. Of several terminations in one step it is the first.
-        judged: Whether it was a success as the task declares it, shape ``(worlds,)``, bool; meaningless where ``success`` is None.
-        names: What can end an episode: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
+        causes: Index into ``names`` of the cause of its end, shape ``(worlds,)``, int32. Of several terminations in one step, the first.
+        judged: Whether it was a success by the task's criterion, shape ``(worlds,)``, bool; meaningless if ``success`` is None.
+        names: Causes of an end: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
             the terminations of a declared task.
-        columns: Names of the columns of ``sums`` behind the first two.
-        success: The metric or termination that makes a success; None: that only the clock ended it.
-        says_success: Whether success means anything: of a task without terminations that declares none it does not.
-        final: The metrics of which the last step counts.
+        columns: Names of the columns of ``sums`` after the first two.
+        success: The metric or termination that makes a success; None: only the clock ended the episode.
+        says_success: Whether success is defined; without terminations and a criterion it is not.
+        final: The metrics whose last step counts.
     """
 
     sums: torch.Tensor
@@ -45,7 +45,7 @@ class Ended:
 
     @classmethod
     def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> Ended:
-        """What ``task`` tells, in buffers that ``buffer`` allocates among its ``EpisodeArrays``: name, shape, Warp's type."""
+        """The records of ``task``, in buffers that ``buffer`` allocates among its ``EpisodeArrays``: name, shape, Warp's type."""
         count = task.world_count
         rewards = [f"reward_{name}" for name in task.reward_terms]
         ends = [name.removeprefix("termination_") for name in task.termination_names]
@@ -62,8 +62,8 @@ class Ended:
 
     @property
     def terms(self) -> torch.Tensor:
-        """Of each reward term its weighted sum, of each metric its mean over the steps or its last value, shape ``(worlds, terms)``, named
-        by ``columns``."""
+        """The weighted sum of each reward term, and the mean over the steps or the last value of each metric, shape ``(worlds, terms)``,
+        named by ``columns``."""
         steps = self.sums[:, int(STEPS)].clamp(min=1.0)
         terms = self.sums[:, int(TERMS) :].clone()
         for column, name in enumerate(self.columns):
@@ -73,16 +73,16 @@ class Ended:
 
     @property
     def meaning(self) -> str:
-        """What a success is, in words."""
+        """The criterion of success, in words."""
         if self.success is None:
             return "the clock ended the episode" if self.says_success else "the task does not say"
         metric = f"metric_{self.success}" in self.columns
         return f"{self.success} above 0 in the last step" if metric else f"{self.success} ended the episode"
 
     def successes(self, time_outs: torch.Tensor) -> torch.Tensor:
-        """Whether each episode was a success, shape ``(worlds,)``, bool; none is whose physics failed.
+        """Whether each episode was a success, shape ``(worlds,)``, bool; false if its physics failed.
 
         Args:
-            time_outs: Whether the clock ended it, or a termination that counts as the clock, shape ``(worlds,)``, bool.
+            time_outs: Whether the clock, or a termination that counts as a time-out, ended it, shape ``(worlds,)``, bool.
         """
         return time_outs if self.success is None else self.judged & (self.causes != int(PHYSICS_FAILED))

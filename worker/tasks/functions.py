@@ -1,16 +1,16 @@
-"""What a term's function asks for, read from its annotations.
+"""The inputs of a term's function, read from its annotations.
 
-A term's function is a ``@wp.func`` whose parameters and result are annotated. It is given what its parameters ask for:
+A term's function is a ``@wp.func`` with annotated parameters and result. Each parameter receives its value by type or name:
 
 - ``world: int``, always;
 - by type: ``WorldArrays``, ``EpisodeArrays``, ``BodyArrays``, ``TerrainArrays``, ``RobotArrays`` (of the term's robot; further
   ones are named by a keyword of the parameter's own name), and the structs of sensors (named the same way);
-- ``joint``, ``body``, ``site``, ``index`` (int): it is called for each element of the term's selection;
-- ``action: int``: it is called for each action;
+- ``joint``, ``body``, ``site``, ``index`` (int): the function is called for each element of the term's selection;
+- ``action: int``: the function is called for each action;
 - ``stream: wp.uint32``: a random generator of its own;
-- ``command: int``: the first column of the command that the keyword ``command`` names (of a command's own function: its own);
+- ``command: int``: the first column of the command that the keyword ``command`` names (in a command's own function: its own);
 - ``memory: int``, ``lasting: int``: the first column of the term's own numbers in ``episodes.memory`` and ``episodes.lasting``
-  (how many, :func:`worker.tasks.term_needs.needs` says beside the function, or the term's ``memory=``, ``lasting=``);
+  (:func:`worker.tasks.term_needs.needs` beside the function, or the term's ``memory=`` and ``lasting=``, give their count);
 - ``value: float`` (actions): offset + scale * action; ``choice: int`` (choices): number of the choice;
 - ``terminated: bool`` (rewards, metrics): whether a termination ended the episode in this step;
 - ``seconds: float``: the length of a control step;
@@ -34,7 +34,7 @@ from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
 
 ELEMENTS = ("joint", "body", "site", "index", "action")
-"""Parameters for each value of which a function is called."""
+"""Parameters over whose values a function is called."""
 GIVEN = ("world", "stream", "memory", "lasting", "value", "choice", "terminated", "seconds")
 """Parameters that the compiler fills by their names."""
 WIDTHS: Mapping[Any, int] = {
@@ -54,13 +54,13 @@ WIDTHS: Mapping[Any, int] = {
 
 @dataclass(frozen=True)
 class Signature:
-    """What a function takes and gives.
+    """Parameters and result of a function.
 
     Attributes:
         name: Of the function.
         parameters: Type of each parameter, in order.
         defaults: Of the parameters that have one.
-        returns: Type of the result, None where there is none.
+        returns: Type of the result, None without one.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Signature:
 
     @property
     def element(self) -> str | None:
-        """The parameter for each value of which the function is called."""
+        """The parameter over whose values the function is called."""
         return next((name for name in ELEMENTS if name in self.parameters), None)
 
     @property
@@ -79,7 +79,7 @@ class Signature:
         return WIDTHS[self.returns] if self.returns is not None else 0
 
     def numbers(self, *, taken: frozenset[str] = frozenset()) -> dict[str, Any]:
-        """Type of each parameter that is a number of the declaration, besides those ``taken``."""
+        """Type of each parameter that is a number of the declaration, except those in ``taken``."""
         return {
             name: kind
             for name, kind in self.parameters.items()
@@ -93,10 +93,10 @@ def is_warp(function: Any) -> bool:
 
 
 def signature(function: Any) -> Signature:
-    """What a Warp function takes and gives.
+    """Parameters and result of a Warp function.
 
     Raises:
-        ValueError: It has a parameter or a result without a type that a term may have.
+        ValueError: A parameter or the result has no type, or a type that a term can't have.
     """
     name = function.func.__qualname__
     try:
@@ -131,7 +131,7 @@ def signature(function: Any) -> Signature:
 
 
 STRUCTS: Mapping[Any, str] = {WorldArrays: "worlds", EpisodeArrays: "episodes", BodyArrays: "bodies"}
-"""Structs of which there is one for all terms, and its name in a kernel."""
+"""Structs that all terms share, and their names in a kernel."""
 
 
 def is_struct(kind: Any) -> bool:
@@ -140,7 +140,7 @@ def is_struct(kind: Any) -> bool:
 
 
 def is_robot(kind: Any) -> bool:
-    """Whether a parameter wants the arrays of a robot."""
+    """Whether a parameter takes the arrays of a robot."""
     return kind is RobotArrays
 
 
@@ -152,8 +152,8 @@ def shown_type(kind: Any) -> str:
 def reads_poses(function: Any) -> bool:
     """Whether a Warp function, or one that it calls, may read poses or velocities of ``BodyArrays``.
 
-    Centres of mass in their bodies stay what they are in a step: a function that reads nothing else of it needs no body brought up to
-    date. Where the text does not tell, as with another name for the same arrays, the answer is yes.
+    Centres of mass relative to their bodies do not change in a step: a function that reads nothing else needs no update of bodies.
+    If the source leaves it open, as with another name for the same arrays, the answer is yes.
     """
     hints = typing.get_type_hints(function.func)
     names = {name for name, kind in hints.items() if kind is BodyArrays}
@@ -161,7 +161,7 @@ def reads_poses(function: Any) -> bool:
 
 
 def _reads(function: Any, names: set[str]) -> bool:
-    """Whether a function does anything with ``names`` but read their centres of mass, or hand them to functions that do no more."""
+    """Whether a function does more with ``names`` than read their centres of mass, or pass them to functions that do no more."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError):

@@ -83,18 +83,18 @@ class G1Flat(Velocity):
         "tolerance": 1.0e-8,
         "ls_tolerance": 0.01,
         "ccd_iterations": 50,
-        # In 16 worlds x 100 steps of random, zero, held and far too large random actions there were at most 31 contacts and 115 rows.
+        # 16 worlds x 100 steps of random, zero, held and far too large random actions had at most 31 contacts and 115 rows.
         "nconmax": 64,
         "njmax": 230,
     }
 
     def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """Besides those of all robots: where the robot touches itself."""
+        """Also the robot's contacts with itself."""
         touching = ContactSensor(bodies="*", against="robot", fine=True, together=True)
         return {**super().sensors_of(config), "self_contacts": touching}
 
     def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """It does not touch itself."""
+        """Also a cost of contacts with itself."""
         collisions = rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0)
         return {**super().rewards_of(config), "self_collisions": collisions}
 

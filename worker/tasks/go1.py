@@ -92,7 +92,7 @@ class Go1Rough(Velocity):
     }
 
     def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """Besides those of all robots: what else touches the ground, or the robot itself."""
+        """Also contacts of other parts with the ground, and of the robot with itself."""
 
         def hits(against: str = "ground", **what: Any) -> ContactSensor:
             return ContactSensor(against=against, fine=True, together=True, **what)
@@ -106,7 +106,7 @@ class Go1Rough(Velocity):
         }
 
     def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """It stands upright on the ground as it slopes, and touches it with its feet alone."""
+        """Upright relative to the slope of the ground, with costs of contacts other than the feet's."""
         return {
             **super().rewards_of(config),
             "upright": rate(
@@ -118,7 +118,7 @@ class Go1Rough(Velocity):
         }
 
     def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
-        """It may tilt as it likes, but its thighs may not touch the ground."""
+        """Contact of a thigh with the ground, instead of a tilt limit."""
         ends = dict(super().terminations_of(config))
         del ends["fell_over"]
         return {**ends, "illegal_contact": Termination(terms.illegal_contact, contacts="thighs", force=10.0)}

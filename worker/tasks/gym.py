@@ -1,7 +1,7 @@
 """Tasks as Gymnasium vector environments: ``gymnasium.make_vec("worker.tasks.gym:Muster/Cartpole-v0", num_envs=64)``.
 
-Gymnasium 1.4 loads no plugins by itself: importing this module registers the built-in tasks, and the ``module:`` prefix
-of the id does that import. After it, ``"Muster/Cartpole-v0"`` alone is enough.
+Gymnasium 1.4 does not load plugins by itself: importing this module registers the built-in tasks, and the ``module:`` prefix
+of the id imports it. After that, ``"Muster/Cartpole-v0"`` is enough.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ Observations = np.ndarray | dict[str, np.ndarray]
 
 
 class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
-    """One task as a vector environment, with numpy at its edge.
+    """A task as a vector environment with numpy inputs and outputs.
 
     A world whose episode ends is reset in the same step: the step returns the first observation of the next episode, and
-    ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask); of images
+    ``info["final_obs"][world]`` holds the last one of the old (None in other worlds; ``info["_final_obs"]`` is the mask); for images,
     the one before the last step.
 
-    An observation is an array; of a task with images beside numbers a dictionary of arrays: ``policy``, and each group of images.
+    An observation is an array; for a task with both images and numbers, a dictionary of arrays: ``policy``, and each image group.
 
     Args:
-        task: Name or ``module:Class``, as :func:`worker.tasks.find_task` takes it.
+        task: Name or ``module:Class``, as for :func:`worker.tasks.find_task`.
         num_envs: Number of worlds.
-        seed: Seed until :meth:`reset` gives another.
+        seed: Seed until :meth:`reset` sets another.
         device: ``"cpu"`` or ``"cuda:<n>"``.
         **overrides: Fields of the task's configuration, by name.
 
     Raises:
-        ValueError: No such task, no such field of its configuration, or a value out of range.
+        ValueError: The task or a field of its configuration does not exist, or a value is out of range.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -76,12 +76,12 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Begin a new episode in every world.
 
         Args:
-            seed: Makes what follows a function of the seed and the actions alone; None goes on with the random streams.
+            seed: Restart the random streams from this seed; None: continue them.
             options: Not used by any task.
 
         Returns:
             Observations, shape ``(num_envs, observations)``, float32 (images ``(num_envs, channels, height, width)``, uint8),
-            in a dictionary where there are images beside numbers, and an empty info.
+            in a dictionary for a task with both images and numbers, and an empty info.
 
         Raises:
             ValueError: ``seed`` is negative, or ``options`` asks for a partial reset, which worlds do by themselves.
@@ -116,7 +116,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         truncations = self._numpy(self.task.time_outs)
         info: dict[str, Any] = {}
         if dones.any():
-            # no picture is taken of a world between its end and its reset: the one before stands for it
+            # no image is rendered between a world's end and its reset; the previous one takes its place
             terminal = self._images
             if "policy" not in terminal:
                 terminal = {"policy": self._numpy(self.task.terminal_observations), **terminal}
@@ -145,7 +145,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
 
 
 def _space(group: torch.Tensor) -> gymnasium.Space[Any]:
-    """Of one world's part of an observation group."""
+    """The space of one world's part of an observation group."""
     shape = tuple(group.shape[1:])
     if group.dtype == torch.uint8:
         return gymnasium.spaces.Box(0, 255, shape, np.uint8)

@@ -1,4 +1,4 @@
-"""Observation groups that are images: which camera each shows, and what is said of them in manifests and tables."""
+"""Image observation groups: their cameras, and their descriptions in manifests and tables."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 def cameras(
     declaration: Declaration, config: TaskConfig, sensors: Mapping[str, Any], views: Mapping[str, RobotView]
 ) -> dict[str, str]:
-    """The name of the camera that each observation group of images shows.
+    """The camera's name for each image group.
 
     Args:
         declaration: The task's terms.
-        config: Its configuration, which names the groups, too.
+        config: Its configuration, which also names the groups.
         sensors: The sensors as declared, by name.
         views: Its robots and objects by name.
 
     Raises:
-        ValueError: There is no such camera, what the camera is on is not there, or the configuration has other groups of images.
+        ValueError: The camera or its mounting does not exist, or the configuration names other image groups.
     """
     _check_groups(config, declaration)
     known = [name for name, sensor in sensors.items() if hasattr(sensor, "channels")]
@@ -47,7 +47,7 @@ def cameras(
 
 
 def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
-    """Refuse images that the configuration does not name as such: a job is checked against it when it is submitted."""
+    """Refuse image groups that the configuration does not declare: submission checks jobs against it."""
     told, kind = config.observation_groups, type(config).__name__
     there = [*declaration.groups, *declaration.images]
     for group in declaration.images:
@@ -69,7 +69,7 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
 
 
 def described(task: Task) -> dict[str, dict[str, Any]]:
-    """What the images of each observation group are, as plain values: the camera's settings, and the names of the channels."""
+    """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
     camera, plan = getattr(task.config, "camera", None), getattr(task, "plan", None)
     found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
     for group, name in plan.images.items() if plan else ():
@@ -79,7 +79,7 @@ def described(task: Task) -> dict[str, dict[str, Any]]:
 
 
 def shown(plan: Plan, group: str) -> str:
-    """One line that says what an image of a group is."""
+    """Description of a group's images, in one line."""
     sensor = plan.declaration.sensors[plan.images[group]]
     kind = sensor.kind
     if kind == "segmentation":

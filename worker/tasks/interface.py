@@ -1,4 +1,4 @@
-"""What the numbers of a task's policy mean on a robot: each observation and each action with its unit, scale and offset, as data."""
+"""The meaning of a policy's numbers on a robot, as data: each observation and action with its unit, scale and offset."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class Observation:
 
     name: str
     unit: str = "1"
-    """Unit of the quantity, before the scale; ``"1"`` of a ratio."""
+    """Unit of the quantity, before the scale; ``"1"`` for a ratio."""
     scale: float = 1.0
     """Factor [1/unit]."""
     offset: float = 0.0
     """Value of the quantity that the policy sees as 0 [unit]."""
     kind: Literal["measured", "command", "previous_action"] = "measured"
-    """Where it comes from: a sensor, the operator, or the policy itself (its last action, clipped)."""
+    """Its source: a sensor, the operator, or the policy itself (its last action, clipped)."""
     range: tuple[float, float] | None = None
-    """Least and greatest value in training, of a command [unit]."""
+    """Least and greatest value of a command in training [unit]."""
     clip: tuple[float, float] | None = None
     """Limits of ``quantity - offset`` before the scale [unit]; None: not limited."""
     back: int = 0
-    """How many control steps ago it was: history that the policy sees. Before an episode's first step, its first value."""
+    """Age in control steps, for observations with history. Before an episode's first step, the first value stands in."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Interface:
 
 
 def motor(model: Any, actuator: int, name: str, unit: str, default_position: float) -> Action:
-    """A motor of ``model`` (MuJoCo's) whose input is the action: a share of its full force or torque."""
+    """A motor of ``model`` (MuJoCo's); the action, its input, is a fraction of its full force or torque."""
     full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
     return Action(name, "effort", unit, scale=full, default_position=default_position, effort_limit=abs(full))
 
 
 def servo(model: Any, actuator: int, name: str, unit: str, default_position: float, scale: float) -> Action:
-    """A position controller of ``model`` (MuJoCo's) whose target an action moves from the default position."""
+    """A position controller of ``model`` (MuJoCo's); the action moves its target away from the default position."""
     limited = bool(model.actuator_forcelimited[actuator])
     return Action(
         name,
@@ -63,7 +63,7 @@ def servo(model: Any, actuator: int, name: str, unit: str, default_position: flo
 
 
 def deviations(noise: float | Mapping[str, float], observations: tuple[Observation, ...]) -> list[float]:
-    """Standard deviation of the noise on each observation, as the policy sees it. Only what is measured is noisy.
+    """Standard deviation of the noise on each observation, in the policy's units. Only measured observations are noisy.
 
     Args:
         noise: As :attr:`worker.tasks.config.Randomization.observation_noise`.

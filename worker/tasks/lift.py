@@ -1,4 +1,4 @@
-"""An arm that grips a cube and lifts it to a target, as mjlab 1.6 has it (``Mjlab-Lift-Cube-Yam``)."""
+"""An arm that grips a cube and lifts it to a target, as in mjlab 1.6 (``Mjlab-Lift-Cube-Yam``)."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class LiftCube(DeclaredTask):
         return yam()
 
     def objects(self, config: LiftCubeConfig) -> Mapping[str, Any]:
-        """The cube; where it begins is up to the command."""
+        """The cube; the command places it."""
         return {
             "cube": Box("cube", size=(EDGE, EDGE, EDGE), mass=0.05, position=(0.3, 0.0, EDGE), color=(0.8, 0.2, 0.2))
         }
 
     def declare(self, config: LiftCubeConfig) -> Declaration:
-        """The terms, by mjlab's names; each reward is one per second."""
+        """The terms, by mjlab's names; each reward is per second."""
 
         def rate(function: Any, **options: Any) -> Reward:
             return Reward(function, per_second=True, **options)

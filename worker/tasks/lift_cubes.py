@@ -1,4 +1,4 @@
-"""An arm that finds one of several cubes and lifts it to a target, as mjlab 1.6 has it (``Mjlab-Multi-Cube-Seg-Yam``), without the camera."""
+"""An arm that lifts one of several cubes to a target, as in mjlab 1.6 (``Mjlab-Multi-Cube-Seg-Yam``), without the camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from worker.tasks.declaration import Command, Declaration, Metric, Observation, 
 from worker.tasks.lift import LiftCube
 
 APART = 0.06
-"""Cubes are put down with their middles at least so far from one another, more than the diagonal of a face [m]."""
+"""Least distance between the centres of cubes at the start, more than the diagonal of a face [m]."""
 ROOM = {"nconmax": 24, "njmax": 72}
 """Contacts of one more cube with the ground and with others, and their rows of constraints."""
 
@@ -27,16 +27,16 @@ METRICS = (
     ("at_goal", terms.chosen_object_at_target),
     ("episode_success", terms.chosen_object_was_at_target),
 )
-"""What takes the place of LiftCube's terms of these names, with their numbers."""
+"""Replacements of LiftCube's terms of these names, with the same numbers."""
 
 
 class LiftCubes(LiftCube):
-    """The YAM arm and cubes, three by default, of which one is to be lifted: 41 observations, 7 actions, else as LiftCube."""
+    """The YAM arm and cubes, three by default; the task is to lift one: 41 observations, 7 actions, otherwise as LiftCube."""
 
     config_type = LiftCubesConfig
 
     def objects(self, config: LiftCubesConfig) -> Mapping[str, Any]:
-        """The cubes, each of its own colour; where they begin is up to the command."""
+        """The cubes, each of its own colour; the command places them."""
         cube = super().objects(config)["cube"]
         colors = [colorsys.hsv_to_rgb(index / config.cubes, 0.8, 0.9) for index in range(config.cubes)]
         return {f"cube_{index}": dataclasses.replace(cube, color=color) for index, color in enumerate(colors)}
@@ -49,7 +49,7 @@ class LiftCubes(LiftCube):
         self.solver_options = options | {name: options[name] + each for name, each in more.items()}  # type: ignore[misc]
 
     def declare(self, config: LiftCubesConfig) -> Declaration:
-        """LiftCube's terms and numbers, of the cube that is chosen; beside them which one it is, and where all are."""
+        """LiftCube's terms and numbers for the chosen cube; also the choice, and the positions of all cubes."""
         single = super().declare(config)
         rewards, metrics, lift = single.rewards, single.metrics, single.commands["lift_height"]
         seen = dict(single.observations)

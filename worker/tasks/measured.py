@@ -1,4 +1,4 @@
-"""Where on a robot a term is measured: the frame that the policy contract tells."""
+"""The frame on the robot in which a term is measured, for the policy contract."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _HERE, _NOT_TURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def is_library(term: Term) -> bool:
-    """Whether the function of a term is one of Muster's library, and not one of the task's that has the same name."""
+    """Whether a term's function is from Muster's library, rather than the task's own with the same name."""
     return getattr(terms, term.function_name, None) is term.function
 
 
 def frame_of(plan: Plan, term: Term, sensors: Sequence[str]) -> Frame | None:
-    """The frame of an observation term: of its root or of its inertial measurement unit; None of any other.
+    """The frame of an observation term: of its root or of its inertial measurement unit; None for all others.
 
     Args:
         plan: The task's.
@@ -45,7 +45,7 @@ def frame_of(plan: Plan, term: Term, sensors: Sequence[str]) -> Frame | None:
 
 
 def _of_unit(view: RobotView, unit: Imu) -> Frame:
-    """That of the site or body on which an inertial measurement unit is."""
+    """The frame of the site or body of an inertial measurement unit."""
     if unit.site is None:
         (body,) = view.find_bodies(unit.body or "*")
         name = view.body_names[body]

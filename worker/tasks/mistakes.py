@@ -1,4 +1,4 @@
-"""Mistakes in the code of a user's task, told in one line that names his file: they are the same at every attempt."""
+"""Mistakes in the code of a user's task, reported in one line with the file; a retry would not help."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from worker.errors import UserError, is_out_of_memory
 _OURS = str(Path(__file__).parents[1])
 _INSTALLED = tuple({sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib", "platstdlib")})
 _PARSED = re.compile(r'Error while parsing function "[^"]*" at (?P<file>[^\n]+):(?P<line>\d+):\n')
-"""How Warp says where a function can't be compiled: once for each function on the way to it."""
+"""Warp's message about a function that can't be compiled, once for each function in the call chain."""
 _MISSING_FILES = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 
 
 class TaskMistake(ValueError):
-    """An error that the user's own code made.
+    """An error in the user's own code.
 
     Args:
         words: One line: task, file and line, error.
-        trace: The traceback, where the error arose deep in a library; else empty.
+        trace: The traceback, if the error arose deep in a library; else empty.
     """
 
     def __init__(self, words: str, trace: str = "") -> None:
@@ -37,7 +37,7 @@ class TaskMistake(ValueError):
 
 @contextmanager
 def task_mistakes(task: str) -> Iterator[None]:
-    """Tell an exception that passed through the user's own code as a :class:`TaskMistake`; let all others pass.
+    """Turn an exception that passed through the user's own code into a :class:`TaskMistake`; let all others pass.
 
     Args:
         task: Name of the task, or ``module:Class``.
@@ -93,7 +93,7 @@ def _is_users(file: str, package: str) -> bool:
 
 
 def _parsed(text: str, package: str) -> tuple[str, str] | None:
-    """Where Warp could not compile a function of the user's, and what it says of it."""
+    """The place of a user's function that Warp could not compile, and Warp's message."""
     users = [found for found in _PARSED.finditer(text) if _is_users(found["file"], package)]
     if not users:
         return None
@@ -103,7 +103,7 @@ def _parsed(text: str, package: str) -> tuple[str, str] | None:
 
 
 def _hint(error: Exception, frame: FrameType) -> str:
-    """The nearest of the names that there are."""
+    """The nearest existing name."""
     name, known = getattr(error, "name", None), []
     if isinstance(error, AttributeError) and getattr(error, "obj", None) is not None:
         known = dir(error.obj)
@@ -120,6 +120,6 @@ def _names(code: CodeType) -> tuple[str, ...]:
 
 
 def _shown(file: str) -> str:
-    """A file as it is written in the folder of the job."""
+    """A file's path relative to the job's directory."""
     path = Path(file)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else file

@@ -1,4 +1,4 @@
-"""The numbers of a declaration: data with places, in one array that every kernel of the task reads."""
+"""The numbers of a declaration, each with a place, in one array that every kernel of the task reads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXPRESSIONS: Mapping[Any, str] = {
 
 
 Check = Callable[[list[float]], str | None]
-"""What is wrong with the numbers of a place, in a few words; None where nothing is."""
+"""The error in the numbers of a place, in a few words; None: they are valid."""
 
 
 def in_order(ends: list[float]) -> str | None:
@@ -48,7 +48,7 @@ def is_amount(values: list[float]) -> str | None:
 
 
 def stays(declared: float) -> Check:
-    """The number that the declaration gave, and no other."""
+    """Accept only the declared number."""
     return lambda values: (
         None if values == [float(declared)] else f"the declaration alone can change it from {declared}"
     )
@@ -74,7 +74,7 @@ class Numbers:
             place: Of the numbers.
             value: As declared.
             count: How many there must be.
-            check: What else they must be, now and whenever a job changes them.
+            check: A further check, now and whenever a job changes them.
 
         Raises:
             ValueError: The value is not that many numbers, or ``check`` refuses them.
@@ -97,13 +97,13 @@ class Numbers:
         """Change the numbers of a place, as ``config.numbers`` says under ``where``.
 
         Raises:
-            ValueError: There is no such place, or the value is not as many numbers, or not such as the place can have.
+            ValueError: The place does not exist, or the value has another count of numbers or is not valid there.
         """
         first, count = self.find(place, where)
         self.values[first : first + count] = self._checked(f"{where}.{place}", place, value, count)
 
     def check_filled(self, place: str, value: float, where: str) -> None:
-        """Refuse a value that all numbers of a place are to have in the course of training. Raises ValueError."""
+        """Check a value that a curriculum will give all numbers of a place. Raises ValueError."""
         _, count = self.find(place, where)
         self._checked(f"{where}.{place}", place, [value] * count, count)
 
@@ -111,7 +111,7 @@ class Numbers:
         """First index and count of a place.
 
         Raises:
-            ValueError: There is no such place.
+            ValueError: The place does not exist.
         """
         if place not in self.places:
             raise ValueError(

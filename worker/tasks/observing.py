@@ -7,10 +7,10 @@ from worker.tasks.source import Source, calls, parameters_of
 
 
 def group_function(source: Source, group: str, terms: list[Seen]) -> str:
-    """The text of ``observe_GROUP``.
+    """The source of ``observe_GROUP``.
 
-    Its parameters: ``fresh``, whether the world was just placed; ``commit``, whether the observation is that of the next step and not
-    the last one of an episode; ``out``, where it is written; ``now``, the group's row of the step before, with its history.
+    Its parameters: ``fresh``, whether the world was just reset; ``commit``, whether the observation is that of the next step rather
+    than the last one of an episode; ``out``, the output; ``now``, the group's row of the step before, with its history.
     """
     own = (
         "world: int, fresh: bool, commit: bool, out: wp.array2d(dtype=wp.float32), now: wp.array2d(dtype=wp.float32), "
@@ -57,7 +57,7 @@ def _draw_delay(seen: Seen) -> list[str]:
 
 
 def _column(seen: Seen, column: str) -> list[str]:
-    """From ``x``, the value of one column, to the observation."""
+    """Turn ``x``, the value of one column, into the observation."""
     lines = []
     if seen.offset:
         lines += [f"x = x - {seen.offset.at(column)}"]
@@ -76,7 +76,7 @@ def _column(seen: Seen, column: str) -> list[str]:
 
 
 def _delay(seen: Seen, column: str) -> list[str]:
-    """Take the value of ``lag`` steps before, and keep this one; until there are such, the first one of the episode."""
+    """Take the value of ``lag`` steps ago, and keep this one; early in an episode, take its first value."""
     size, greatest = len(seen.names), seen.term.delay[1]
     first = f"{seen.past + 1} + {column}"
     return [

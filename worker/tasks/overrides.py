@@ -1,4 +1,4 @@
-"""What a job's YAML sets of a task's configuration (``train.config``), and what is wrong with it. Imported without torch."""
+"""Apply the settings of a job's YAML (``train.config``) to a task's configuration, or refuse them. Imported without torch."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ C = TypeVar("C")
 
 @functools.cache
 def training_sections() -> frozenset[str]:
-    """Fields that say how a task is trained, by the names of the installed algorithms: a job's YAML changes them in sections of their own."""
+    """Fields with training settings, named after the installed algorithms; a job's YAML sets them in sections of their own."""
     return frozenset(point.name for point in entry_points(group="muster.settings"))
 
 
 def configured(kind: type[C], overrides: Mapping[str, Any]) -> C:
-    """A configuration with the overrides that a job's YAML gives, as plain values.
+    """A configuration with the overrides of a job's YAML, which are plain values.
 
-    A mapping for a field that is a configuration itself, such as ``randomize``, changes the keys that it names.
+    Where a field is itself a configuration, such as ``randomize``, a mapping changes the keys that it names.
 
     Args:
         kind: Its class, a dataclass with a default for each field.
@@ -52,7 +52,7 @@ def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mappin
             raise Refused((*where, key), f"{kind.__name__} has no such key; {nearest(key, sorted(known))}")
         values[key] = _as(getattr(default, key), value, (*where, key))
     try:
-        # as pydantic's own __init__ does it, which a plain dataclass that extends a pydantic one does not have
+        # as pydantic's own __init__ does; a plain dataclass that extends a pydantic one lacks it
         made = TypeAdapter(kind).validator.validate_python(ArgsKwargs((), values), self_instance=kind.__new__(kind))
     except ValidationError as error:
         raise _refused(error, where, overrides) from error
@@ -63,7 +63,7 @@ def _made(kind: type[C], default: Any, values: dict[str, Any], overrides: Mappin
 
 
 def _as(default: Any, value: Any, where: Path) -> Any:
-    """``value`` of a YAML document in the form of the default: a list may stand for a tuple, a mapping for a configuration."""
+    """``value`` of a YAML document in the type of the default: a list may stand for a tuple, a mapping for a configuration."""
     if isinstance(default, tuple) and isinstance(value, list):
         return tuple(_as(default[0] if default else None, item, where) for item in value)
     if dataclasses.is_dataclass(default) and not isinstance(default, type) and isinstance(value, Mapping):
@@ -76,7 +76,7 @@ def _refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) 
     problems = error.errors(include_url=False)
     first: Any = problems[0]
     found = first.get("input")
-    # of a rule over several fields the words say it all; a tuple was a list in the YAML
+    # the message of a rule over several fields is complete; a tuple was a list in the YAML
     first["input"] = {} if isinstance(found, ArgsKwargs) else list(found) if isinstance(found, tuple) else found
     path = _keys(first["loc"], overrides)
     cause = first.get("ctx", {}).get("error")
@@ -86,7 +86,7 @@ def _refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) 
 
 
 def _keys(path: Path, value: Any) -> Path:
-    """The part of ``path`` that is in the YAML: pydantic goes on with names of types."""
+    """The part of ``path`` that is in the YAML; pydantic appends names of types."""
     for place, key in enumerate(path):
         inside = key in value if isinstance(value, Mapping) else isinstance(value, list) and key in range(len(value))
         if not inside:
@@ -96,7 +96,7 @@ def _keys(path: Path, value: Any) -> Path:
 
 
 def expecting(words: str) -> WrapValidator:
-    """Annotation of a field: whatever is wrong with a part of its value, say what the whole has to be."""
+    """Annotation of a field: for an error in any part of its value, describe the whole expected value."""
 
     def check(value: Any, inner: Callable[[Any], Any]) -> Any:
         try:
@@ -108,5 +108,5 @@ def expecting(words: str) -> WrapValidator:
 
 
 def from_mapping(kind: type[Any]) -> BeforeValidator:
-    """Annotation of a field that is a configuration of this kind: a mapping of its fields will do."""
+    """Annotation of a field that is a configuration of this kind: accept a mapping of its fields."""
     return BeforeValidator(lambda value: kind(**value) if isinstance(value, Mapping) else value)

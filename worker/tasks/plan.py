@@ -1,4 +1,4 @@
-"""A declaration bound to its robots: which number is where, and what every column is called."""
+"""A declaration bound to its robots: the place of every number and the name of every column."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from worker.tasks.numbers import are_times, flat, in_order, is_amount
 
 JUDGED = {"terminated": "terminated"}
 DRAWN = {"stream": "stream"}
-"""Parameters that are variables of the kernel where terms of some sections are called."""
+"""Parameters that are variables of the kernel, for terms of some sections."""
 AXES = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("x", "y", "z", "w")}
 
 
 @dataclass
 class Column:
-    """Where the numbers are that a kernel applies to each column of a term: one for all, or one a column."""
+    """Location of the numbers that a kernel applies to the columns of a term: one for all, or one per column."""
 
     first: int
     each: bool
@@ -46,9 +46,9 @@ class Seen:
         bound: The term.
         names: Of the columns of one step.
         first: Its first column in the group.
-        scale, offset, noise, clip: Numbers, None where there is nothing to do.
+        scale, offset, noise, clip: Numbers; None: not applied.
         normal: Whether noise is normal; else uniform.
-        past: First column of what it keeps for its delay, -1 without one.
+        past: First column of the memory for its delay, -1 without one.
         blur: Standard deviations of the noise that ``config.randomize.observation_noise`` adds to what the policy sees.
     """
 
@@ -89,8 +89,8 @@ class Driven:
 
 @dataclass
 class Told:
-    """A command: its own term and the update of each step, its first column in memory, that of the control steps for which
-    it still holds, and the bounds of its duration.
+    """A command: its own term and the update of each step, its first column in memory, the column that counts its remaining
+    control steps, and the bounds of its duration.
     """
 
     bound: Bound
@@ -102,7 +102,7 @@ class Told:
 
 @dataclass
 class Happening:
-    """An event; of one at intervals the column in memory of its countdown, and the numbers of its bounds [s]."""
+    """An event; for one at intervals, the column in memory of its countdown and the numbers of its bounds [s]."""
 
     bound: Bound
     countdown: int = -1
@@ -110,7 +110,7 @@ class Happening:
 
 
 class Plan:
-    """What a task's kernels are made of.
+    """The contents of a task's kernels.
 
     Args:
         declaration: The task's terms.
@@ -168,7 +168,7 @@ class Plan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each column of the policy's group; those of the past end on ``_1`` (the step before), ``_2``, …"""
+        """Name of each column of the policy's group; earlier steps end in ``_1`` (the step before), ``_2``, …"""
         return tuple(name for seen in self.groups["policy"] for name in stacked(seen))
 
     @property
@@ -195,7 +195,7 @@ class Plan:
         return bound
 
     def _success(self, name: str | None) -> str | None:
-        """Whether the last step was a success, in the words of the kernel that judges it. Raises ValueError for an unknown name."""
+        """Whether the last step was a success, as an expression of the kernel. Raises ValueError for an unknown name."""
         metrics, ends = list(self.declaration.metrics), list(self.declaration.terminations)
         if name is None:
             return None
@@ -206,7 +206,7 @@ class Plan:
         raise ValueError(f"success: no metric and no termination is called {name}; {nearest(name, [*metrics, *ends])}")
 
     def _check_course(self, place: str, values: list[float], where: str) -> None:
-        """Refuse a place that is none, or a value that all its numbers can't have in the course of training."""
+        """Refuse an unknown place, or a value that is invalid for any of its numbers."""
         for value in values:
             if place.startswith("randomize."):
                 check_randomized(self.declaration.randomize, place, value, where, fill=True)
@@ -214,7 +214,7 @@ class Plan:
                 self.numbers.check_filled(place, value, where)
 
     def _reserve_commands(self) -> None:
-        """Columns of all commands first, so that any term may name any of them."""
+        """Reserve the columns of all commands first, so that any term may name any of them."""
         for name, term in self.declaration.commands.items():
             check_command(f"commands.{name}", term)
             self.binder.reserve_command(name, term)
@@ -242,7 +242,7 @@ class Plan:
         check_driven([driven.bound for driven in self.driven], self.views, self.binder.sensors)
 
     def _default(self, place: str, bound: Bound) -> list[float]:
-        """The default positions of the joints for which a term is called."""
+        """The default positions of a term's joints."""
         if not bound.takes("joint"):
             raise ValueError(
                 f'{place}: offset="default" is for terms of joints; {bound.term.function_name} has no parameter joint'
@@ -345,7 +345,7 @@ class Plan:
                 seen.blur = Column(self.numbers.add(place, mine, len(mine)), True)
 
     def _exact(self) -> list[Seen] | None:
-        """The critic's terms where none are declared: the policy's without noise and delay; None where that is what the policy sees."""
+        """The critic's terms if none are declared: the policy's without noise and delay; None: these equal the policy's."""
         policy = self.groups["policy"]
         if "critic" in self.groups or not any(seen.noise or seen.blur or seen.past >= 0 for seen in policy):
             return None
@@ -353,7 +353,7 @@ class Plan:
 
 
 def check_result(bound: Bound, section: str) -> None:
-    """Refuse a function whose result is not what its section needs."""
+    """Refuse a function whose result its section can't use."""
     if bound.signature is None:
         if section in ("events", "commands", "actions", "curricula"):
             raise ValueError(
@@ -373,7 +373,7 @@ def check_result(bound: Bound, section: str) -> None:
 
 
 def column_names(place: str, name: str, term: Observation, bound: Bound) -> list[str]:
-    """The names of a term's columns: those given, or the term's with its elements' and axes'."""
+    """The names of a term's columns: as given, or made of the names of the term, its elements and its axes."""
     if term.names is not None:
         if len(term.names) != bound.columns:
             raise ValueError(f"{place}: {len(term.names)} names for {bound.columns} columns")
@@ -395,7 +395,7 @@ def stacked(seen: Seen) -> list[str]:
 
 
 def by_pattern(place: str, values: Mapping[str, float], names: list[str]) -> list[float]:
-    """One value for each name; of several patterns that fit, the first one counts.
+    """One value for each name; the first pattern that fits counts.
 
     Raises:
         ValueError: A pattern fits no name, or a name has no pattern.

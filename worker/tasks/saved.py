@@ -1,4 +1,4 @@
-"""Whether a saved state of worlds is one of this task's."""
+"""Check that a saved state of worlds fits a task."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import torch
 
 NEWER = ("broken", "last_actions", "earlier_actions", "activations")
-"""What states of older versions do not have, and which may begin at 0."""
+"""Tensors that states of older versions lack; they may begin at 0."""
 
 
 def completed(
     tensors: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor], metrics: int
 ) -> dict[str, torch.Tensor]:
-    """A state with zeros for what an older version did not save: :data:`NEWER`, and the sums of all ``metrics``, which are the last ones.
+    """A state with zeros for tensors that an older version did not save: :data:`NEWER`, and the sums of all ``metrics``, the last ones.
 
     Args:
         tensors: Of the task.
@@ -28,7 +28,7 @@ def completed(
 
 
 def check_state(what: str, tensors: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor]) -> None:
-    """Compare a saved state with the tensors that it is for.
+    """Check a saved state against the tensors that it will fill.
 
     Args:
         what: The state, for the error.
@@ -36,7 +36,7 @@ def check_state(what: str, tensors: Mapping[str, torch.Tensor], state: Mapping[s
         state: As saved.
 
     Raises:
-        ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn otherwise.
+        ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn differently.
     """
     if missing := sorted(tensors.keys() - state.keys()):
         raise ValueError(f"{what} lacks {', '.join(missing)}")

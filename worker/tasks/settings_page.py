@@ -24,15 +24,15 @@ MJLAB: Mapping[str, Mapping[str, int | None]] = {
     "LiftCube": {"iterations": 10, "ls_iterations": 20, "nconmax": 55, "njmax": 600},
     "LiftCubes": {"iterations": 10, "ls_iterations": 20, "nconmax": 415, "njmax": 600},
 }
-"""What mjlab 1.6 gives the solver of its task; None: MuJoCo Warp chooses."""
+"""Solver options of mjlab 1.6's task; None: MuJoCo Warp chooses."""
 
 HEAD = """\
 # Settings of the robots' tasks
 
-Every number of `Go1Flat`, `Go1Rough`, `G1Flat`, `G1Rough`, `LiftCube` and `LiftCubes` as they are by default. Where a cell is empty, the
-task does not have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-g1rough) says what the terms mean, what differs from mjlab, and
-what a job's YAML changes. This page is written by `python -m worker.tasks.settings_page` from the declarations; `muster tasks NAME` prints
-the same of any task.
+Every default number of `Go1Flat`, `Go1Rough`, `G1Flat`, `G1Rough`, `LiftCube` and `LiftCubes`. An empty cell means that the task does not
+have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-g1rough) explains the terms, the differences from mjlab, and the settings
+that a job's YAML can change. `python -m worker.tasks.settings_page` writes this page from the declarations; `muster tasks NAME` prints
+the same for any task.
 """
 
 
@@ -81,7 +81,7 @@ def _there(row: Row) -> str:
 
 
 def _glance(found: Mapping[str, Sketch]) -> str:
-    """What of each task is one number or word."""
+    """The settings of each task that are one number or word."""
     rows = {name: _values(name, sketched) for name, sketched in found.items()}
     labels = next(iter(rows.values()))
     return _table(["", *rows], [[label, *(values[label] for values in rows.values())] for label in labels])
@@ -116,7 +116,7 @@ def _values(name: str, sketched: Sketch) -> dict[str, str]:
 def _section(
     section: str, note: str, found: Mapping[str, Sketch], keys: Sequence[str], value: Callable[[Row], str]
 ) -> str:
-    """One row for each term that is the same in some of the tasks; columns in which nothing stands are left out."""
+    """One row for each term, shared by the tasks in which it is the same; empty columns are left out."""
     cells: dict[tuple[str, ...], dict[str, str]] = {}
     for name, sketched in found.items():
         for row in sketched.rows.get(section, ()):
@@ -127,14 +127,14 @@ def _section(
     firsts = [row[0] for row in cells]
     rows = [
         [*(_cell(keys[index], row[index]) for index in kept), *(cells[row].get(name, "") for name in found)]
-        for row in sorted(cells, key=lambda row: firsts.index(row[0]))  # those of one name beside one another
+        for row in sorted(cells, key=lambda row: firsts.index(row[0]))  # group equal names
     ]
     title = section.capitalize() + (f": {note}" if note else "")
     return f"### {title}\n\n" + _table([*(keys[index] for index in kept), *found], rows)
 
 
 def _commands(found: Mapping[str, Sketch]) -> str:
-    """The numbers that commands are drawn from, at the start of training, and the stages by iteration of those that have any."""
+    """The ranges of commands at the start of training, and their stages by iteration, if any."""
     cells: dict[str, dict[str, str]] = {}
     for name, sketched in found.items():
         for place, values in sketched.places.items():
@@ -149,12 +149,12 @@ def _commands(found: Mapping[str, Sketch]) -> str:
 
 
 def _points(points: Sequence[Sequence[float]]) -> str:
-    """Lists of an iteration and what holds from there."""
+    """Pairs of an iteration and the value from there on."""
     return " ".join(f"[{', '.join(f'{number:g}' for number in point)}]" for point in points)
 
 
 def _cell(key: str, text: str) -> str:
-    """Names and settings stand as code."""
+    """Format names and settings as code."""
     if not text:
         return ""
     return f"`{text}`" if key in ("name", "term", "of") else text
@@ -166,5 +166,5 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 if __name__ == "__main__":
-    wp.config.log_level = wp.LOG_WARNING  # what it says on standard output is no part of the page
+    wp.config.log_level = wp.LOG_WARNING  # keep its messages on standard output out of the page
     sys.stdout.write(page())

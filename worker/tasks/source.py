@@ -1,4 +1,4 @@
-"""How terms are called in the text of a kernel."""
+"""Source text of kernels: the calls of terms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OURS = (
 
 
 class Source:
-    """Names of functions and structs in the text of a task's kernels.
+    """Names of functions and structs in the source of a task's kernels.
 
     Args:
         plan: The task's.
@@ -43,7 +43,7 @@ class Source:
         self._functions: dict[str, Any] = {}
 
     def function(self, bound: Bound) -> str:
-        """The name by which a term's function is called."""
+        """The name of a term's function in the source."""
         function = bound.term.function
         stem = f"term_{function.func.__name__}"
         number = 0
@@ -58,7 +58,7 @@ class Source:
         )
 
     def scope(self) -> dict[str, Any]:
-        """All names in the text."""
+        """All names in the source."""
         ours = {name: getattr(episode_functions, name) for name in _OURS}
         types = {_type_name(variable): kind for variable, kind in self.plan.binder.structs.items()}
         return {
@@ -83,7 +83,7 @@ def parameters_of(source: Source) -> str:
 
 
 def calls(source: Source, bound: Bound, use: Callable[[str], list[str]]) -> list[str]:
-    """Lines that call a term's function once, or for each of its elements in a loop over ``k``.
+    """Lines that call a term's function once, or in a loop over its elements, counted by ``k``.
 
     Args:
         source: Names.
@@ -106,7 +106,7 @@ def call_of(source: Source, bound: Bound) -> str:
 
 
 def loop(source: Source, bound: Bound, lines: list[str]) -> list[str]:
-    """A loop over the elements of a term: ``k`` counts them, and the parameter of the element's name is what the function is given."""
+    """A loop over the elements of a term: ``k`` counts them, and the variable named after the element is passed to the function."""
     assert bound.signature is not None and bound.elements is not None
     element = f"{bound.signature.element} = {_element(source, bound.elements)}"
     if len(bound.elements) == 1:

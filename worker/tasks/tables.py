@@ -18,7 +18,7 @@ Row = dict[str, str]
 
 
 def tables(plan: Plan) -> dict[str, list[Row]]:
-    """Every section of a plan that has terms, as rows of text by column; all rows of a section have the same columns."""
+    """Every non-empty section of a plan, as rows of text by column; all rows of a section have the same columns."""
     found: dict[str, list[Row]] = {"actions": _actions(plan)}
     for group, seen in plan.groups.items():
         if group in plan.declaration.groups:
@@ -141,7 +141,7 @@ def _reward(plan: Plan, bound: Bound) -> Row:
 
 
 def _term(plan: Plan, bound: Bound) -> Row:
-    """Name, function, what it is called for, and its numbers."""
+    """Name, function, elements and numbers of a term."""
     of = ""
     if bound.elements is not None and not bound.takes("action") and bound.element_names:
         of = (

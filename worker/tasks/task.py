@@ -1,4 +1,4 @@
-"""A task: many worlds of one robot, its actions, observations, reward terms and resets."""
+"""A task: many worlds of one robot, with its actions, observations, reward terms and resets."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from worker.tasks.telling import Telling
 class Task(Telling):
     """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
 
-    A subclass names its configuration, terms and kernels and builds one world; everything else is here. Every tensor
-    below is a fixed buffer (the same address for ever), shared with Warp, on ``device``.
+    A subclass names its configuration, terms and kernels and builds one world; this class does the rest. Every tensor
+    below is a fixed buffer on ``device``, shared with Warp; its address never changes.
 
     Args:
         config: The task's configuration, of type ``config_type``.
@@ -54,38 +54,38 @@ class Task(Telling):
     Attributes:
         world_count: Number of worlds.
         max_episode_length: Control steps after which the clock ends an episode.
-        actions: What to do next, shape ``(worlds, action_size)``, or ``(worlds, 1)`` where they are choices; float32.
-        observations: What the policy sees, shape ``(worlds, *observation_shape)``: float32, or uint8 where there is a camera.
-        states: What ``observe`` writes, named by ``observation_names``, shape ``(worlds, states)``, float32: without a camera the
-            observations.
+        actions: The next actions, shape ``(worlds, action_size)``, or ``(worlds, 1)`` of discrete choices; float32.
+        observations: The policy's input, shape ``(worlds, *observation_shape)``: float32, or uint8 with a camera.
+        states: The output of ``observe``, named by ``observation_names``, shape ``(worlds, states)``, float32; without a camera,
+            the observations.
         terminal_observations: The states before the reset, valid where ``dones``; same shape as ``states``, float32.
-        groups: The observation groups by name: ``policy`` is :attr:`observations`, ``critic`` what the simulation knows: the states
-            without noise.
-        terminal_groups: The groups before the reset, valid where ``dones``; of images there is none.
+        groups: The observation groups by name: ``policy`` is :attr:`observations`, ``critic`` the states without noise.
+        terminal_groups: The groups before the reset, valid where ``dones``; images are not among them.
         rewards: Shape ``(worlds,)``, float32.
         dones: Whether the episode ended, shape ``(worlds,)``, bool.
         time_outs: Whether it ended by the clock alone, shape ``(worlds,)``, bool.
         episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
-        mishap: Which world was reset, and why, since :meth:`clear_statistics`: see :meth:`read_mishap`; shape ``(1,)``, int32.
-        ended: The last episode of each world that ended, see :class:`worker.tasks.ended.Ended`.
+        mishap: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_mishap`; shape
+            ``(1,)``, int32.
+        ended: The last finished episode of each world, see :class:`worker.tasks.ended.Ended`.
         randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
-        captured: Whether :meth:`step` replays a graph; true after construction, which tries it out.
+        captured: Whether :meth:`step` replays a graph; true after construction, which captures one on trial.
     """
 
     config_type: ClassVar[type[TaskConfig]]
     """Type of the configuration."""
     parameters_type: ClassVar[Any]
-    """Warp struct whose fields are filled from the configuration's fields of the same names, for the kernels.
+    """Warp struct for the kernels; its fields are filled from the configuration's fields of the same names.
 
     A pair of numbers becomes a ``wp.vec2``."""
     reward_terms: tuple[str, ...]
-    """Names of the reward terms, in the order of the kernel's indices: that of the configuration's ``rewards``; of the class, the default ones."""
+    """Names of the reward terms, in the order of the configuration's ``rewards`` and of the kernel's indices; on the class, the default ones."""
     observation_names: tuple[str, ...]
     """Name of each observation, in order."""
     action_names: tuple[str, ...]
-    """Name of each action, in order (the joint that it drives); of a task with choices, of each choice."""
+    """Name of each action, in order (the joint that it drives); of a task with discrete actions, of each choice."""
     discrete: bool = False
     """Whether an action is one of several choices: its number, from 0, is then ``episodes.actions[world, 0]``."""
     act: ClassVar[wp.Kernel]
@@ -95,13 +95,13 @@ class Task(Telling):
     ground: ClassVar[bool] = False
     """Whether the worlds stand on a ground plane."""
     metric_names: tuple[str, ...] = ()
-    """Names of what is logged besides the rewards, as a mean over the steps; of declared tasks."""
+    """Names of the metrics, which are logged besides the rewards as means over the steps; of declared tasks."""
     termination_names: tuple[str, ...] = ()
-    """Names of what ends episodes, which are counted; of declared tasks."""
+    """Names of the terminations, which are counted; of declared tasks."""
     success: str | None = None
-    """The metric or termination that makes an evaluated episode a success; None: that only the clock ended it."""
+    """The metric or termination that makes an evaluated episode a success; None: an episode that only the clock ended is one."""
     memory_size: int = 0
-    """Numbers that the kernels keep of each world in ``episodes.memory``, such as commands; they are part of the state."""
+    """Numbers per world in ``episodes.memory``, such as commands; they are part of the state."""
     lasting_size: int = 0
     """Numbers that survive episodes, in ``episodes.lasting``."""
     solver_options: ClassVar[Mapping[str, Any]] = {}
@@ -148,7 +148,7 @@ class Task(Telling):
         except ValueError as error:
             raise ValueError(f"task {type(self).__name__}: {error}") from error
         wp.synchronize_device(self.device)  # the worlds are built on Warp's own stream
-        # torch fills some of the buffers: Warp's own stream might clear them after that
+        # torch fills some of the buffers; Warp's own stream could otherwise clear them afterwards
         with on_torch_stream(self.device):
             self._allocate()
             self._prepare()
@@ -165,7 +165,7 @@ class Task(Telling):
                 self.observation_shape = tuple(self.observations.shape[1:])
             self.groups, self.terminal_groups = self._group()
             self._begin()
-            for _, part in self._parts():  # Loads every kernel, which a capture cannot do on every platform.
+            for _, part in self._parts():  # Load every kernel; not every platform can load one during a capture.
                 part()
         self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
         self.captured = assert_replays(self, self._steps)
@@ -173,7 +173,7 @@ class Task(Telling):
 
     @classmethod
     def sketch(cls, config: TaskConfig) -> Self:
-        """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError where nothing fits."""
+        """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError for a wrong one."""
         task = cls.__new__(cls)
         task.config = config
         task.reward_terms = tuple(config.rewards)
@@ -187,31 +187,31 @@ class Task(Telling):
         return template
 
     def build(self, builder: newton.ModelBuilder) -> None:
-        """Add one world to an empty builder (MuJoCo's custom attributes are registered already)."""
+        """Add one world to an empty builder; MuJoCo's custom attributes are already registered."""
         raise NotImplementedError
 
     def stands_on(self) -> bool | Terrain:
-        """Whether the worlds stand on a plane, or the terrain that they stand on."""
+        """The terrain, or whether the worlds stand on a plane."""
         return self.ground
 
     def read_model(self, parameters: Any) -> None:
-        """Fill the kernel parameters that depend on the built model (``self.worlds``); by default none."""
+        """Fill the kernel parameters that depend on the built model (``self.worlds``); there are none by default."""
 
     def interface(self) -> Interface | None:
-        """What the policy's numbers mean on a robot, in the order of ``observation_names`` and ``action_names``; None: not declared.
+        """The meaning of the policy's numbers on a robot, in the order of ``observation_names`` and ``action_names``; None: not declared.
 
-        It is exported with the policy. It also says which observations are measured, so that noise leaves the others alone.
+        It is exported with the policy. It also says which observations are measured; only these get noise.
         """
         return None
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Called before every training iteration, outside the CUDA graph: the place for a curriculum.
 
-        As it stands it sets what ``config.curriculum`` names. A subclass may do more: fill its own device arrays, which its kernels
-        read. What it does must follow from the arguments alone, which are the same on every rank and after a restart.
+        By default it sets the numbers that ``config.curriculum`` names. A subclass may also fill device arrays that its kernels
+        read. The result must depend on the arguments alone, which are the same on every rank and after a restart.
 
         Args:
-            iteration: How many are done.
+            iteration: Number of finished iterations.
             reward: Mean return of the episodes that ended last; None before the first.
             episode_length: Their mean length [steps].
         """
@@ -219,35 +219,36 @@ class Task(Telling):
             self._number(name).fill_(value_at(points, iteration))
 
     def _number(self, name: str) -> torch.Tensor:
-        """What a curriculum changes under this name."""
+        """The number that a curriculum changes under this name."""
         return self.level if name == "level" else self._weights[self.reward_terms.index(name)]
 
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
 
         Args:
-            actions: As :attr:`actions`, into which they are copied.
+            actions: Copied into :attr:`actions`; of its shape and type.
         """
         self.actions.copy_(actions)
         for launch in self._steps:
             launch()
 
     def watch(self, look: Callable[[], None] | None) -> None:
-        """Have ``look`` called after every control step, in place of what was called before; None: nothing. It has run once before.
+        """Call ``look`` after every control step, instead of an earlier one; None: call nothing. Run ``look`` once beforehand.
 
-        It launches kernels alone, which write nothing that the task reads. Whoever holds a graph of :meth:`step` records it anew.
+        It may only launch kernels, and these may write nothing that the task reads. A caller with a graph of :meth:`step` must
+        capture it again.
         """
         self._steps[len(self._parts()) :] = [] if look is None else [CapturedStep(look, self.device).launch]
 
     def reset(self) -> None:
-        """Begin a new episode, from fresh random numbers, in every world."""
+        """Begin a new episode with new random numbers in every world."""
         with on_torch_stream(self.device):
             self._launch_observe(RESET)
 
     def restart(self, seed: int, first_world: int) -> None:
-        """Become the worlds of another seed or another global index, as if they had just been built.
+        """Turn the worlds into those of another seed or global index, as if they had just been built.
 
-        The physics and the scene that ``config.randomize`` drew for each world stay (``config.randomize.draws_worlds``).
+        The physics and the scene that ``config.randomize`` drew for each world stay as they are (``config.randomize.draws_worlds``).
 
         Args:
             seed: Any integer >= 0.
@@ -265,7 +266,7 @@ class Task(Telling):
     def seed(self, seed: int) -> None:
         """Restart all random streams from another seed; the worlds change at their next reset.
 
-        The physics that ``randomize`` drew for each world stays that of the seed at construction.
+        The physics that ``randomize`` drew at construction stays.
 
         Args:
             seed: Any integer >= 0.
@@ -296,29 +297,29 @@ class Task(Telling):
         self.mishap.fill_(int(NO_MISHAP))
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
-        """Decode a value of :attr:`mishap`: the index of the world in this task and its cause; None where no world failed."""
+        """Decode a value of :attr:`mishap`: the index of the failed world in this task and the cause; None: no world failed."""
         return None if code == NO_MISHAP else read_mishap(code, self.observation_names)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Everything that :meth:`load_state_dict` needs to go on bit for bit (on the CPU), copied to host memory.
+        """The state from which :meth:`load_state_dict` continues bit for bit (on the CPU), copied to host memory.
 
         Returns:
-            Tensors by name, each with leading dimension ``world_count``, so that worlds can be dealt out again.
+            Tensors by name, each with leading dimension ``world_count``, so that worlds can be resharded.
         """
         return {name: tensor.detach().cpu().clone() for name, tensor in self.state_tensors().items()}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Continue from :meth:`state_dict`, in place. Worlds keep the seed and the global index that they had.
+        """Continue from :meth:`state_dict`, in place. Worlds keep their seed and global index.
 
         Args:
-            state: As returned by :meth:`state_dict` of the same task with as many worlds.
+            state: From :meth:`state_dict` of the same task with as many worlds.
 
         Raises:
             ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn
-                otherwise; nothing was changed.
+                differently; nothing has changed.
         """
         tensors = self.state_tensors()
-        # older states lack what is 0 when an episode begins, or nothing to go by
+        # older states lack tensors that begin an episode at 0
         state = completed(tensors, state, len(self.metric_names))
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
@@ -404,7 +405,7 @@ class Task(Telling):
         }
 
     def _prepare(self) -> None:
-        """Everything that the kernels take besides the worlds and episodes."""
+        """Prepare the kernels' inputs other than the worlds and episodes."""
         self._parameters = self.parameters_type()
         for item in fields(self.config):
             if hasattr(self._parameters, item.name):
@@ -413,14 +414,14 @@ class Task(Telling):
         self.read_model(self._parameters)
 
     def _begin(self) -> None:
-        """What happens to the worlds once in their life: called after random streams are seeded, and again after the trial step."""
+        """Initialise each world once: called after the random streams are seeded, and again after the trial step."""
 
     def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
-        """The control step in order: its parts, and of each whether a graph holds it."""
+        """The parts of the control step, in order, and whether a graph holds each."""
         return [(True, self._launch_step)]
 
     def _launch_step(self) -> None:
-        """The whole control step, as launches."""
+        """Launch the whole control step."""
         self.randomizer.push()
         wp.launch(
             self.act,

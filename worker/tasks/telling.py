@@ -1,4 +1,4 @@
-"""What a task tells of its metrics, and of functions that it was given, such as a learner's reward: where they run, and what failed in them."""
+"""A task's report on its metrics and on functions of the user, such as a learner's reward: where they run, and their errors."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from collections.abc import Mapping, Sequence
 
 
 class Telling:
-    """A task that shows no metric and was given no function; others override this."""
+    """A task that shows no metric and has no function of the user; others override this."""
 
     final_metrics: tuple[str, ...] = ()
-    """Metrics of which an episode's last step counts."""
+    """Metrics whose value at an episode's last step counts."""
     shown_metrics: Mapping[str, str] = {}
     """Metrics that a training's progress shows, and their units."""
 
     waits_for_host: bool = False
-    """Whether a step reads anything back to the host: then no graph can hold it."""
+    """Whether a step reads data back to the host, so that no graph can hold it."""
 
     def notes(self) -> Sequence[str]:
-        """What the log of a training says of them once, a line each."""
+        """Lines about them, for the start of a training's log."""
         return ()
 
     def failures(self) -> Mapping[str, tuple[int, int]]:
-        """What went wrong in them since the task was built; waits for the device.
+        """Errors in them since the task was built; waits for the device.
 
         Returns:
-            By a line that says what: how often, and in which world first, counted over all ranks; the most frequent first.
+            By error line: its count, and the first world, counted over all ranks; the most frequent first.
         """
         return {}

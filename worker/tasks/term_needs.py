@@ -1,4 +1,4 @@
-"""What a term's function needs that its parameters' types do not tell: declared beside the function, and so known wherever it is used.
+"""Needs of a term's function beyond its parameters' types, declared beside the function and so known wherever it is used.
 
 >>> @needs(memory_each=1)
 ... @wp.func
@@ -16,14 +16,14 @@ _Function = TypeVar("_Function")
 
 @dataclass(frozen=True)
 class Needs:
-    """What a function needs.
+    """The needs of a function.
 
     Attributes:
         memory: Numbers of its own in ``episodes.memory``.
         memory_each: Further ones for each value that its element may have: each joint of the robot, or each ``index``.
         command: Numbers of its command that the policy sees; a function that draws a command writes exactly that many.
         hidden: Numbers of its command behind those.
-        size: How many values ``index`` has, where it counts something of the function's own.
+        size: How many values ``index`` has, where it counts elements of the function's own.
         each: How many values ``index`` has for each column of the sensors.
         columns: The parameters whose sensors have a column for each ``index``; None: all that have columns.
         points: The number that says how many columns of its height scan belong to one ``index``; empty: one column each.
@@ -50,7 +50,7 @@ _NEEDS: dict[Any, Needs] = {}
 
 
 def needs(**options: Any) -> Callable[[_Function], _Function]:
-    """Declare what a term's function needs; it stands above ``@wp.func``.
+    """Declare the needs of a term's function; the decorator stands above ``@wp.func``.
 
     Args:
         **options: As for :class:`Needs`.
@@ -65,8 +65,8 @@ def needs(**options: Any) -> Callable[[_Function], _Function]:
 
 
 def needs_of(function: Any) -> Needs:
-    """What a function was declared to need; :data:`NOTHING` of one that declares nothing."""
+    """The declared needs of a function; :data:`NOTHING` by default."""
     try:
         return _NEEDS.get(function, NOTHING)
-    except TypeError:  # whatever it is, it can't be a key and so is no function
+    except TypeError:  # not hashable, so not a function
         return NOTHING

@@ -1,4 +1,4 @@
-"""Terms written in torch: functions of the task that give a tensor, one row a world."""
+"""Terms written in torch: functions of the task that return a tensor with one row per world."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 class TorchTerms:
-    """The torch terms of a task. What they give stands in columns that the task's kernels read as they call a Warp function.
+    """The torch terms of a task. The task's kernels read their results from columns, where they would call a Warp function.
 
-    They run between the kernels, on the same stream, and nothing waits for the host: in a training that torch captures they are
-    captured as well. Those of observations run twice in a step: before worlds are placed afresh and after that.
+    They run between the kernels, on the same stream, and nothing waits for the host: torch captures them with the training.
+    Observation terms run twice per step: before and after the reset of worlds.
 
     Args:
-        task: Whose worlds they look at.
+        task: The task whose worlds they read.
         plan: The task's.
-        external: Where their results stand, shape ``(worlds, columns)``.
+        external: Their results, shape ``(worlds, columns)``.
 
     Attributes:
         any: Whether there are any.
@@ -38,12 +38,12 @@ class TorchTerms:
         self.any, self.observe_any = bool(self._terms), bool(self._seen)
 
     def judge(self) -> None:
-        """All of them, after the physics."""
+        """Run all terms, after the physics."""
         for bound in self._terms:
             self._run(bound)
 
     def observe(self) -> None:
-        """Those of observations, once more."""
+        """Run the observation terms again."""
         for bound in self._seen:
             self._run(bound)
 

@@ -1,4 +1,4 @@
-"""Robots on legs that follow velocity commands, on a plane or on rough ground: what mjlab 1.6's velocity tasks have in common.
+"""Legged robots that follow velocity commands, on a plane or on rough ground: the common part of mjlab 1.6's velocity tasks.
 
 Source of all numbers: ``mjlab/tasks/velocity/velocity_env_cfg.py`` and ``config/*/env_cfgs.py``.
 """
@@ -37,32 +37,32 @@ from worker.tasks.declared import DeclaredTask
 from worker.tasks.randomize import Randomize
 
 COMMANDED = ("forward", "left", "turn")
-"""What is commanded: each has stages in the configuration, such as ``command_forward``."""
+"""The commanded velocities; each has stages in the configuration, such as ``command_forward``."""
 FARTHEST_SCAN = 5.0
-"""Beyond this depth the ground below the trunk is not seen [m]; also what heights are divided by."""
+"""Range of the scan of the ground below the trunk [m]; heights are divided by it."""
 FOOT_HEIGHT = 0.1
 """How high a foot should swing [m]."""
 MOVES = 0.05
-"""Commands of less ask to stand: speed [m/s] + turning velocity [rad/s]."""
+"""Smaller commands mean standing: speed [m/s] + turning velocity [rad/s]."""
 UNSEEN = 0.3
-"""How near to the end of the terrain's border an episode ends [m]."""
+"""Distance to the end of the terrain's border at which an episode ends [m]."""
 
 
 @dataclass(frozen=True)
 class Walker:
-    """What the task has to know of a robot.
+    """The properties of a robot that the task needs.
 
     Attributes:
-        robot: Makes it.
+        robot: Function that makes it.
         action_scale: How far an action of 1 moves a joint's target [rad], by pattern of joints.
         base: Body of the root.
         torso: Body that is to be upright.
         imu: Site of the inertial measurement unit.
         soles: Sites of the feet, in the model's order.
-        touching: Which geoms or bodies are the feet, in the order of ``soles``.
-        ring: Where the ground around a sole is looked at.
-        tolerances: How far joints may be from their default positions.
-        randomize: What differs from world to world.
+        touching: Geoms or bodies of the feet, in the order of ``soles``.
+        ring: Points around a sole at which the ground is scanned.
+        tolerances: Tolerated deviations of joints from their default positions.
+        randomize: Quantities that differ from world to world.
     """
 
     robot: Callable[[], Robot]
@@ -83,20 +83,20 @@ class Walker:
 
 
 class Velocity(DeclaredTask):
-    """A robot that follows velocity commands; a subclass names the robot, where it walks, and what else there is on rough ground."""
+    """A robot that follows velocity commands; a subclass names the robot, its ground, and further terms on rough ground."""
 
     ground = True
     walker: ClassVar[Walker]
     """The robot."""
     rough: ClassVar[bool] = False
-    """Whether it walks on rough ground, which it sees, and not on a plane."""
+    """Whether it walks on rough ground, which it observes, instead of a plane."""
 
     def robot(self, config: VelocityConfig) -> Robot:
-        """The robot as it stands."""
+        """The robot in its standing pose."""
         return self.walker.robot()
 
     def terrain(self, config: VelocityConfig) -> Terrain | None:
-        """Stairs, slopes, waves and rough ground, harder from level to level, or nothing."""
+        """Stairs, slopes, waves and rough ground, harder with each level; None on flat ground."""
         return Terrain() if self.rough else None
 
     def build(self, builder: newton.ModelBuilder) -> None:
@@ -117,7 +117,7 @@ class Velocity(DeclaredTask):
         self.solver_options = {**type(self).solver_options, **limits}  # type: ignore[misc]
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
-        """Command from the ranges of this iteration, then do what ``config.curriculum`` says."""
+        """Set this iteration's ranges of commands, then apply ``config.curriculum``."""
         config: Any = self.config
         for name in COMMANDED:
             ends = range_at(getattr(config, f"command_{name}"), iteration)
@@ -205,7 +205,7 @@ class Velocity(DeclaredTask):
         }
 
     def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
-        """What ends an episode: a fall, or the end of the terrain, which is none; a subclass may change it."""
+        """The terminations: a fall, and as a time-out the end of the terrain; a subclass may change them."""
         ends = {"fell_over": Termination(terms.root_tilted, limit=math.radians(70.0))}
         if terrain := self.terrain(config):
             margin = terrain.border - UNSEEN
@@ -213,7 +213,7 @@ class Velocity(DeclaredTask):
         return ends
 
     def _seen(self, noisy: bool) -> Mapping[str, Observation]:
-        """What a robot's own sensors see; what only the simulation knows of it has neither noise nor bias."""
+        """Observations of a robot's own sensors; the critic's copies have neither noise nor bias."""
 
         def measured(function: Any, noise: float, **options: Any) -> Observation:
             return Observation(function, noise=noise if noisy else 0.0, **options)
@@ -234,7 +234,7 @@ class Velocity(DeclaredTask):
         return seen
 
     def _known(self) -> Mapping[str, Observation]:
-        """What only the simulation knows, of each foot."""
+        """Privileged observations of each foot, for the critic."""
         walker = self.walker
         names = list(walker.soles)
         return {

@@ -1,1 +1,1 @@
-"""What others see of the worlds while they are simulated: the tap, recordings and pictures."""
+"""Views of the worlds while they are simulated: the tap, recordings and pictures."""

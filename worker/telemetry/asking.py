@@ -32,7 +32,7 @@ def answer_of(run: Run) -> Path:
 
 
 def is_alive(host: object, process: object) -> bool:
-    """Whether a process of this machine runs; of another machine nobody here knows, which counts as no."""
+    """Whether a process of this machine runs; False for one of another machine, which can't be seen from here."""
     if host != socket.gethostname() or not isinstance(process, int) or process <= 0:
         return False
     try:
@@ -59,7 +59,7 @@ class Asking:
         self._writer = 0
         """The process that answered."""
         self.note = ""
-        """What the training says of what it leaves out."""
+        """The training's message about what it leaves out."""
 
     def ask(self) -> None:
         """Put the request; an answer of an earlier one is forgotten. Raises UserError where another process reads."""
@@ -121,7 +121,7 @@ class Asking:
         return bool(self._writer) and not is_alive(socket.gethostname(), self._writer)
 
     def withdraw(self) -> None:
-        """Take the request back; the training sees that nobody reads any more."""
+        """Withdraw the request; the training sees that it has no reader any more."""
         request_of(self._run).unlink(missing_ok=True)
 
     def _unreadable(self, error: Exception) -> UserError:

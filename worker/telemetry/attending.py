@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 LOOK_SECONDS = 1.0
 """Between two looks for a request."""
 DRAIN_SECONDS = 0.02
-"""Between two looks at the tap, while somebody reads."""
+"""Between two looks at the tap, while it has a reader."""
 NEWEST_SECONDS = 0.05
 """The same, for a reader to whom the newest control step is enough: a screen."""
 
@@ -55,7 +55,7 @@ class Attending:
         self._thread.start()
 
     def attend(self) -> bool:
-        """Between two iterations: open the tap where somebody has asked for it; returns whether graphs have to be recorded anew."""
+        """Between two iterations: open the tap if it was asked for; returns whether graphs have to be recorded anew."""
         if not self._wanted:
             return False
         tap = Tap.within(self._task, self._wanted)

@@ -108,7 +108,7 @@ def _open(run: Run, worlds: int, output: Path, known: dict[str, str]) -> Recordi
 
 
 def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
-    """What the worlds of a run's training look like, and the ``train`` section of its job. Raises UserError."""
+    """The stage of a run's training worlds, and the ``train`` section of its job. Raises UserError."""
     import warp
 
     from worker.learning.job import configure, user_errors

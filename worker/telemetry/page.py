@@ -73,7 +73,7 @@ class Page:
         program = need_rerun()
         self._http = _listen(port)
         self._home = Path(tempfile.mkdtemp(prefix="muster-view-"))
-        # Rerun's server looks at no Host header: of an address that nobody can guess no page of another name (DNS rebinding) reads
+        # Rerun's server looks at no Host header: with an address that can't be guessed no page of another name (DNS rebinding) reads
         own = f"127.{secrets.randbelow(255)}.{secrets.randbelow(255)}.{1 + secrets.randbelow(254)}"
         stream, assets = _free_port(own), _free_port(own)
         self.server = f"rerun+http://{own}:{stream}/proxy"

@@ -1,4 +1,4 @@
-"""What a command that looks at a policy is busy with: on a terminal one line that is written over, elsewhere plain lines now and then."""
+"""Progress of a command that looks at a policy: on a terminal one line that is overwritten, elsewhere plain lines now and then."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Activity:
         self._said, self._told = "", 0.0
 
     def say(self, text: str) -> None:
-        """A new activity, of which nobody knows how long it lasts."""
+        """A new activity of unknown duration."""
         if self._bar is None:
             print(text, file=sys.stderr, flush=True)
             self._said, self._told = text, time.monotonic()
@@ -61,7 +61,7 @@ class Activity:
 
 
 def loading(run: Run, worlds: int) -> str:
-    """What is said before libraries are imported and worlds are built, which takes seconds."""
+    """The message before libraries are imported and worlds are built, which takes seconds."""
     spec = (run.description() or {}).get("spec") or {}
     train = spec.get("train")
     task = str(train.get("task", "the task")) if isinstance(train, dict) else "the task"

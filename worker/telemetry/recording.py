@@ -207,7 +207,7 @@ class Recording:
         }
         self._add(f"/{frame}/rl/step", messages.STEP, now, messages.encoded(messages.STEP, **fields))
         if not self._sums[world, 1]:
-            # where the first step that is seen ends an episode, nobody knows when that began
+            # if the first step seen ends an episode, the episode's beginning is unknown
             self._whole[world] = self._just_ended[world] or (fields["age"] == 1 and not done)
         self._just_ended[world] = done
         self._sums[world] += fields["reward"], 1
@@ -260,7 +260,7 @@ _LATCHED = {
     **{name: _FOR_EVER for name in ("deadline", "lifespan", "liveliness_lease_duration")},
     "avoid_ros_namespace_conventions": False,
 }
-"""The quality of service, in ROS 2's numbers, of what stands once: a player keeps it for whoever comes later."""
+"""The quality of service, in ROS 2's numbers, of messages written once: players keep them for late subscribers."""
 
 
 def _qos(topic: str) -> dict[str, str]:

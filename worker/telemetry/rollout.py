@@ -81,7 +81,7 @@ class Rollout:
         return cls(run, checkpoint, config, task, policy, seed)
 
     def stage(self, device: str = "cpu") -> Stage:
-        """What these worlds look like."""
+        """The appearance of these worlds."""
         with user_errors():
             return Stage(type(self.task), self.config, self.task.world_count, device)
 

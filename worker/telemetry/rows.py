@@ -1,4 +1,4 @@
-"""What the tap keeps of a world in one control step: one row of numbers, what each of them is, and the images that the policy sees."""
+"""The tap's record of a world in one control step: one row of numbers, the meaning of each, and the images that the policy sees."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Layout:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Layout:
-        """What :meth:`to_json` wrote."""
+        """Reads the text of :meth:`to_json`."""
         names = {name: tuple(value[name]) for name in ("observations", "actions", "terms")}
         return cls(**{**value, **names, "images": tuple(map(tuple, value["images"]))})
 
@@ -128,12 +128,12 @@ class Rows:
 
     @property
     def observations(self) -> np.ndarray:
-        """What is observed after the step, shape ``(steps, worlds, observations)``."""
+        """Observations after the step, shape ``(steps, worlds, observations)``."""
         return self.part(2)
 
     @property
     def actions(self) -> np.ndarray:
-        """What the policy asked for, shape ``(steps, worlds, actions)``."""
+        """The policy's actions, shape ``(steps, worlds, actions)``."""
         return self.part(3)
 
     @property
@@ -151,7 +151,7 @@ class Rows:
         return self.marks[:, :, MARKS.index(name)]
 
     def pictures(self, step: int) -> dict[str, np.ndarray]:
-        """What each camera saw after a step, by its group: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
+        """The image of each camera after a step, by its group: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
         found: dict[str, np.ndarray] = {}
         if self.images is None:
             return found

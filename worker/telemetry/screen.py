@@ -1,4 +1,4 @@
-"""What the live view shows, as Rerun has it: shapes on links in 3-D, curves, the log. Nothing else of Muster imports Rerun.
+"""The live view in Rerun: shapes on links in 3-D, curves, the log. Nothing else of Muster imports Rerun.
 
 On the timeline ``time`` are wall-clock times; of a recording its own ones. ``iteration`` and ``step`` (control steps) are beside it.
 """
@@ -39,7 +39,7 @@ _RECENT = 20.0
 
 @dataclass(frozen=True)
 class Look:
-    """What is seen of a few worlds that are alike.
+    """The stage of a few equal worlds.
 
     Attributes:
         links: Names of the links that poses are given for, in order.
@@ -70,7 +70,7 @@ class Screen:
     def __init__(self, server: str | Path, title: str, look: Look, start: np.ndarray, live: bool) -> None:
         self._look = look
         self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
-        """What :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
+        """The rows that :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
@@ -168,7 +168,7 @@ class Screen:
             self._rr.disconnect()
 
     def _stand(self) -> None:
-        """What does not move."""
+        """The parts that do not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._rr.log(
             "worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True

@@ -58,7 +58,7 @@ class Segment:
             np.frombuffer(self._memory, np.uint8, counts[2], starts[4]).reshape(shapes[2]) if counts[2] else None
         )
         self._next = 0
-        """What is read next, counted in rows that were written."""
+        """The next row to read, counted in rows written."""
         self._step: int | None = None
         """Number of the control step that is read next."""
 
@@ -110,7 +110,7 @@ class Segment:
         self._next, self._step = int(self._header[_WRITTEN]), None
 
     def take(self) -> Iterator[Rows]:
-        """What was written since the last call, as copies: runs of consecutive control steps. What was overwritten counts as lost."""
+        """Copies of the rows written since the last call: runs of consecutive control steps. Overwritten rows count as lost."""
         size, written = self.layout.rows, int(self._header[_WRITTEN])
         first = max(self._next, written - size)
         places = np.arange(first, written) % size

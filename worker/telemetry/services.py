@@ -31,7 +31,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Tracked:
-    """What a service learns of a run, besides its metrics."""
+    """The facts that a service gets about a run, besides its metrics."""
 
     name: str
     task: str
@@ -91,7 +91,7 @@ class WandB:
 
     def prepare(self) -> None:
         self._wandb = _package("wandb")
-        # before its first use: it writes nothing to the terminal, and asks nobody for a key
+        # before its first use: it writes nothing to the terminal, and asks for no key
         known = self._wandb.setup(settings=self._wandb.Settings(silent=True, console="off")).settings
         mode = self._given.get("mode") or known.mode
         if mode == "disabled":
@@ -185,7 +185,7 @@ class MLflow:
         name = self._given.get("experiment") or os.environ.get("MLFLOW_EXPERIMENT_NAME") or self._tracked.task
         found = self._client.get_experiment_by_name(name)
         self._experiment = found.experiment_id if found else self._client.create_experiment(name)
-        if identity is None:  # one that was created before a kill, and that nobody noted
+        if identity is None:  # one that was created before a kill, and was not noted
             same = self._client.search_runs([self._experiment], f"tags.`muster.run` = '{fresh}'", max_results=1)
             identity = same[0].info.run_id if same else self._create(fresh)
         self.identity = identity

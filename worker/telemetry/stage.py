@@ -1,4 +1,4 @@
-"""What a task's worlds look like, without their physics: link frames from joint coordinates, and the shapes on the links."""
+"""The appearance of a task's worlds, without their physics: link frames from joint coordinates, and the shapes on the links."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 ROWS = 1024
 """Control steps that the ring holds."""
 IMAGE_MEMORY = 64 << 20
-"""Bytes that the images of a training's ring may take, on the device and, while somebody reads, twice on the host."""
+"""Bytes that the images of a training's ring may take, on the device and, while it has a reader, twice on the host."""
 LEAST_ROWS = 32
 """A ring of fewer control steps is overwritten before it is read: then images are left out."""
 
@@ -130,7 +130,7 @@ class Tap:
 
     @property
     def left_out(self) -> str:
-        """What is said of images that are too large for the ring; nothing where none is missing."""
+        """The message about images that are too large for the ring; empty if none is missing."""
         worlds, most = self.layout.worlds, IMAGE_MEMORY // LEAST_ROWS
         step = worlds * Layout.of(self._task, worlds, ROWS).image_bytes
         if step == worlds * self.layout.image_bytes:

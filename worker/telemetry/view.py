@@ -133,7 +133,7 @@ class Training:
         return screen
 
     def _tell(self, screen: Screen) -> None:
-        """What is new in metrics and log. A volume that is away for a while is no reason to end."""
+        """The news of metrics and log. A volume that is away for a while does not end the view."""
         try:
             screen.say(map(_line, self._log.poll()))
             history = history_of(self._run)
@@ -272,7 +272,7 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int],
 
 
 def look_of(stage: Stage, rows: Rows) -> Look:
-    """What is seen of a stage's worlds, beside each other."""
+    """A stage's worlds, beside each other."""
     from worker.telemetry.screen import Look
 
     cameras = tuple(name for name, *_ in rows.layout.images)

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from orchestrator.api.callers import Caller
+from orchestrator.api.http.callers import Caller
 from tests.conftest import PATIENCE, Serving
 from tests.support.conformance.streams import client_of
 

@@ -16,15 +16,15 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from orchestrator.api.auth import Access, Guard
-from orchestrator.api.limits import RateLimit
+from orchestrator.api.http.auth import Access, Guard
+from orchestrator.api.http.limits import RateLimit
 from orchestrator.api.permissions import current_identity
-from orchestrator.database import Database
-from orchestrator.errors import ServerError
+from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
 from orchestrator.keys import KeyStore
+from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.session import Database
 from orchestrator.server import Server
-from orchestrator.tables import JobQueue
 from tests.conftest import Serving, run_muster
 from tests.support.conformance.keys import client, refused
 
@@ -135,7 +135,7 @@ def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path
 
 def test_the_rate_counts_each_client_and_submissions_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr("orchestrator.api.limits.time.monotonic", lambda: now)
+    monkeypatch.setattr("orchestrator.api.http.limits.time.monotonic", lambda: now)
     limit = RateLimit(rate=10, submit_rate=2)
     assert [limit.refusal("a", "submitjob") for _ in range(4)] == [None] * 4
     assert "submit 2 jobs" in str(limit.refusal("a", "submitjob"))
@@ -209,7 +209,7 @@ def test_a_home_directory_is_its_users_alone_and_an_open_one_is_closed(
         assert "since it also holds 'of somebody'" in said and "Muster's directories in it are closed" in said
         database = Database.at(tmp_path / "older")
         with database.session() as session:
-            session.add(JobQueue(name="x", environments=[]))
+            session.add(JobQueue(name="x", compute_environments=[]))
         found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "older").glob("muster.db*")}
         database.close()
         assert found == dict.fromkeys(("muster.db", "muster.db-wal", "muster.db-shm", "muster.db.lock"), 0o600)

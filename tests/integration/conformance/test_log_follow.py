@@ -70,7 +70,7 @@ for i in range(150): print(os.environ["AWS_BATCH_JOB_NODE_INDEX"], i, sep=":"); 
                 own[name] = [e["message"] for e in tail.seen if e["logStreamName"] == name and ":" in e["message"]]
             return all(len([text for text in texts if "ended" not in text]) >= 150 for texts in own.values())
 
-        wait_for(complete, 20, what="all lines")
+        wait_for(complete, 60, what="all lines")
         tail.ending.set()
         tail.join()
         complete()

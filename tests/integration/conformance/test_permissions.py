@@ -11,10 +11,13 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from orchestrator.api import batch, logs, members, native
-from orchestrator.api.app import create_app
+from orchestrator.api.batch import members
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.http.app import create_app
+from orchestrator.api.logs import operations as logs
+from orchestrator.api.native import routes as native
 from orchestrator.api.permissions import HIDDEN, Operation
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 from tests.support.conformance.permissions_world import KEYS, MARK, SECRET, TOKEN, World, definition
 
 OWN_WRITE = "+ + + - - - -"

@@ -10,14 +10,16 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import boto3
 import pytest
 
-from orchestrator.engines import aws_batch
-from orchestrator.engines.aws_batch import AwsBatchEngine
-from orchestrator.engines.aws_config import is_mounted_from
-from orchestrator.engines.base import EngineError, NotYet, Placement
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.aws_batch import engine as aws_batch
+from orchestrator.engines.aws_batch.config import is_mounted_from
+from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
 from tests.conftest import Serving, run_muster, wait_for
@@ -64,7 +66,7 @@ PRINT = "env | grep -E '^(AWS_|MASTER_|MUSTER_|NODE_RANK|NNODES|RANK|WORLD_SIZE|
 def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_home(bench: AwsBench) -> None:
     handle = bench.launch(bench.gang(f"{PRINT}; {LAST}", 3, main=1))
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], bench.log()
-    facts = json.loads(handle)
+    facts = handle.facts
     lines = [line for line in bench.lines() if line.rank is not None]
     told = [dict(line.text.split("=", 1) for line in lines if line.node == index) for index in range(3)]
     main = told[1]["MUSTER_ADDRESS"]
@@ -132,6 +134,23 @@ def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tm
     )
 
 
+def test_what_aws_is_sent_is_the_request_of_the_plan(bench: AwsBench) -> None:
+    sent: dict[str, dict[str, Any]] = {}
+    for client, name in ((bench.engine._batch, "RegisterJobDefinition"), (bench.engine._submitting, "SubmitJob")):
+        client.meta.events.register(
+            f"provide-client-params.batch.{name}", lambda params, name=name, **_: sent.update({name: params})
+        )
+    gang = bench.gang(nodes=2, timeout=100)
+    plan = bench.engine.plan(gang)
+    bench.launch(gang)
+    assert sent["RegisterJobDefinition"] == plan.request.definition
+    arn = sent["SubmitJob"].pop("jobDefinition")
+    assert sent["SubmitJob"] == plan.request.submission and plan.request.definition["jobDefinitionName"] in arn
+    shown = json.loads(plan.document)
+    assert shown["RegisterJobDefinition"] == plan.request.definition
+    assert shown["SubmitJob"].items() >= plan.request.submission.items()
+
+
 def test_nodes_of_different_kinds_are_ranges_of_their_own(bench: AwsBench) -> None:
     kinds = [["sh", "-c", f"echo kind {kind}"] for kind in (0, 0, 1)]
     handle = bench.launch(bench.gang(nodes=3, commands=kinds, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 3))
@@ -151,7 +170,7 @@ def test_what_was_submitted_by_a_controller_that_died_is_found(bench: AwsBench) 
     assert len(bench.processes()) == len({*bench.processes()}) and len(processes_of(bench.volume.path)) == 2
     bench.engine.stop(handle, 1.0)
     second = bench.gang("exit 0", attempt=2)
-    assert json.loads(bench.launch(second))["aws"] != json.loads(handle)["aws"]
+    assert bench.launch(second).facts["aws"] != handle.facts["aws"]
     definitions = bench.aws.client.batch("DescribeJobDefinitions", jobDefinitionName=f"muster-{gang.title}")
     assert len(definitions["jobDefinitions"]) == 2, "another command is another revision"
 
@@ -265,7 +284,7 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench
     def reason() -> str:
         [node] = bench.engine.observe(handle)
         assert node.running
-        return node.waiting if "500" in node.waiting else ""
+        return node.words if "500" in node.words else ""
 
     said = wait_for(reason, 10, "the reason")
     assert said.startswith("AWS Batch: ") and "CPUs" in said
@@ -275,7 +294,7 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
     [node] = away.engine.observe(handle)
-    assert node.running and "does not answer" in node.waiting
+    assert node.running and "does not answer" in node.words
     with pytest.raises(NotYet, match="does not answer"):
         away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
 

@@ -19,11 +19,11 @@ import yaml
 from moto.cloudformation.models import cloudformation_backends
 from moto.ec2.models import ec2_backends
 
-from orchestrator.aws_stack import Event, first_failure
 from orchestrator.cli import main
-from orchestrator.engines.aws_batch import AwsBatchEngine
-from orchestrator.engines.aws_config import load_config
-from orchestrator.engines.base import Placement
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.aws_batch.config import load_config
+from orchestrator.engines.aws_batch.engine import AwsBatchEngine
+from orchestrator.engines.aws_batch.stack import Event, first_failure
 from tests.conftest import REPOSITORY, run_muster
 from tests.support.engines.bench import make_gang
 from tests.support.engines.moto_aws import moto_server
@@ -235,7 +235,7 @@ def test_the_engine_works_on_what_up_has_written(
         title="ant",
     )
     handle = engine.launch(engine.plan(gang))
-    job = json.loads(handle)["aws"]
+    job = handle.facts["aws"]
     [listed] = account.client("batch").list_jobs(
         jobQueue="muster", filters=[{"name": "JOB_NAME", "values": [f"ant-{gang.job}-1-1"]}]
     )["jobSummaryList"]

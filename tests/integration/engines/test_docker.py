@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import socket
 import threading
 import time
@@ -13,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines import docker as docker_engine
-from orchestrator.engines.base import EngineError, NotYet
+from orchestrator.engines.api import EngineError, NotYet
+from orchestrator.engines.docker import engine as docker_engine
 from shared_store import __version__
 from shared_store.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for
@@ -60,11 +59,11 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
     gang = bench.gang(f"exec python3 -c '{script.replace(chr(39), chr(34))}'", 2, main=1)
     handle = bench.launch(gang)
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0], bench.log()
-    addresses = json.loads(handle)["addresses"]
+    addresses = handle.facts["addresses"]
     assert bench.log() == [f"met {addresses[0]}"] and addresses[0] != addresses[1]
     # a second gang has another network, and reaches nobody here
     other = bench.launch(bench.gang(attempt=2))
-    assert not set(json.loads(other)["addresses"]) & set(addresses)
+    assert not set(other.facts["addresses"]) & set(addresses)
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
@@ -140,7 +139,7 @@ def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: DockerBench) ->
     [node] = bench.ended(handle)
     if node.exit_code == 0:
         pytest.skip("THIS KERNEL DOES NOT LIMIT MEMORY")
-    assert (node.exit_code, node.detail) == (137, "OutOfMemoryError: Container killed due to memory usage")
+    assert (node.exit_code, node.words) == (137, "OutOfMemoryError: Container killed due to memory usage")
 
 
 def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: DockerBench) -> None:
@@ -191,7 +190,7 @@ def test_two_threads_that_look_at_once_copy_a_log_once(bench: DockerBench, monke
 def test_a_long_log_is_copied_to_its_end_and_keeps_its_head_and_its_tail(
     bench: DockerBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrator.engines.docker._LOOK", 0.0)  # it goes on at the next look
+    monkeypatch.setattr("orchestrator.engines.docker.engine._LOOK", 0.0)  # it goes on at the next look
     handle = bench.launch(bench.gang("seq 100000 160000; echo the error; exit 1", 1, log_limit=1 << 20))
     bench.ended(handle)
     log = bench.log()
@@ -322,7 +321,7 @@ def test_images_that_are_built_here_say_the_controller_s_version() -> None:
     ],
 )
 def test_a_docker_engine_of_this_machine_is_known_as_such(url: str, name: str, here: bool) -> None:
-    from orchestrator.engines.docker import _is_here
+    from orchestrator.engines.docker.engine import _is_here
 
     assert _is_here(url, name) is here
 
@@ -342,3 +341,24 @@ def test_with_muster_in_the_image_the_supervisor_writes_log_and_outcome(bench: D
     assert node.exit_code == 3, (node, bench.log())
     assert (outcome.exit_code, outcome.reason) == (3, "rank 0 exited with code 3")
     assert "rank 0 of 1 in /muster/store" in bench.log()
+
+
+@pytest.mark.parametrize("image", [PLAIN, SUPERVISED])
+def test_the_containers_that_docker_has_are_those_of_the_plan(bench: DockerBench, image: str) -> None:
+    gang = bench.gang("exec sleep 600", 2, image=image, container={"linuxParameters": {"initProcessEnabled": True}})
+    plan = bench.engine.plan(gang)
+    handle = bench.launch(gang)
+    addresses = handle.facts["addresses"]
+    kernels = None if image == PLAIN else bench.engine._kernels
+    for index, planned in enumerate(plan.request):
+        sent = planned.at(addresses[index], addresses[0]).arguments((), kernels)
+        found = bench.client.containers.get(sent["name"]).attrs
+        config, host = found["Config"], found["HostConfig"]
+        assert (config["Cmd"], config["Entrypoint"]) == (sent["command"], sent["entrypoint"])
+        assert {*config["Env"]} == {f"{name}={value}" for name, value in sent["environment"].items()}
+        assert config["Labels"].items() >= sent["labels"].items() and config["Hostname"] == sent["hostname"]
+        assert (host["NanoCpus"], host["Memory"]) == (sent["nano_cpus"], 256 * 2**20)
+        assert (host["Init"], host["ShmSize"]) == (True, 128 * 2**20)
+        assert {(m["Source"], m["Destination"]) for m in found["Mounts"]} == {
+            (m["Source"], m["Target"]) for m in sent["mounts"]
+        }

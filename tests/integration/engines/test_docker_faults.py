@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 from shared_store.layout import Store
 from shared_store.metrics import read_metrics
 from shared_store.outcomes import read_outcome

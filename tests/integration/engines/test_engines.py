@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines import ENGINES, make_engine, slurm_commands
-from orchestrator.engines.base import EngineError
-from orchestrator.engines.mounts import Mount, with_mounts
-from orchestrator.engines.ray_cluster import ray_environment
+from orchestrator.engines.api import EngineError, Setting
+from orchestrator.engines.installed import ENGINES, make_engine
+from orchestrator.engines.ray.cluster import ray_environment
+from orchestrator.engines.slurm import commands as slurm_commands
+from orchestrator.engines.toolkit.mounts import Mount, with_mounts
 from tests.conftest import run_muster
 from tests.support.engines.slurm_cluster import need_slurm
 
@@ -88,9 +89,9 @@ def test_what_is_mounted_and_where_are_absolute_paths(source: str, target: str) 
 
 
 def test_every_engine_is_made_by_its_name(tmp_path: Path) -> None:
-    assert make_engine("local", tmp_path, cpus=2.0, gpus=["3"]).capacity()[0].gpus == ("3",)
+    assert make_engine("local", Setting(tmp_path, cpus=2.0, gpus=["3"])).capacity()[0].gpus == ("3",)
     with pytest.raises(EngineError, match="there is no engine 'kubernetes'"):
-        make_engine("kubernetes", tmp_path)
+        make_engine("kubernetes", Setting(tmp_path))
 
 
 def test_what_an_engine_s_own_commands_hand_on_to_jobs_is_without_the_other_engines_secrets(

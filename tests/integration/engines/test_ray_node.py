@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines.ray_node import Node
+from orchestrator.engines.ray.node import Node
 from shared_store.contract import NodeContract
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
@@ -22,7 +22,7 @@ from tests.support.processes import alive, await_end, frozen
 ESCAPE = "echo $$; env -i setsid sh -c 'echo $$; exec sleep 600' & exec sleep 600"
 ACTOR = """
 import json, sys, time
-from orchestrator.engines.ray_node import Node
+from orchestrator.engines.ray.node import Node
 node = Node({"MUSTER_GANG": "ray-node/1/1", "NODE_RANK": "0"}, 1e9)
 print(node.start([], sys.argv[2:], {}, json.loads(sys.argv[1]), 0, None), flush=True)
 time.sleep(600)

@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines import slurm_commands, slurm_script
-from orchestrator.engines.base import EngineError, NodeStatus, NotYet, Placement
-from orchestrator.engines.slurm import SlurmEngine
-from orchestrator.engines.slurm_commands import SlurmJob, list_hosts
-from orchestrator.engines.slurm_words import ending, waiting
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Cause, EngineError, Handle, NodeStatus, NotYet
+from orchestrator.engines.slurm import commands as slurm_commands
+from orchestrator.engines.slurm import script as slurm_script
+from orchestrator.engines.slurm.commands import SlurmJob, list_hosts
+from orchestrator.engines.slurm.engine import SlurmEngine
+from orchestrator.engines.slurm.states import ending, waiting
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import POLITE, STUBBORN, WAIT
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
@@ -33,7 +35,7 @@ def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: S
     try:
         assert [host.away for host in SlurmEngine().capacity()] == [False, True, False]
         handle = bench.launch(bench.gang(nodes=3))
-        wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].waiting, 20, "it is queued")
+        wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)
     finally:
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
@@ -106,7 +108,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
         show, 3, main=1, environments=environments, directory="/usr/share", gpus=GPUS, title='a "job" \\ é $HOME #1'
     )
     handle = bench.launch(gang)
-    assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(json.loads(handle)["output"]).read_text()
+    assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(handle.facts["output"]).read_text()
     told = sorted((json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"]))
     assert [env["AWS_BATCH_JOB_NODE_INDEX"] for env in told] == ["0", "1", "2"]
     assert [env["RANK"] for env in told] == ["1", "0", "2"], "rank 0 is on the main node"
@@ -156,7 +158,7 @@ def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitt
     assert successor.launch(successor.plan(gang)) == handle, "found, not submitted twice"
     bench.ready(gang)
     assert all(node.running for node in SlurmEngine().observe(handle)) or wait_for(
-        lambda: all(node.running and not node.waiting for node in successor.observe(handle)), 10, "known by its handle"
+        lambda: all(node.running and not node.words for node in successor.observe(handle)), 10, "known by its handle"
     )
     bench.engine.stop(handle, 0.0)
     assert successor.launch(successor.plan(gang)) == handle, "an ended one, too"
@@ -166,15 +168,15 @@ def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitt
 def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(bench: SlurmBench) -> None:
     handle = bench.launch(bench.gang("exit 0"))
     bench.ended(handle)
-    facts = {**json.loads(handle), "slurm": "999999", "gang": "forgotten/1/1"}
-    assert [node.exit_code for node in look(json.dumps(facts))] == [0]
-    forgotten = {**facts, "job": "another"}
-    [node] = look(json.dumps(forgotten))
-    assert (node.running, node.detail) == (False, "Slurm has forgotten the job, and the node left no outcome")
-    bench.engine.stop(json.dumps(forgotten), 1.0)
+    facts = {**handle.facts, "slurm": "999999"}
+    assert [node.exit_code for node in look(Handle("slurm", "forgotten/1/1", 1, facts))] == [0]
+    forgotten = Handle("slurm", "forgotten/1/1", 1, {**facts, "job": "another"})
+    [node] = look(forgotten)
+    assert (node.running, node.words) == (False, "Slurm has forgotten the job, and the node left no outcome")
+    bench.engine.stop(forgotten, 1.0)
 
 
-def look(handle: str) -> list[NodeStatus]:
+def look(handle: Handle) -> list[NodeStatus]:
     """What an engine without a memory sees, once it has asked."""
     engine = SlurmEngine()
     return wait_for(  # type: ignore[no-any-return]
@@ -186,9 +188,9 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     big = bench.ready(bench.gang(nodes=3, cpus=4))
     small = bench.launch(bench.gang(cpus=4, suffix="2"))
 
-    def waits(text: str, handle: str = small) -> bool:
+    def waits(text: str, handle: Handle = small) -> bool:
         [first, *_] = bench.engine.observe(handle)
-        return first.running and not first.address and text in first.waiting
+        return first.running and not first.address and text in first.words
 
     wait_for(lambda: waits("waits for nodes to become free (Resources; job"), 20, "its reason")
     many = bench.launch(bench.gang(nodes=4, suffix="4"))
@@ -197,9 +199,9 @@ def test_a_gang_waits_for_room_with_slurm_s_reason(bench: SlurmBench) -> None:
     wait_for(lambda: waits("the partition is down", closed), 20, "its reason")
     long = bench.launch(bench.gang(suffix="6", options={"partition": "short"}, timeout=3600))
     wait_for(lambda: waits("more time than the partition allows", long), 20, "its reason")
-    bench.cluster.run("scancel", json.loads(closed)["slurm"])
+    bench.cluster.run("scancel", closed.facts["slurm"])
     [node] = bench.ended(closed)
-    assert node.detail.startswith("it was cancelled in Slurm, not by Muster (job "), node
+    assert node.words.startswith("it was cancelled in Slurm, not by Muster (job "), node
     bench.engine.stop(small, 5.0)
     assert bench.state(small) == "CANCELLED" and not bench.engine.observe(small)[0].running
     bench.engine.stop(big, 0.0)
@@ -268,6 +270,16 @@ def test_the_script_says_what_the_queue_and_the_job_ask_for(bench: SlurmBench) -
     )
 
 
+def test_the_script_that_slurm_has_is_that_of_the_plan(bench: SlurmBench) -> None:
+    gang = bench.gang(nodes=2, bus="tcp/127.0.0.1:1", bus_token="the credential")
+    plan = bench.engine.plan(gang)
+    handle = bench.ready(gang)
+    has = bench.cluster.run("scontrol", "write", "batch_script", handle.facts["slurm"], "-")
+    assert has.strip() == plan.request.script.strip() and "the credential" in has
+    assert handle.facts["output"] == plan.request.output
+    assert plan.document == plan.request.script.replace("the credential", "\\u2026"), "all of it but the credential"
+
+
 def test_a_gang_is_asked_to_leave_and_then_made_to(bench: SlurmBench) -> None:
     polite = bench.ready(bench.gang(POLITE, 3))
     assert bench.stopped(polite, 30.0) == [75, 75, 75]
@@ -292,10 +304,10 @@ def test_what_a_node_does_not_have_is_one_line_with_its_name(bench: SlurmBench) 
     other = bench.start(bench.gang(nodes=1, epoch=2, suffix="2"))
     for node, name in zip(bench.ended(nowhere), NODES, strict=False):
         assert node.exit_code == 2
-        assert node.detail == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
+        assert node.words == f"muster: node {name}: [Errno 2] No such file or directory: '/no/such/place'"
     [node] = bench.ended(other)
-    assert node.exit_code == 2 and node.detail.startswith(f"muster supervisor: store {bench.store.path} on "), node
-    assert " is not the controller's: run run has epoch 1 there, not 2" in node.detail
+    assert node.exit_code == 2 and node.words.startswith(f"muster supervisor: store {bench.store.path} on "), node
+    assert " is not the controller's: run run has epoch 1 there, not 2" in node.words
 
 
 def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
@@ -305,12 +317,16 @@ def test_a_first_node_without_this_python_or_without_the_store_is_one_line(
         patched.setattr(sys, "executable", "/no/python")
         handle = bench.launch(bench.gang(nodes=2))
     for node in bench.ended(handle):
-        assert not node.running and node.detail.endswith("/no/python: No such file or directory"), node
-    monkeypatch.setattr(slurm_script, "output_path", lambda gang: "/nowhere/slurm.out")
+        assert not node.running and node.words.endswith("/no/python: No such file or directory"), node
+    render = slurm_script.render
+    elsewhere = "/nowhere/slurm.out"
+    monkeypatch.setattr(
+        slurm_script, "render", lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)
+    )
     [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
     assert (
-        node.detail.startswith("Slurm could not start it on n1: is ")
-        and "file system that all nodes share" in node.detail
+        node.words.startswith("Slurm could not start it on n1: is ")
+        and "file system that all nodes share" in node.words
     )
 
 
@@ -337,14 +353,21 @@ def test_what_slurm_says_of_a_job_that_waits_is_said_in_words(state: str, reason
 
 
 @pytest.mark.parametrize(
-    ("state", "code", "words"),
+    ("state", "cause", "code", "words"),
     [
-        ("PREEMPTED", 75, "preempted by Slurm, and did not leave in time (job 5)"),
-        ("TIMEOUT", 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)"),
-        ("OUT_OF_MEMORY", 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
-        ("NODE_FAIL", 137, "Slurm lost a node of n1 (job 5)"),
-        ("SOMETHING_NEW", 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
+        ("PREEMPTED", Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time (job 5)"),
+        (
+            "TIMEOUT",
+            Cause.STOPPED,
+            137,
+            "Slurm ended it at its time limit; ask for more (timeout, or muster:time) (job 5)",
+        ),
+        ("OUT_OF_MEMORY", Cause.OUT_OF_MEMORY, 137, "OutOfMemoryError: Container killed due to memory usage (job 5)"),
+        ("NODE_FAIL", Cause.HOST_LOST, 137, "Slurm lost a node of n1 (job 5)"),
+        ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why (job 5)"),
     ],
 )
-def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(state: str, code: int, words: str) -> None:
-    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (code, words)
+def test_how_slurm_ended_a_job_is_the_end_of_a_node_that_left_no_outcome(
+    state: str, cause: Cause | None, code: int, words: str
+) -> None:
+    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, words)

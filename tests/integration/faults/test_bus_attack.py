@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from orchestrator.bus import Bus, BusError
+from orchestrator.control.bus import Bus, BusError
 from shared_store.bus import Credential, presence_key
 from tests.conftest import Serving, wait_for
 from tests.support.worker.node import node_contract
-from worker.bus import NodeBus
+from worker.node.bus import NodeBus
 
 KEY = "muster/victim/1/0"
 

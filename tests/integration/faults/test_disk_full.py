@@ -12,10 +12,10 @@ import pytest
 from botocore.exceptions import ClientError
 from sqlalchemy import func, select, update
 
-from orchestrator.database import Database, DatabaseFull
-from orchestrator.disk import DEFAULT, Disk, MinFree
-from orchestrator.errors import ApiError
-from orchestrator.tables import JobQueue
+from orchestrator.control.disk import DEFAULT, Disk, MinFree
+from orchestrator.domain.errors import ApiError
+from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.session import Database, DatabaseFull
 from tests.conftest import PATIENCE, Serving, run_muster, wait_for
 from tests.support.conformance.streams import client_of
 from tests.support.faults.full_disk import fill, small_volume
@@ -83,14 +83,16 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
 def test_the_database_ends_jobs_on_a_volume_without_a_free_byte(volume: Path) -> None:
     database = Database.at(volume)
     with database.session() as session:
-        session.add(JobQueue(name="q", priority=1, environments=[], tags={}, limits=[]))
+        session.add(JobQueue(name="q", priority=1, compute_environments=[], tags={}, limits=[]))
     fill(volume)
     for priority in range(2000):
         with database.session() as session:
             session.execute(update(JobQueue).values(priority=priority))
     with pytest.raises(DatabaseFull, match="its volume is full; make room there"), database.session() as session:
         for number in range(200):
-            session.add(JobQueue(name=f"q{number}", priority=1, environments=["x" * 100_000], tags={}, limits=[]))
+            session.add(
+                JobQueue(name=f"q{number}", priority=1, compute_environments=["x" * 100_000], tags={}, limits=[])
+            )
     with database.session() as session:
         assert session.scalar(select(func.count()).where(JobQueue.name.startswith("q"))) == 1
     database.close()

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator import peers
-from orchestrator.errors import ApiError
-from orchestrator.peers import Peers
+from orchestrator.control import peers
+from orchestrator.control.peers import Peers
+from orchestrator.domain.errors import ApiError
 from shared_store.epoch import Claim, raise_epoch, read_epoch
 from shared_store.layout import Store
 from tests.conftest import Serving, submit_gang, wait_for

@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from orchestrator import automatic
-from orchestrator.api import submission
+from orchestrator.api.batch import submission
+from orchestrator.api.native import automatic
 from orchestrator.client import Client
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
+from orchestrator.persistence.models import Job
 from orchestrator.server import Server
-from orchestrator.tables import Job
 from shared_store.checkpoints import list_checkpoints, retain
 from shared_store.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang

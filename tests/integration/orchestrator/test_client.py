@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.errors import Unreachable
+from orchestrator.domain.errors import Unreachable
 from tests.conftest import Serving, submit_gang, wait_for
 
 

@@ -18,8 +18,8 @@ import httpx
 import pytest
 import uvicorn
 
-from orchestrator.api import connections
-from orchestrator.api.connections import Connection, Connections, raise_descriptor_limit
+from orchestrator.api.http import connections
+from orchestrator.api.http.connections import Connection, Connections, raise_descriptor_limit
 from orchestrator.client import Client
 from orchestrator.server import Server
 from tests.conftest import MUSTER, Serving, submit_gang, wait_for

@@ -11,40 +11,44 @@ from pathlib import Path
 
 import httpx
 import pytest
-from alembic import command
 from alembic.autogenerate import compare_metadata
-from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, select, text
 from sqlalchemy.exc import IntegrityError
 
-from orchestrator.accounting import add_usage, charge, forget_before, resource_seconds, usage_at
-from orchestrator.database import Database, DatabaseError, find_job
-from orchestrator.errors import ApiError, ServerError
-from orchestrator.roster import Roster
-from orchestrator.schema import MIGRATIONS, NEWEST
+from orchestrator.control.usage import add_usage, charge, forget_before, resource_seconds, usage_at
+from orchestrator.control.work_queue import WorkQueue
+from orchestrator.domain.errors import ApiError, ServerError
+from orchestrator.persistence.models import (
+    Attempt,
+    Base,
+    ComputeEnvironment,
+    Dependency,
+    Job,
+    JobQueue,
+    Node,
+    RunRecord,
+    now,
+)
+from orchestrator.persistence.queries import find_job
+from orchestrator.persistence.schema import NEWEST
+from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from orchestrator.tables import Attempt, Base, ComputeEnvironment, Dependency, Job, JobQueue, RunRecord, now
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for
 from tests.support.orchestrator import postgres
+from tests.support.orchestrator.databases import migrate
 from tests.support.orchestrator.rows import job
 
 
-@pytest.fixture(scope="session")
-def server() -> Iterator[postgres.Server]:
-    binaries = postgres.programs()
-    if binaries is None:
-        pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
-    with postgres.serving(binaries) as running:
-        yield running
+@pytest.fixture
+def server(postgresql: postgres.Server) -> postgres.Server:
+    return postgresql
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'muster.db'}"
-    return str(request.getfixturevalue("server").new_database())
+@pytest.fixture
+def url(database_url: str) -> str:
+    return database_url
 
 
 @pytest.fixture
@@ -66,7 +70,7 @@ def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
     url: str, opened: Callable[[], Database], history: str
 ) -> None:
     if history == "migrated":
-        _migrate(url, "upgrade", "head")
+        migrate(url, "upgrade", "head")
     database = opened()
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection)
@@ -79,7 +83,7 @@ def test_a_new_database_and_a_migrated_one_have_what_the_tables_say(
 def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_jobs(
     url: str, opened: Callable[[], Database]
 ) -> None:
-    _migrate(url, "upgrade", "0001")
+    migrate(url, "upgrade", "0001")
     engine = create_engine(url)
     with engine.begin() as connection:
         connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
@@ -111,7 +115,7 @@ def test_a_database_of_the_first_version_is_brought_up_to_date_and_keeps_its_job
 def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_definition(
     url: str, opened: Callable[[], Database]
 ) -> None:
-    _migrate(url, "upgrade", "0003")
+    migrate(url, "upgrade", "0003")
     engine = create_engine(url)
     insert = (
         "INSERT INTO jobs (id, name, queue, definition, request, node_properties, run, status, created_at, "
@@ -129,7 +133,7 @@ def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_defin
         for name in ("p", "p:0", "alone"):
             job_ = session.get_one(Job, name)
             assert (job_.node_properties, job_.tags, job_.parameters) == ({"numNodes": 1}, {"a": "b"}, {})
-    _migrate(url, "downgrade", "0003")
+    migrate(url, "downgrade", "0003")
     engine = create_engine(url)
     with engine.connect() as connection:
         assert connection.scalar(text("SELECT count(*) FROM jobs WHERE node_properties IS NULL")) == 0
@@ -139,7 +143,7 @@ def test_children_of_an_array_that_was_stored_with_copies_share_the_arrays_defin
 def test_runs_of_an_older_database_belong_to_the_queue_and_owner_of_their_first_job(
     url: str, opened: Callable[[], Database]
 ) -> None:
-    _migrate(url, "upgrade", "0004")
+    migrate(url, "upgrade", "0004")
     engine = create_engine(url)
     with engine.begin() as connection:
         for number, (run, queue, key, epoch) in enumerate(
@@ -174,8 +178,8 @@ def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:
 
 def test_down_and_up_again_leaves_the_tables_as_they_are(url: str, opened: Callable[[], Database]) -> None:
     opened().close()
-    _migrate(url, "downgrade", "0001")
-    _migrate(url, "downgrade", "base")
+    migrate(url, "downgrade", "0001")
+    migrate(url, "downgrade", "base")
     with opened().engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
 
@@ -201,7 +205,7 @@ def test_a_database_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 
 def test_a_second_controller_on_one_postgresql_is_refused_until_the_first_is_dead(server: postgres.Server) -> None:
     url = server.new_database()
-    script = f"from orchestrator.database import Database; d = Database({url!r}); print('up', flush=True); input()"
+    script = f"from orchestrator.persistence.session import Database; d = Database({url!r}); print('up', flush=True); input()"
     first = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert first.stdout is not None and first.stdout.readline() == b"up\n"
     with pytest.raises(DatabaseError, match="another controller has it"):
@@ -283,26 +287,26 @@ def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opene
 
 
 def test_the_roster_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
-    database, live = opened(), Roster()
+    database, live = opened(), WorkQueue()
     database.committed = live.note
     with database.session() as session:
         states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
         session.add_all(job(status, status=status) for status in states)
         session.add(job("ending", status="RUNNABLE", stop_reason="enough"))
-    fresh = Roster()
+    fresh = WorkQueue()
     with database.session() as session:
         fresh.load(session)
-    for roster, due in ((live, ["SUBMITTED", "ending"]), (fresh, ["PENDING", "SUBMITTED", "ending"])):
-        assert [entry.job for entry in roster.waiting()] == ["RUNNABLE"]
-        assert sorted(roster.active()) == ["RUNNING", "STARTING"]
-        assert sorted(roster.take_due()) == due, "what was pending may have become ready while nobody looked"
+    for work_queue, due in ((live, ["SUBMITTED", "ending"]), (fresh, ["PENDING", "SUBMITTED", "ending"])):
+        assert [entry.job for entry in work_queue.waiting()] == ["RUNNABLE"]
+        assert sorted(work_queue.active()) == ["RUNNING", "STARTING"]
+        assert sorted(work_queue.take_due()) == due, "what was pending may have become ready while nobody looked"
 
 
 def test_a_stop_that_comes_while_the_controller_writes_is_looked_at() -> None:
-    roster, stale = Roster(), job("a", status="RUNNABLE")
-    roster.look_again(["a"])  # a request has just ended the job
-    roster.note([stale])  # the controller commits what it had read before
-    assert list(roster.take_due()) == ["a"]
+    work_queue, stale = WorkQueue(), job("a", status="RUNNABLE")
+    work_queue.look_again(["a"])  # a request has just ended the job
+    work_queue.note([stale])  # the controller commits what it had read before
+    assert list(work_queue.take_due()) == ["a"]
 
 
 def test_an_array_keeps_its_children_until_the_last_is_over(opened: Callable[[], Database]) -> None:
@@ -324,22 +328,29 @@ def test_history_is_forgotten_only_where_nobody_needs_it(opened: Callable[[], Da
     with opened().session() as session:
         session.add_all([job("old", **over), job("needed", **over), job("waits", status="PENDING")])
         session.add(job("young", status="SUCCEEDED", stopped_at=now()))
-        session.add(Attempt(job_id="old", number=1, epoch=1, nodes=[]))
+        session.add(Attempt(job_id="old", number=1, epoch=1, nodes=[Node(index=0, host="h")]))
         session.add(Dependency(job_id="waits", on_id="needed"))
         session.commit()
         assert forget_before(session, 2000) == 1
         assert sorted(session.scalars(select(Job.id))) == ["needed", "waits", "young"]
-        assert session.scalars(select(Attempt.job_id)).all() == []
+        assert session.scalars(select(Attempt.job_id)).all() == session.scalars(select(Node.job_id)).all() == []
 
 
 def test_an_attempt_is_charged_for_what_it_held_and_lost(opened: Callable[[], Database], tmp_path: Path) -> None:
     run = Store(tmp_path / "store").open().run("r")
-    nodes = [{"gpus": ["0", "1"], "cpus": 4.0}, {"gpus": ["2", "3"], "cpus": 4.0}]
-    failed = Attempt(job_id="a", number=1, epoch=1, nodes=nodes, created_at=10_000, stopped_at=70_000, ending="failed")
+
+    def nodes() -> list[Node]:
+        return [Node(host="h", gpus=gpus, cpus=4.0, memory=1) for gpus in (("0", "1"), ("2", "3"))]
+
+    failed = Attempt(
+        job_id="a", number=1, epoch=1, nodes=nodes(), created_at=10_000, stopped_at=70_000, ending="failed"
+    )
     charge(failed, run, 70_000)
     assert (failed.gpu_seconds, failed.cpu_seconds) == (240.0, 480.0)
     assert (failed.wasted_gpu_seconds, failed.wasted_cpu_seconds) == (240.0, 480.0), "it had saved nothing"
-    done = Attempt(job_id="a", number=2, epoch=2, nodes=nodes, created_at=10_000, stopped_at=20_000, ending="succeeded")
+    done = Attempt(
+        job_id="a", number=2, epoch=2, nodes=nodes(), created_at=10_000, stopped_at=20_000, ending="succeeded"
+    )
     charge(done, run, 20_000)
     assert (done.gpu_seconds, done.wasted_gpu_seconds) == (40.0, 0.0)
     assert resource_seconds(failed, 70_000) == 240.0
@@ -430,12 +441,3 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(server: postgres.
         assert not (serving.home / "muster.db").exists()
     finally:
         serving.close()
-
-
-def _migrate(url: str, direction: str, revision: str) -> None:
-    config, engine = Config(), create_engine(url)
-    config.set_main_option("script_location", str(MIGRATIONS))
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        getattr(command, direction)(config, revision)
-    engine.dispose()

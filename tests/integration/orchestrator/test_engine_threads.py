@@ -21,20 +21,22 @@ from typing import Any
 import pytest
 
 from orchestrator.client import Client
+from orchestrator.domain.hosts import Host, Placement
 from orchestrator.engines import runner
-from orchestrator.engines.base import (
+from orchestrator.engines.api import (
     EngineError,
     Gang,
     GangStatus,
-    Host,
+    Handle,
+    NodePhase,
     NodeStatus,
     NotYet,
-    Placement,
     Plan,
     Transient,
+    read_handle,
 )
-from orchestrator.engines.local import LocalEngine
-from orchestrator.engines.several import Several
+from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.transience import is_final
 from orchestrator.server import Server
 from shared_store.layout import Store
@@ -71,18 +73,18 @@ class Fake:
         self._do()
         return [Host(HOST, 4, (), 1024)]
 
-    def plan(self, gang: Gang) -> Plan:
-        return Plan(gang, [])
+    def plan(self, gang: Gang) -> Plan[None]:
+        return Plan(gang, [], None)
 
-    def launch(self, plan: Plan) -> str:
+    def launch(self, plan: Plan[None]) -> Handle:
         self._do()
-        return plan.gang.name
+        return Handle(self.name, plan.gang.name, len(plan.gang.placements), {})
 
-    def observe(self, handle: str) -> GangStatus:
+    def observe(self, handle: Handle) -> GangStatus:
         self._do()
-        return [NodeStatus(True, "here")]
+        return [NodeStatus(NodePhase.RUNNING, "here")]
 
-    def stop(self, handle: str, grace: float) -> None:
+    def stop(self, handle: Handle, grace: float) -> None:
         if self.error is not None:
             raise self.error
 
@@ -91,15 +93,15 @@ class Fake:
 
 
 @contextlib.contextmanager
-def engines(*made: Any) -> Iterator[Several]:
-    several = Several(made)
+def engines(*made: Any) -> Iterator[EngineSet]:
+    several = EngineSet(made)
     try:
         yield several
     finally:
         several.close()
 
 
-def launched(several: Several, what: Gang) -> str:
+def launched(several: EngineSet, what: Gang) -> str:
     def ask() -> str | None:
         try:
             return several.launch(what.name, [each.host for each in what.placements], lambda: several.plan(what))
@@ -140,7 +142,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
         def says() -> str:
             [node] = several.observe(handle) or []
             assert node.running and node.address == "here"
-            return node.waiting
+            return node.words
 
         said = wait_for(says, 10, "that it does not answer")
         assert said.startswith("the engine engine has not answered since "), said
@@ -173,7 +175,7 @@ def test_an_engine_that_fails_is_logged_once_and_its_gangs_count_as_running(
         ):
             fake.error = error
             [node] = wait_for(
-                lambda said=said: (s := several.observe(handle)) and said in s[0].waiting and s,  # type: ignore[misc]
+                lambda said=said: (s := several.observe(handle)) and said in s[0].words and s,  # type: ignore[misc]
                 20,
                 said,
             )
@@ -181,8 +183,8 @@ def test_an_engine_that_fails_is_logged_once_and_its_gangs_count_as_running(
             with pytest.raises(EngineError, match="trying again"):
                 several.stop(handle, 0)
         fake.error = None
-        wait_for(lambda: (s := several.observe(handle)) and not s[0].waiting, 20, "that it is seen again")
-        assert several.stop(handle, 0) == [NodeStatus(True, "here")]
+        wait_for(lambda: (s := several.observe(handle)) and not s[0].words, 20, "that it is seen again")
+        assert several.stop(handle, 0) == [NodeStatus(NodePhase.RUNNING, "here")]
     looks = [record for record in caplog.records if "look at the gang" in record.getMessage()]
     assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
 
@@ -201,7 +203,7 @@ def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_start
                 while True:
                     taken.append(os.open("/dev/null", os.O_RDONLY))
             with pytest.raises(OSError, match="Too many open files"):
-                engine.observe(handle.split(" ", 2)[2])
+                engine.observe(read_handle(handle))
             for spare in range(12):  # wherever it runs out of them
                 for descriptor in taken[-spare:] if spare else []:
                     os.close(descriptor)
@@ -219,14 +221,14 @@ def test_without_descriptors_nothing_is_taken_for_dead_and_no_half_gang_is_start
                 os.close(descriptor)
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
         try:
-            [node] = wait_for(lambda: (s := several.observe(handle)) and not s[0].waiting and s, 60, "that it is seen")
+            [node] = wait_for(lambda: (s := several.observe(handle)) and not s[0].words and s, 60, "that it is seen")
             assert node.running
             names = {member.gang for member in gang_members(tmp_path)}
-            assert names <= {"running/1/1", f"half-{spare}/1/1"} and spare > 2, (names, spare)
+            assert names <= {"running/1/1", f"half-{spare}/1/1"} and spare > 0, (names, spare)
         finally:
             several.stop(handle, 0)
             for name in range(spare + 1):
-                engine.stop(json.dumps({"gang": f"half-{name}/1/1", "nodes": []}), 0)
+                engine.stop(Handle("local", f"half-{name}/1/1", 0, {"nodes": []}), 0)
     assert processes_of(tmp_path) == []
 
 
@@ -240,7 +242,7 @@ def test_a_job_that_can_t_be_started_for_now_keeps_its_attempts_and_one_that_nev
             raise OSError(number[0], os.strerror(number[0]))
         return popen(command, *arguments, **options)
 
-    monkeypatch.setattr("orchestrator.engines.local.subprocess.Popen", refused)
+    monkeypatch.setattr("orchestrator.engines.local.engine.subprocess.Popen", refused)
     server = Server(tmp_path, port=0, cpus=2)
     server.start()
     try:

@@ -8,18 +8,23 @@ import signal
 import subprocess
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from orchestrator import gangs
+from orchestrator.api.batch import rules
 from orchestrator.client import Client
-from orchestrator.engines.base import EngineError
-from orchestrator.engines.local import LocalEngine
-from orchestrator.errors import ApiError
-from orchestrator.jobs import Ending, NodeEnd, Verdict
+from orchestrator.control import attempts
+from orchestrator.domain.errors import ApiError
+from orchestrator.domain.gang import GangSpec, gang_needs
+from orchestrator.domain.job import Ending, NodeEnd, Verdict
+from orchestrator.engines.api import EngineError
+from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.persistence import gangs
+from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.server import Server
-from orchestrator.tables import Attempt, Job
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
 from tests.support.orchestrator.jobs import await_status, detail
 from tests.support.processes import parent, processes_of, processes_of_job
@@ -270,14 +275,37 @@ def test_a_main_node_that_was_told_to_end_waits_for_the_cause_for_a_limited_time
     ranges = [{"targetNodes": "0:", "container": container}]
     properties = {"numNodes": 2, "mainNode": 0, "nodeRangeProperties": ranges}
     job = Job(id="j", name="j", queue="default", definition="d", request={}, run="j", node_properties=properties)
-    attempt = Attempt(job_id="j", number=1, nodes=[{"host": "localhost"}] * 2)
+    attempt = Attempt(job_id="j", number=1, nodes=[Node(host="localhost"), Node(host="localhost")])
     ends = [NodeEnd(143, "rank 0 was killed by SIGTERM", 1.0, asked=True), None]
-    judged = inside.controller.gangs
+    judged = inside.controller.attempts
     try:
         assert judged._verdict(job, attempt, ends, 0) is None, "the child may tell the cause"
-        monkeypatch.setattr(gangs, "_CAUSE_PATIENCE", -1.0)
+        monkeypatch.setattr(attempts, "_CAUSE_PATIENCE", -1.0)
         assert judged._verdict(job, attempt, ends, 0) == Verdict(
             Ending.FAILED, "main node: rank 0 was killed by SIGTERM", 143, certain=False
         )
     finally:
         judged._uncertain.clear()
+
+
+def test_a_definition_and_a_job_are_read_once_each_from_submission_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+
+    def counting(node_properties: Mapping[str, Any]) -> GangSpec:
+        read.append(node_properties["numNodes"])
+        return gang_needs(node_properties)
+
+    for module in (rules, gangs):
+        monkeypatch.setattr(module, "gang_needs", counting)
+    server = Server(tmp_path, port=0, cpus=2)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            job = submit_gang(client, "import time; time.sleep(1)" + MAIN_LAST, nodes=2, env=NATIVE)
+            await_status(client, job, "SUCCEEDED")
+            assert len(detail(client, job)["attempts"][0]["nodes"]) == 2
+    finally:
+        server.close()
+    assert read == [2, 2], "when the definition is registered, and when the job is submitted with its overrides"

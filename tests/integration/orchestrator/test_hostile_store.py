@@ -13,11 +13,11 @@ import httpx
 import pytest
 from sqlalchemy import select
 
-from orchestrator.api.log_events import log_file
+from orchestrator.api.logs.events import log_file
 from orchestrator.client import Client
-from orchestrator.database import Database, DatabaseError
+from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from orchestrator.tables import Job, JobQueue
 from shared_store.epoch import close_claim, raise_epoch, read_epoch
 from shared_store.files import DamagedFile, write_json
 from shared_store.layout import Run

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 import os
 import signal
 import socket
+import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from orchestrator.engines.base import EngineError, Placement
-from orchestrator.engines.local import LocalEngine
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Cause, EngineError, Handle, NodePhase
+from orchestrator.engines.local.engine import LocalEngine
 from shared_store.epoch import raise_epoch
-from shared_store.processes import end_all, find_process
+from shared_store.processes import children, end_all, find_process, marked
 from tests.conftest import wait_for
 from tests.support.engines.local_bench import LocalBench
 from tests.support.engines.sites import POLITE, STUBBORN, WAIT
@@ -30,8 +32,39 @@ def bench(tmp_path: Path) -> Iterator[LocalBench]:
     found.close()
 
 
-def pids(handle: str) -> list[int]:
-    return [node["pid"] for node in json.loads(handle)["nodes"]]
+def pids(handle: Handle) -> list[int]:
+    return [node["pid"] for node in handle.facts["nodes"]]
+
+
+def test_what_is_started_is_the_request_of_the_plan(bench: LocalBench) -> None:
+    gang = bench.gang(nodes=2, placements=[Placement("localhost", ("2",), 1, 64), Placement("localhost", (), 1, 64)])
+    plan = bench.engine.plan(gang)
+    handle = bench.ready(gang)
+    for pid, node in zip(pids(handle), plan.request, strict=True):
+        raw = Path(f"/proc/{pid}/environ").read_bytes().decode().split("\0")
+        found = dict(item.split("=", 1) for item in raw if item)
+        # the port is the first free one, of those that begin with the planned one
+        assert found.pop("MASTER_PORT") >= node.environment["MASTER_PORT"]
+        assert found == {name: value for name, value in node.environment.items() if name != "MASTER_PORT"}
+        assert Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")[:-1] == list(node.command)
+        assert os.readlink(f"/proc/{pid}/cwd") == node.directory
+
+
+def test_a_supervisor_that_has_not_begun_yet_is_not_taken_for_its_shim(bench: LocalBench, tmp_path: Path) -> None:
+    """Between its fork and its exec it has the shim's command line and environment."""
+    gang = bench.gang(nodes=1)
+    request = bench.engine.plan(gang).request[0]
+    program = tmp_path / "shim.py"
+    program.write_text("import os, time\nif os.fork(): os.wait()\nelse: time.sleep(600)\n")
+    line = [*request.command[:3], str(program), *request.command[4:]]
+    shim = subprocess.Popen(line, env={**request.environment, "MASTER_PORT": "1"}, start_new_session=True)
+    try:
+        [child] = wait_for(lambda: children(shim.pid), 20, "the fork")
+        found = LocalEngine(tmp_path).launch(bench.engine.plan(gang))
+        assert pids(found) == [shim.pid] != [child]
+    finally:
+        end_all(lambda: marked([f"MUSTER_GANG={gang.name}"]))
+        shim.wait()
 
 
 # -- capacity and plan ------------------------------------------------------------------------------------------------
@@ -185,7 +218,7 @@ def test_two_gangs_that_start_at_once_do_not_get_one_port(bench: LocalBench) -> 
 
 def test_the_main_node_is_started_first(bench: LocalBench) -> None:
     handle = bench.launch(bench.gang(nodes=3, main=2))
-    starts = [int(node["start"]) for node in json.loads(handle)["nodes"]]
+    starts = [int(node["start"]) for node in handle.facts["nodes"]]
     first, second, main = pids(handle)
     assert main < first < second or starts[2] < min(starts[:2]), "pids grow until they wrap around"
 
@@ -233,6 +266,7 @@ def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: LocalBen
     gang = bench.gang(nodes=4, commands=[["sh", "-c", each] for each in ("exit 0", "exit 75", "exit 3", "kill -9 $$")])
     status = bench.ended(bench.launch(gang))
     assert [node.exit_code for node in status] == [0, 75, 3, 137]
+    assert [node.cause for node in status] == [Cause.EXIT, Cause.EXIT, Cause.EXIT, Cause.SIGNAL]
     contracts = [node.contract for node in bench.engine.plan(gang).nodes]
     assert [node.address for node in status] == [contract.address for contract in contracts]
 
@@ -240,7 +274,8 @@ def test_how_nodes_ended_is_seen_by_the_engine_that_started_them(bench: LocalBen
 def test_a_supervisor_killed_by_a_signal_ends_with_128_and_its_number(bench: LocalBench) -> None:
     handle = bench.ready(bench.gang(nodes=1))
     os.kill(pids(handle)[0], signal.SIGKILL)
-    assert bench.ended(handle)[0].exit_code == 137
+    [node] = bench.ended(handle)
+    assert (node.exit_code, node.cause) == (137, Cause.SIGNAL)
 
 
 def test_a_new_engine_observes_from_the_handle_alone(bench: LocalBench) -> None:
@@ -248,22 +283,22 @@ def test_a_new_engine_observes_from_the_handle_alone(bench: LocalBench) -> None:
     other = bench.new_engine()
     wait_for(lambda: not other.observe(handle)[1].running, 10, "the end of node 1")
     first, second = other.observe(handle)
-    assert (first.running, first.exit_code) == (True, None)
-    assert (second.running, second.exit_code) == (False, None), "nobody that it knows saw the end"
+    assert (first.phase, first.exit_code) == (NodePhase.RUNNING, None)
+    assert (second.phase, second.cause) == (NodePhase.ENDED, Cause.HOST_LOST), "nobody that it knows saw the end"
     assert bench.outcome(1).exit_code == 4, "but the store knows"
 
 
 def test_a_pid_that_was_given_to_another_process_is_not_taken_for_the_node(bench: LocalBench) -> None:
     handle = bench.ready(bench.gang(nodes=1))
-    state = json.loads(handle)
-    state["nodes"][0]["start"] = "1"
-    assert not bench.new_engine().observe(json.dumps(state))[0].running
+    [node] = handle.facts["nodes"]
+    other = replace(handle, facts={"nodes": [{**node, "start": "1"}]})
+    assert not bench.new_engine().observe(other)[0].running
 
 
 def test_what_a_supervisor_said_before_it_reached_the_store_is_told(bench: LocalBench) -> None:
     raise_epoch(bench.run, 5)
     status = bench.ended(bench.launch(bench.gang(nodes=1, epoch=4)))
-    assert (status[0].exit_code, status[0].detail) == (
+    assert (status[0].exit_code, status[0].words) == (
         3,
         "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving",
     )
@@ -341,7 +376,7 @@ def test_nothing_is_kept_of_a_gang_that_was_stopped(bench: LocalBench) -> None:
     bench.ended(handles[2])
     for handle in handles:
         bench.engine.stop(handle, 5.0)
-    assert bench.engine.observe(handles[2])[0].detail.startswith("muster supervisor: run run: this attempt has epoch 4")
+    assert bench.engine.observe(handles[2])[0].words.startswith("muster supervisor: run run: this attempt has epoch 4")
     assert list((bench.home / "home" / "supervisors").iterdir()) == []
     assert not bench.engine._children
 

@@ -11,12 +11,12 @@ import pytest
 
 from orchestrator.cli.jobs import submit_spec
 from orchestrator.client import Client
-from orchestrator.definition import compile_definition, compile_submission
-from orchestrator.engines.base import Gang, Plan
-from orchestrator.engines.local import LocalEngine
-from orchestrator.errors import ApiError, SpecError
+from orchestrator.domain.errors import ApiError, SpecError
+from orchestrator.engines.api import Gang, Plan
+from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.server import Server
-from orchestrator.spec import validate
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.model import validate
 from shared_store.files import write_json
 from tests.conftest import Serving, run_muster, wait_for
 
@@ -51,7 +51,7 @@ def test_the_whole_command_is_there_however_narrow_the_terminal(server: Serving)
 def test_a_plan_is_made_of_what_a_submission_would_be_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, given = LocalEngine.plan, []
 
-    def noted(engine: LocalEngine, gang: Gang) -> Plan:
+    def noted(engine: LocalEngine, gang: Gang) -> Plan[Any]:
         given.append(gang)
         return plan(engine, gang)
 
@@ -147,3 +147,36 @@ def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment
         elastic = compile_definition(validate({**document, "nodes": {"min": 1, "max": 3}}, "job.yaml"), "/")
         plan = client.post("/api/plan", {"definition": elastic, "queue": "small"})
     assert (plan["computeEnvironment"], len(plan["nodes"])) == ("small", 2), "as many nodes as 1 CPU has room for"
+
+
+def test_an_option_of_an_engine_that_is_misspelt_is_refused_when_the_tag_is_made(inside: Server) -> None:
+    def refused(operation: str, **request: Any) -> str:
+        with pytest.raises(ApiError) as refusal:
+            client.batch(operation, **request)
+        assert refusal.value.status == 400
+        return str(refusal.value)
+
+    arn = "arn:aws:batch:us-east-1:000000000000:"
+    with Client(inside.url) as client:
+        tags = {"muster:engine": "slurm", "muster:partiton": "gpu"}
+        slurm = {"computeEnvironmentName": "cluster", "type": "UNMANAGED"}
+        said = refused("CreateComputeEnvironment", **slurm, tags=tags)
+        assert (
+            "muster:partiton: a compute environment of the slurm engine has no such option; did you mean part" in said
+        )
+        assert "no such engine; did you mean slurm?" in refused(
+            "CreateComputeEnvironment", **slurm, tags={"muster:engine": "slrum"}
+        )
+        client.batch("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slurm", "muster:partition": "gpu"})
+        tagged = refused("TagResource", resourceArn=f"{arn}compute-environment/cluster", tags={"muster:nice": "low"})
+        assert "tag muster:nice is 'low', not a whole number" in tagged
+        night = {"jobQueueName": "night", "priority": 1}
+        night["computeEnvironmentOrder"] = [{"order": 1, "computeEnvironment": "cluster"}]  # type: ignore[assignment]
+        assert "did you mean qos?" in refused("CreateJobQueue", **night, tags={"muster:qs": "low"})
+        assert "no such option" in refused("CreateJobQueue", **night, tags={"muster:hosts": "a"})
+        client.batch("CreateJobQueue", **night, tags={"muster:qos": "low", "muster:images": "refuse", "owner": "me"})
+        queue = f"{arn}job-queue/night"
+        assert "did you mean time?" in refused("TagResource", resourceArn=queue, tags={"muster:tme": "8:00:00"})
+        client.batch("TagResource", resourceArn=queue, tags={"muster:time": "8:00:00"})
+        kept = {"muster:qos": "low", "muster:images": "refuse", "owner": "me", "muster:time": "8:00:00"}
+        assert client.batch("ListTagsForResource", resourceArn=queue)["tags"] == kept

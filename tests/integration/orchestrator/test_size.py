@@ -11,12 +11,12 @@ from sqlalchemy import event, func, select
 
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
-from orchestrator.api.limits import LARGEST_COMMANDS
-from orchestrator.api.log_streams import newest_streams
+from orchestrator.api.http.limits import LARGEST_COMMANDS
+from orchestrator.api.logs.streams import newest_streams
 from orchestrator.api.permissions import Identity, current_identity
-from orchestrator.database import Database
+from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.session import Database
 from orchestrator.server import Server
-from orchestrator.tables import Attempt, Job
 from shared_store.layout import Store
 from tests.conftest import wait_for
 from tests.support.orchestrator.rows import job
@@ -162,7 +162,7 @@ def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of
     with database.session() as session:
         session.add(job("array", kind="array"))
         for index in range(3):
-            attempt = Attempt(number=1, epoch=1, nodes=[{"index": 0, "host": "h"}])
+            attempt = Attempt(number=1, epoch=1, nodes=[Node(index=0, host="h")])
             session.add(
                 job(f"array:{index}", run=f"array-{index}", parent="array", node_properties=None, attempts=[attempt])
             )

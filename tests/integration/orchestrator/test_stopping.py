@@ -21,7 +21,7 @@ ASLEEP = "import os, time; print('pid', os.getpid(), os.getppid(), flush=True); 
 
 
 def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orchestrator.gangs.GRACE", 1.0)
+    monkeypatch.setattr("orchestrator.control.attempts.GRACE", 1.0)
     server = Server(tmp_path, port=0, cpus=2)
     server.start()
     try:

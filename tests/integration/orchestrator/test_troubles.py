@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import itertools
 import os
 import re
 import shutil
@@ -12,6 +12,7 @@ import socket
 import sqlite3
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,16 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator import disk
 from orchestrator.client import Client
-from orchestrator.database import Database, DatabaseError
-from orchestrator.engines.local import LocalEngine
-from orchestrator.engines.ray import RayEngine
-from orchestrator.errors import ApiError, ServerError
+from orchestrator.control import disk
+from orchestrator.domain.errors import ApiError, ServerError
+from orchestrator.engines.api import Handle
+from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.home import HomeLock
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from orchestrator.tables import Job
 from tests.conftest import submit_gang, wait_for
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail
 from tests.support.orchestrator.rows import job
@@ -96,21 +98,17 @@ def ended(inside: Server) -> tuple[str, str]:
     return jobs
 
 
-@pytest.mark.parametrize(
-    ("column", "value"),
-    [("node_properties", "{broken"), ("node_properties", "null"), ("node_properties", "[]"), ("nodes", "[1]")],
-)
+@pytest.mark.parametrize("value", ["{broken", "null", "[]"])
 def test_a_damaged_row_answers_for_itself_alone(
-    inside: Server, http: httpx.Client, ended: tuple[str, str], column: str, value: str
+    inside: Server, http: httpx.Client, ended: tuple[str, str], value: str
 ) -> None:
     broken, whole = ended
     home = Path(str(inside.controller.database.volume))
-    table, key = ("jobs", "id") if column == "node_properties" else ("attempts", "job_id")
-    [[kept]] = change(home, f"SELECT {column} FROM {table} WHERE {key} = ?", broken)
+    [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", broken)
     asked = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
     run = http.get(f"/api/jobs/{broken}").json()["run"]
     before = http.post("/v1/describejobs", json={"jobs": [whole]}).json()["jobs"]
-    change(home, f"UPDATE {table} SET {column} = ? WHERE {key} = ?", value, broken)
+    change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", value, broken)
     try:
         answer = http.post("/v1/listjobs", json=asked)
         assert answer.status_code == 200, answer.text
@@ -125,14 +123,13 @@ def test_a_damaged_row_answers_for_itself_alone(
             assert each["statusReason"].endswith("; the job's row in the database is damaged")
         pages = [http.get(f"/api/jobs/{broken}")]
         pages.append(http.post("/v1/listjobs", json={"multiNodeJobId": broken, "jobStatus": "SUCCEEDED"}))
-        if column == "node_properties":
-            pages.append(http.get(f"/api/jobs/{broken}/logs"))
+        pages.append(http.get(f"/api/jobs/{broken}/logs"))
         for page in pages:
             said = f"job broken ({broken[:8]}): the job's row in the database is damaged; submit the job again"
             assert (page.status_code, page.json()["message"]) == (409, said)
         assert all(http.get(f"/api/{path}").status_code == 200 for path in (f"jobs/{whole}", "runs", f"runs/{run}"))
     finally:
-        change(home, f"UPDATE {table} SET {column} = ? WHERE {key} = ?", kept, broken)
+        change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, broken)
 
 
 def test_a_job_whose_definition_is_gone_from_the_database_answers_for_itself_alone(
@@ -287,15 +284,17 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     engine = RayEngine.__new__(RayEngine)  # no cluster is needed for what gangs hold
     engine.home, engine._lock, engine._grown = tmp_path, threading.Lock(), {}
     stop = threading.Event()
+    handles = (Handle("ray", f"job{number}/1/1", 1, {"hosts": ["ray/+1"]}) for number in itertools.count(1))
+    stopped: list[Handle] = []
 
     def hold_and_stop() -> None:
-        number = 0
+        held: deque[Handle] = deque()
         while not stop.is_set():
-            number += 1
-            engine._note({"ray": f"job{number}/1/1", "hosts": ["ray/+1"]})
-            if number > 20:
-                with contextlib.suppress(KeyError):
-                    engine.stop(json.dumps({"ray": f"job{number - 20}/1/1", "hosts": ["ray/+1"]}), 0)
+            held.append(next(handles))
+            engine._note(held[-1])
+            if len(held) > 20:
+                engine.stop(held[0], 0)
+                stopped.append(held.popleft())
 
     thread = threading.Thread(target=hold_and_stop)
     thread.start()
@@ -306,6 +305,7 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     finally:
         stop.set()
         thread.join()
+    assert stopped, "while the machines were looked at"
 
 
 def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobody(

@@ -16,9 +16,9 @@ import pytest
 from sqlalchemy import select
 
 from orchestrator.client import Client
-from orchestrator.jobs import Status
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Job, WebhookDelivery
 from orchestrator.server import Server
-from orchestrator.tables import Job, WebhookDelivery
 from tests.conftest import Serving, call_muster, submit_gang
 from tests.support.orchestrator import rows
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks

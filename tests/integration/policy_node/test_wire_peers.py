@@ -172,7 +172,7 @@ def test_what_the_node_says_is_read_by_another_cdr_reader_and_has_rmw_zenoh_s_at
     assert list(message.velocity) == [] and message.header.stamp.sec > 0
 
 
-def test_wrong_messages_are_told_in_a_line_and_the_node_survives_them(running: Running) -> None:
+def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(running: Running) -> None:
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="confused")
         wrong = node.publisher("joint_states", TWIST)
@@ -220,13 +220,15 @@ def test_a_silent_robot_is_told_and_a_reset_begins_a_fresh_episode_and_the_end_u
         )
         reset, states = node.publisher("/muster_policy/reset", EMPTY), node.publisher("joint_states", JOINT_STATE)
 
-        def diagnosed() -> bool:
-            states.publish(joint_state(0.1))
+        def diagnosed(acting: bool) -> bool:
+            if acting:
+                states.publish(joint_state(0.1))
             time.sleep(0.02)
-            return bool(diagnoses) and diagnoses[-1].status[0].message == "acting"
+            return bool(diagnoses) and (diagnoses[-1].status[0].message == "acting") is acting
 
-        wait_for(diagnosed, 20, "a diagnosis of the acting node")
-        assert any("all inputs are there" in line for line in said), "and /rosout has the lines"
+        wait_for(lambda: diagnosed(False), 20, "the end of what the tests before sent")
+        wait_for(lambda: diagnosed(True), 20, "a diagnosis of the acting node")
+        wait_for(lambda: any("all inputs are there" in line for line in said), 20, "the line on /rosout")
         reset.publish(MESSAGES.make(EMPTY, structure_needs_at_least_one_member=0))
 
         def told(sample: zenoh.Sample) -> None:
@@ -243,7 +245,7 @@ def test_a_silent_robot_is_told_and_a_reset_begins_a_fresh_episode_and_the_end_u
         node.close()
 
 
-def test_a_port_that_is_taken_and_a_router_that_is_not_there_are_one_line(tmp_path: Path) -> None:
+def test_a_taken_port_and_a_missing_router_are_reported_in_one_line(tmp_path: Path) -> None:
     bundle = write_bundle(tmp_path / "bundle", contract(SPEED), np.array([[1.0], [0.0]]))
     command = [sys.executable, "-m", "muster_policy.cli", str(bundle)]
     env = {**os.environ, "PYTHONPATH": str(REPOSITORY / "policy_node")}

@@ -69,7 +69,7 @@ def known(shim: subprocess.Popen[str], group: str) -> NodeProcesses:
 
 
 @pytest.mark.parametrize(("end", "code"), [("exit 0", 0), ("exit 75", 75), ("kill -9 $$", 137), ("kill -TERM $$", 143)])
-def test_what_escaped_is_gone_when_the_supervisor_has_ended(group: str, pids: Path, end: str, code: int) -> None:
+def test_escaped_processes_are_gone_when_the_supervisor_has_ended(group: str, pids: Path, end: str, code: int) -> None:
     shim = start(ESCAPE.format(pids=pids) + end, group)
     assert shim.wait(20 * PATIENCE) == code
     assert len(read(pids)) == 2 and not any(alive(pid) for pid in read(pids))
@@ -82,7 +82,7 @@ def test_a_child_that_kills_its_parent_does_not_outlive_it(group: str, pids: Pat
     assert not any(alive(pid) for pid in read(pids))
 
 
-def test_the_node_ends_when_what_its_shim_is_tied_to_dies(group: str, pids: Path) -> None:
+def test_the_node_ends_when_its_shim_s_parent_dies(group: str, pids: Path) -> None:
     inner = f"{ESCAPE.format(pids=pids)}exec sleep 600"
     owner = (
         "import os, subprocess, sys; from shared_store.shim import shimmed;"
@@ -162,7 +162,7 @@ def test_a_shim_is_told_apart_from_other_commands_by_its_command_line() -> None:
     assert group_of([b"python", b"-P", b"-m", b"worker.supervisor", b"--", b"sleep", b"1"]) is None
 
 
-def test_what_can_not_be_killed_is_named_and_waited_for(pids: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unkillable_process_is_named_and_waited_for(pids: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shim = start(f"setsid sleep 600 & echo $! >{pids}; while :; do sleep 0.02; done", "")
     node = known(shim, "")
     wait_for(lambda: read(pids), 20, "the process")

@@ -115,7 +115,7 @@ def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: N
     n = node()
     write, least = "import time\nfor i in range(150): print(f'{i:03d}', 'x' * 100, 'end'); time.sleep(0.01)", 5000
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({least}, -1))"
-    main = "import sys; from worker.supervisor import main; sys.exit(main(sys.argv[1:]))"
+    main = "import sys; from worker.node.supervisor import main; sys.exit(main(sys.argv[1:]))"
     # Python itself must write nothing meanwhile: it takes a module that it could cache by half for whole
     n.start(sys.executable, "-uc", write, program=("-c", f"{limit}; {main}"), PYTHONDONTWRITEBYTECODE="1")
     wait_for(lambda: "can't be written" in n.stderr.read_text(), 10, "a refused write")
@@ -131,7 +131,7 @@ def test_when_the_volume_has_room_again_the_log_goes_on_with_whole_lines(node: N
     assert len(other) == 1 and f" {150 - len(numbers)} lines (" in other[0] and "left out" in other[0]
 
 
-def test_of_a_flood_both_ends_are_in_the_log_and_what_is_between_is_counted(node: Nodes) -> None:
+def test_a_flooded_log_keeps_both_ends_and_counts_the_middle(node: Nodes) -> None:
     n = node(log_limit=1 << 20)
     assert n.python("for i in range(60_000): print(f'{i:020d}')\nraise SystemExit('the error')") == 1
     output = [text for text in n.output() if text.isdigit()]
@@ -224,7 +224,7 @@ def test_a_rank_that_reads_its_standard_input_finds_it_at_its_end(node: Nodes) -
 @pytest.mark.parametrize(
     ("command", "problem"), [("no-such-program", "No such file or directory"), ("/tmp", "Permission denied")]
 )
-def test_a_command_that_can_not_be_started_is_told_with_what_to_do(node: Nodes, command: str, problem: str) -> None:
+def test_a_command_that_can_not_be_started_is_reported_with_a_remedy(node: Nodes, command: str, problem: str) -> None:
     n = node(ranks_per_node=2)
     assert n.call(command, "argument") == 127
     reason = f"can't start {command!r}: {problem}; is it installed, and is the path right?"
@@ -249,7 +249,7 @@ def test_a_command_that_can_not_be_started_is_told_with_what_to_do(node: Nodes, 
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )
-def test_a_broken_contract_is_told_in_one_line(
+def test_a_broken_contract_is_reported_in_one_line(
     node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str
 ) -> None:
     n = node()
@@ -263,7 +263,7 @@ def test_a_broken_contract_is_told_in_one_line(
     assert not (tmp_path / "started").exists()
 
 
-def test_a_damaged_epoch_file_is_told_in_one_line(node: Nodes) -> None:
+def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
     n = node()
     (n.run.path / "EPOCH").write_text("")
     assert n.call("true") == 2
@@ -273,7 +273,7 @@ def test_a_damaged_epoch_file_is_told_in_one_line(node: Nodes) -> None:
     )
 
 
-def test_a_store_that_is_not_the_controllers_is_told_before_anything_starts(node: Nodes, tmp_path: Path) -> None:
+def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: Nodes, tmp_path: Path) -> None:
     n = node(epoch=3)
     (tmp_path / "other" / "runs").mkdir(parents=True)
     assert n.call("touch", str(tmp_path / "started"), MUSTER_STORE=str(tmp_path / "other")) == 2
@@ -285,7 +285,7 @@ def test_a_store_that_is_not_the_controllers_is_told_before_anything_starts(node
 
 
 @pytest.mark.parametrize("arguments", [[], ["--"], ["sleep", "60"]])
-def test_a_wrong_call_is_told_how_it_is_called(arguments: list[str]) -> None:
+def test_a_wrong_call_prints_the_usage(arguments: list[str]) -> None:
     command = [sys.executable, "-P", "-m", "worker.supervisor", *arguments]
     called = subprocess.run(command, capture_output=True, text=True, timeout=20)
     assert (called.returncode, called.stderr) == (2, "usage: python -m worker.supervisor -- COMMAND [ARG …]\n")

@@ -22,7 +22,7 @@ from tests.support.worker.node import Nodes
 # -- ends -------------------------------------------------------------------------------------------------------------
 
 
-def test_an_exception_is_told_with_its_traceback(node: Nodes) -> None:
+def test_an_exception_is_reported_with_its_traceback(node: Nodes) -> None:
     n = node()
     script = "import sys\nprint('a warning', file=sys.stderr)\ndef f():\n    raise ValueError('bad reward')\nf()"
     assert n.python(script) == 1
@@ -51,7 +51,7 @@ def test_without_a_traceback_the_last_line_on_standard_error_is_the_error(node: 
     assert (outcome.error.message, outcome.error.traceback) == ("fatal: no such device", "")  # type: ignore[union-attr]
 
 
-def test_a_silent_failure_is_told_by_its_code(node: Nodes) -> None:
+def test_a_silent_failure_is_reported_by_its_code(node: Nodes) -> None:
     n = node()
     assert n.shell("exit 9") == 9
     assert (n.ended().reason, n.ended().error) == ("rank 0 exited with code 9", None)
@@ -108,7 +108,7 @@ def test_an_error_file_that_can_not_be_used_costs_neither_the_exit_code_nor_time
     assert ended.reason == f"rank 0 exited with code 7: {ended.error.message}"
 
 
-def test_what_a_program_writes_to_the_progress_pipe_never_ends_its_supervisor(node: Nodes) -> None:
+def test_no_message_on_the_progress_pipe_ends_the_supervisor(node: Nodes) -> None:
     n = node(stall_timeout=600.0)
     lines = [
         "[1]",
@@ -155,7 +155,7 @@ def test_torch_s_own_record_decorator_reports_through_the_supervisor(node: Nodes
 
 
 @pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (11, "SIGSEGV"), (15, "SIGTERM"), (40, "signal 40")])
-def test_a_rank_killed_by_a_signal_is_told_by_its_name(node: Nodes, number: int, name: str) -> None:
+def test_a_rank_killed_by_a_signal_is_reported_by_the_signal_s_name(node: Nodes, number: int, name: str) -> None:
     n = node()
     assert n.shell(f"kill -{number} $$") == 128 + number
     outcome = n.ended()
@@ -199,7 +199,7 @@ def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node:
 
 def test_a_rank_that_does_not_heed_the_failure_of_another_is_killed(node: Nodes) -> None:
     n = node(ranks_per_node=2)
-    main = "import sys, worker.supervisor as s; s._PEER_GRACE = 0.5; sys.exit(s.main(sys.argv[1:]))"
+    main = "import sys, worker.node.supervisor as s; s._PEER_GRACE = 0.5; sys.exit(s.main(sys.argv[1:]))"
     script = 'if [ $RANK = 0 ]; then sleep 0.5; exit 3; fi; trap "" TERM; while :; do sleep 0.1; done'
     n.start("sh", "-c", script, program=("-c", main))
     assert n.wait() == 3
@@ -280,7 +280,7 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
         "import os, sys\n"
         "from shared_store.contract import NodeContract\n"
         "from shared_store.layout import Store\n"
-        "from worker.supervisor import Supervisor\n"
+        "from worker.node.supervisor import Supervisor\n"
         "contract = NodeContract.from_env(os.environ)\n"
         "supervisor = Supervisor(contract, Store(contract.store).run(contract.run), sys.argv[2:])\n"
         "supervisor.stop('asked to leave', contract.grace)\n"
@@ -293,7 +293,7 @@ def test_a_request_that_comes_before_the_ranks_are_started_is_not_forgotten(node
 # -- the job's own environment ----------------------------------------------------------------------------------------
 
 
-def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_what_supervises_it(node: Nodes, tmp_path: Path) -> None:
+def test_a_job_s_variables_take_effect_in_its_ranks_and_not_in_its_supervisor(node: Nodes, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "queue.py").write_text("MINE = True\n")
     job = {

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator import specfile
-from orchestrator.definition import compile_definition
+from orchestrator.spec import file as specfile
+from orchestrator.spec.compile import compile_definition
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
 from tests.conftest import Serving, wait_for

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.bus import Bus, BusError
+from orchestrator.control.bus import Bus, BusError
 from shared_store.bus import LONGEST_ANSWER
 from shared_store.contract import NodeContract
 from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
 from tests.support.processes import gang_members, processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 from tests.support.worker.node import node_contract
-from worker.bus import NodeBus
+from worker.node.bus import NodeBus
 
 NODE = """
 import os, sys, time
 from shared_store.contract import NodeContract
-from worker.bus import NodeBus
+from worker.node.bus import NodeBus
 read, write = os.pipe2(os.O_NONBLOCK)
 bus = NodeBus(NodeContract(job="j", attempt=1, node_index={index}, node_count=2, main_index=0, master_address="127.0.0.1",
     master_port=1, run="r", store="/", epoch=1, job_epoch=1, bus={endpoint!r}, bus_token={token!r}), write)
@@ -115,7 +115,7 @@ def test_an_answer_that_is_too_long_for_the_router_comes_in_part(bus: Bus) -> No
 
 def test_publishing_never_waits_for_a_router_that_hangs(tmp_path: Path) -> None:
     """With blocking congestion control a slow reader stops the writer for seconds; ours drops."""
-    script = f"import sys, time; from pathlib import Path; from orchestrator.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token('j', 1), flush=True); time.sleep(60)"
+    script = f"import sys, time; from pathlib import Path; from orchestrator.control.bus import Bus; b = Bus(Path({str(tmp_path)!r})); b.open(); print(b.endpoint, b.token('j', 1), flush=True); time.sleep(60)"
     router = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True)
     assert router.stdout is not None
     endpoint, token = router.stdout.readline().split()

@@ -7,10 +7,12 @@ import os
 import signal
 from pathlib import Path
 
-from orchestrator import specfile
-from orchestrator.definition import compile_definition, gang_needs
-from orchestrator.engines.base import Gang, Placement
-from orchestrator.engines.local import LocalEngine
+from orchestrator.domain.gang import gang_needs
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Gang
+from orchestrator.engines.local.engine import LocalEngine
+from orchestrator.spec import file as specfile
+from orchestrator.spec.compile import compile_definition
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
@@ -37,7 +39,7 @@ def gang(store: Store, job: str, epoch: int) -> Gang:
         run="r",
         commands=[node.command],
         environments=[node.environment],
-        placements=[Placement("localhost", (), node.cpus, node.memory)],
+        placements=[Placement("localhost", (), node.resources.cpus, node.resources.memory)],
         grace=30.0,
         directory=str(REPOSITORY),
     )

@@ -212,7 +212,7 @@ def test_mounts_differ_from_world_to_world_within_their_limits(context: SensorCo
     assert np.array_equal(later[0], found[1]), "a world's mount does not depend on its rank"
 
 
-def test_a_mount_may_be_drawn_anew_by_each_episode(context: SensorContext) -> None:
+def test_each_episode_may_draw_a_new_mount(context: SensorContext) -> None:
     turn(context, (0.0, 0.0), (0.0, 0.0))
     drawn = camera(context, body="arm", position_range=0.1, redraw=True)
     take(context, drawn, ages=(0, 0))

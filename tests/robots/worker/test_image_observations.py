@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from orchestrator.settings import effective_problem
-from orchestrator.spec import validate
+from orchestrator.spec.model import validate
+from orchestrator.spec.settings import effective_problem
 from shared_store.checkpoints import list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store
@@ -190,7 +190,7 @@ def test_a_policy_may_see_an_image_alone() -> None:
     assert described(alone)["policy"]["sensor"] == "front"
 
 
-def test_the_list_of_tasks_says_what_images_are() -> None:
+def test_the_list_of_tasks_describes_images() -> None:
     told = describe(NAME, whole=True)
     words = "2 x color of 16 x 12 bytes, the present one first"
     assert told["observations"] == ["rail_velocity", f"camera: {words}"]

@@ -157,7 +157,7 @@ def test_impossible_settings_are_refused_in_one_line() -> None:
             configure(LiftCubes, {"config": {"cubes": cubes}})
 
 
-def test_a_selection_of_what_is_not_there_or_fixed_is_refused_in_one_line() -> None:
+def test_a_selection_of_missing_or_fixed_parts_is_refused_in_one_line() -> None:
     class Wrong(LiftCubes):
         selected = "cubs"
 

@@ -81,7 +81,7 @@ def test_the_tutorials_jobs_fit_the_example() -> None:
     assert sketch.plan.numbers.values[sketch.plan.numbers.places["rewards.upright.target"][0]] == 3.0
 
 
-def test_what_a_wrong_number_says(tmp_path: Path) -> None:
+def test_the_page_s_error_for_a_wrong_parameter_is_the_real_one(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
 
     class Pendulum(page.Pendulum):  # type: ignore[name-defined,misc]

@@ -47,7 +47,7 @@ class Everything(Quadruped):
         return dataclasses.replace(super().declare(config), observations=shown)
 
 
-def test_the_contract_says_where_things_are_measured_and_what_is_of_the_library() -> None:
+def test_the_contract_names_frames_of_measurement_and_library_functions() -> None:
     """As the files of the robots have it: the Go1's unit sits on the trunk, to the right; the quadruped's centre of mass is its origin."""
     task = find_task("Go1Flat")
     (group, *_) = policy_contract(task(task.config_type(), 1), "Go1Flat").groups

@@ -187,7 +187,7 @@ def test_a_resumed_run_goes_on_bit_for_bit() -> None:
         np.testing.assert_array_equal(got[name], expected[name], err_msg=name)
 
 
-def test_a_captured_step_does_what_its_launches_do() -> None:
+def test_a_captured_step_equals_its_launches() -> None:
     results = []
     for captured in (False, True):
         worlds, view = build_arm()
@@ -376,7 +376,7 @@ def test_a_declaration_that_can_not_be_is_refused(what: str, options: dict[str, 
         (Randomize("effort_limit", actuators="*", range=(1.0, 2.0)), "joint elbow of robot's actuator is not limited"),
     ],
 )
-def test_a_part_that_is_not_there_is_refused_with_the_entrys_name(entry: Randomize, message: str) -> None:
+def test_a_missing_part_is_refused_with_the_entrys_name(entry: Randomize, message: str) -> None:
     worlds, view = build_arm()
     with pytest.raises(ValueError) as error:
         randomize({"mine": entry}, worlds, view)

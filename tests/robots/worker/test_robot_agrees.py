@@ -83,7 +83,7 @@ def test_the_compiled_model_is_mujocos(robot: Robot):
 
 
 @pytest.mark.parametrize("height", [0.32, 0.26], ids=["above", "on the ground"])
-def test_only_what_touches_is_a_contact(height: float):
+def test_only_touching_geoms_are_contacts(height: float):
     need_mjlab()
     template, worlds = build(GO1)
     view = RobotView(template)

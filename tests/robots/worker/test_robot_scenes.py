@@ -221,7 +221,7 @@ def some(*pairs: str) -> set[frozenset[str]]:
     return {frozenset(pair.split("-")) for pair in pairs}
 
 
-def test_who_touches_whom():
+def test_collision_pairs_of_robots_and_objects():
     def fingers(**options) -> Robot:
         return Robot(FINGERS, actuators=(SERVO,), **options)
 

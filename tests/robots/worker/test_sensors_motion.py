@@ -259,7 +259,7 @@ def walking() -> SensorContext:
     return scene({"robot": walker()}, 1)
 
 
-def test_an_imu_on_what_is_fixed_to_the_world_is_refused() -> None:
+def test_an_imu_on_a_body_fixed_to_the_world_is_refused() -> None:
     context = scene({"robot": swing().replace('<body name="base"', '<site name="post"/><body name="base"')}, 1)
     with pytest.raises(ValueError, match="Imu: post is fixed to the world, so that it never moves"):
         Imu(site="post").build(context)

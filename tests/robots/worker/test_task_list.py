@@ -49,7 +49,7 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
     assert re.search(r"^Quadruped +48 +12 +50 Hz +20 s +track_linear 2", table, re.M)
 
 
-def test_one_task_is_told_by_name_and_a_wrong_name_in_one_line(tmp_path: Path) -> None:
+def test_one_task_is_described_by_name_and_a_wrong_name_is_refused_in_one_line(tmp_path: Path) -> None:
     own = run_muster("tasks", OWN, home=tmp_path).stdout
     assert "cosine, sine, velocity" in own and "upright 1" in own and "hinge" in own
     wrong = run_muster("tasks", "Quadrupet", home=tmp_path)  # which imports nothing

@@ -75,7 +75,7 @@ def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> Non
     assert all(place in text for place in found["numbers"])
 
 
-def test_a_name_that_there_is_no_task_of_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_task_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["LiftCub"]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1

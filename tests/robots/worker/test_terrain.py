@@ -197,7 +197,7 @@ def test_the_default_is_the_rough_terrain_of_others() -> None:
         (lambda: Stairs(platform=-1.0), ["Stairs.platform is -1.0"]),
     ],
 )
-def test_what_cannot_be_built_is_refused_in_one_line(build: Any, parts: list[str]) -> None:
+def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: list[str]) -> None:
     with pytest.raises(ValueError) as refused:
         build()
     assert "\n" not in str(refused.value)

@@ -205,7 +205,7 @@ def test_the_contract_has_the_scales_and_offsets_of_the_robot(name: str) -> None
     assert {joint: home[joint] for joint in wanted} == pytest.approx(wanted)
 
 
-def test_the_contract_names_what_was_commanded(tasks: dict[str, Velocity]) -> None:
+def test_the_contract_names_the_commands(tasks: dict[str, Velocity]) -> None:
     interface = tasks["Go1Flat"].interface()
     assert interface is not None
     commands = [each for each in interface.observations if each.kind == "command"]

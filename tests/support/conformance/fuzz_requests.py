@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from orchestrator.api import logs, paging
 from orchestrator.api.arns import PREFIX
+from orchestrator.api.batch import paging
+from orchestrator.api.logs import operations as logs
 
 _DEEP = tuple('{"a":' * depth + "1" + "}" * depth for depth in (90, 300, 900, 3000))
 ODD_TEXTS = (

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 from tests.conftest import MUSTER, Serving
 from tests.support.conformance import fuzz_requests as good
 from tests.support.conformance.fuzzing import Call

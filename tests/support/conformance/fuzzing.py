@@ -13,8 +13,9 @@ from urllib.parse import quote
 import botocore.session
 from hypothesis import strategies as st
 
-from orchestrator.api import batch, logs
 from orchestrator.api.arns import PREFIX
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.logs import operations as logs
 from tests.support.conformance.fuzz_requests import ARRAYS, CHANGES, GOOD, KNOWN, NUMBERS, ODD_TEXTS
 
 TAGS = ("TagResource", "UntagResource", "ListTagsForResource")

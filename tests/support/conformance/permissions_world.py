@@ -8,12 +8,12 @@ from typing import Any
 
 import httpx
 
-from orchestrator.api import logs
+from orchestrator.api.logs import operations as logs
 from orchestrator.api.permissions import Operation
 from orchestrator.client import Client
-from orchestrator.definition import compile_definition, compile_submission
 from orchestrator.keys import KeyStore
-from orchestrator.spec import validate
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.model import validate
 from shared_store import leagues, models
 from shared_store.bundles import seal
 from shared_store.checkpoints import Checkpoint

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from orchestrator.engines.aws_batch import AwsBatchEngine
-from orchestrator.engines.aws_config import AwsConfig, save_config
-from orchestrator.engines.base import Gang, Placement
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Gang
+from orchestrator.engines.aws_batch.config import AwsConfig, save_config
+from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from shared_store.layout import Store
 from tests.conftest import Serving
 from tests.support.engines.bench import Bench

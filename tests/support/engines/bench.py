@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
-from orchestrator.engines.base import Engine, Gang, NodeStatus, NotYet, Placement
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
 from shared_store.epoch import raise_epoch, read_epoch
 from shared_store.layout import Store
 from shared_store.logs import LogFollower, LogLine
@@ -28,7 +29,7 @@ def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -
         "run": "run",
         "store": str(store),
         "queue": "default",
-        "pool": "pool",
+        "compute_environment": "here",
         "main": 0,
         "commands": [["sh", "-c", script]] * nodes,
         "environments": [{"GREETING": "hello"}] * nodes,
@@ -55,7 +56,7 @@ class Bench(ABC):
         if read_epoch(self.run) < 1:
             raise_epoch(self.run, 1)
         self.engine = self.new_engine()
-        self.handles: list[str] = []
+        self.handles: list[Handle] = []
 
     @abstractmethod
     def new_engine(self) -> Engine:
@@ -67,19 +68,19 @@ class Bench(ABC):
         """A gang whose nodes run ``sh -c script``, with ``changes``. ``suffix``: of the job's id, for another job."""
         return make_gang(self.store.path, script, nodes, **{"job": self.job + suffix, **changes})
 
-    def launch(self, gang: Gang, engine: Engine | None = None) -> str:
+    def launch(self, gang: Gang, engine: Engine | None = None) -> Handle:
         """Give the run to the gang and start it, as a controller does; returns the handle."""
         run = self.store.run(gang.run)
         if read_epoch(run) < gang.epoch:
             raise_epoch(run, gang.epoch)
         return self.start(gang, engine)
 
-    def start(self, gang: Gang, engine: Engine | None = None) -> str:
+    def start(self, gang: Gang, engine: Engine | None = None) -> Handle:
         """Start the gang, even where the run is another one's."""
         engine = engine or self.engine
         plan = engine.plan(gang)
 
-        def started() -> str | None:
+        def started() -> Handle | None:
             try:
                 return engine.launch(plan)
             except NotYet as reason:
@@ -87,12 +88,12 @@ class Bench(ABC):
                     return None
                 raise
 
-        handle: str = wait_for(started, 60, "an answer")
+        handle: Handle = wait_for(started, 60, "an answer")
         if handle not in self.handles:
             self.handles.append(handle)
         return handle
 
-    def ready(self, gang: Gang) -> str:
+    def ready(self, gang: Gang) -> Handle:
         """Launch the gang, if that was not done, and wait until every node has said ``ready``; returns the handle."""
         handle = self.launch(gang)
 
@@ -103,7 +104,7 @@ class Bench(ABC):
         wait_for(said, 60, f"{len(gang.commands)} ready nodes")
         return handle
 
-    def ended(self, handle: str, engine: Engine | None = None) -> list[NodeStatus]:
+    def ended(self, handle: Handle, engine: Engine | None = None) -> list[NodeStatus]:
         """Wait until all nodes have ended; returns how."""
 
         def over() -> list[NodeStatus] | None:
@@ -113,7 +114,7 @@ class Bench(ABC):
         found: list[NodeStatus] = wait_for(over, 60, "the gang's end")
         return found
 
-    def stopped(self, handle: str, grace: float = 5.0) -> list[int | None]:
+    def stopped(self, handle: Handle, grace: float = 5.0) -> list[int | None]:
         """Stop the only gang and check that nothing of it is left; returns the exit codes."""
         self.engine.stop(handle, grace)
         self.nothing_is_left()

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from orchestrator.engines.base import Gang, Placement
-from orchestrator.engines.docker import DockerEngine
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Gang
+from orchestrator.engines.docker.engine import DockerEngine
 from tests.support.engines.bench import Bench
 from tests.support.engines.images import PATH, PLAIN, host_files
 from tests.support.engines.sites import WAIT

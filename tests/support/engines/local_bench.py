@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from orchestrator.engines.base import Gang
-from orchestrator.engines.local import LocalEngine
+from orchestrator.engines.api import Gang
+from orchestrator.engines.local.engine import LocalEngine
 from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.processes import end_all

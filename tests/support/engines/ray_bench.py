@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from orchestrator.engines.base import Gang, Placement
-from orchestrator.engines.ray import RayEngine
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Gang, Handle
+from orchestrator.engines.ray.engine import RayEngine
 from tests.support.engines.bench import Bench
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.engines.sites import WAIT
@@ -40,7 +41,7 @@ class RayBench(Bench):
         placements = [Placement(f"ray/{host}", gpus, cpus, 256) for host in hosts]
         return super().gang(script, len(hosts), suffix=suffix, **{"placements": placements, **changes})
 
-    def stopped_there(self, handle: str) -> list[int | None]:
+    def stopped_there(self, handle: Handle) -> list[int | None]:
         """Exit codes of a gang that lost its third node, where that may go on until it ends itself."""
         self.engine.stop(handle, 5.0)
         return [node.exit_code for node in self.engine.observe(handle)][:2]

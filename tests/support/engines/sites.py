@@ -96,7 +96,7 @@ def slurm(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
 @contextlib.contextmanager
 def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
     """A second Muster plays AWS; its nodes write to a volume that the controller does not see."""
-    from orchestrator.engines.aws_config import AwsConfig, save_config
+    from orchestrator.engines.aws_batch.config import AwsConfig, save_config
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):

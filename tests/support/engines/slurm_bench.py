@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.engines.base import Gang, Placement
-from orchestrator.engines.slurm import SlurmEngine
+from orchestrator.domain.hosts import Placement
+from orchestrator.engines.api import Gang, Handle
+from orchestrator.engines.slurm.engine import SlurmEngine
 from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.engines.slurm_cluster import SlurmCluster
@@ -46,18 +46,18 @@ class SlurmBench(Bench):
         }
         return super().gang(script, nodes, suffix=suffix, **{**facts, **changes})
 
-    def ready(self, gang: Gang) -> str:
+    def ready(self, gang: Gang) -> Handle:
         handle = super().ready(gang)
         wait_for(lambda: all(node.address for node in self.engine.observe(handle)), 10, "Slurm says so")
         return handle
 
-    def state(self, handle: str) -> str:
-        number = json.loads(handle)["slurm"]
+    def state(self, handle: Handle) -> str:
+        number = handle.facts["slurm"]
         return self.cluster.run("squeue", "-h", "-t", "all", "-j", number, "-o", "%T")
 
-    def saved(self, handle: str) -> None:
+    def saved(self, handle: Handle) -> None:
         """Wait until slurmctld has saved that the job runs: it does so every few seconds, and forgets the rest when it is killed."""
-        number, state = json.loads(handle)["slurm"], self.cluster.home / "state" / "job_state"
+        number, state = handle.facts["slurm"], self.cluster.home / "state" / "job_state"
         asked = time.time()
         self.cluster.run("scontrol", "update", f"jobid={number}", "admincomment=seen")
         wait_for(lambda: state.exists() and state.stat().st_mtime > asked, 30, "the state is saved")

@@ -7,8 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from orchestrator import specfile
-from orchestrator.definition import compile_definition, compile_submission
+from orchestrator.spec import file as specfile
+from orchestrator.spec.compile import compile_definition, compile_submission
 from tests.conftest import REPOSITORY, Serving
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 from tests.conftest import submit_gang, wait_for
 from tests.support.faults.home import Home
 from tests.support.processes import end_all, processes_of_job

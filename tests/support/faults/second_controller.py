@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.client import Client
-from orchestrator.errors import ApiError
+from orchestrator.domain.errors import ApiError
 from tests.conftest import wait_for
 from tests.support.faults.home import Home
 from tests.support.processes import end_all

@@ -1,13 +1,15 @@
-"""A controller with its server in the test's own process, where a test may look inside."""
+"""A controller with its server in the test's own process, where a test may look inside; databases on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
 
 from orchestrator.server import Server
+from tests.support.orchestrator import postgres
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +25,20 @@ def inside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def http(inside: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=inside.url, timeout=60) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[postgres.Server]:
+    binaries = postgres.programs()
+    if binaries is None:
+        pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
+    with postgres.serving(binaries) as running:
+        yield running
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A database without tables, on each kind of server."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'muster.db'}"
+    return str(request.getfixturevalue("postgresql").new_database())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.tables import Job
+from orchestrator.persistence.models import Job
 
 NODES = {
     "numNodes": 2,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from orchestrator.engines.base import Host, Placement
-from orchestrator.scheduling import (
-    Decisions,
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.resources import Resources
+from orchestrator.scheduling.decide import Decisions
+from orchestrator.scheduling.snapshot import (
+    ComputeEnvironment,
     FairShare,
     Leading,
-    NodeShape,
-    Pool,
     Queue,
     Running,
-    Shape,
     Snapshot,
     TimeLimit,
     Waiting,
@@ -28,11 +28,11 @@ def host(name: str = "a", cpus: float = 4, gpus: int = 0, memory: int = 8192) ->
     return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), memory)
 
 
-def node(cpus: float = 1, gpus: int = 0, memory: int = 100) -> NodeShape:
-    return NodeShape(cpus, gpus, memory)
+def node(cpus: float = 1, gpus: int = 0, memory: int = 100) -> Resources:
+    return Resources(cpus, gpus, memory)
 
 
-def gang(*nodes: NodeShape, minimum: int | None = None) -> Shape:
+def gang(*nodes: Resources, minimum: int | None = None) -> Shape:
     return Shape(nodes, len(nodes) if minimum is None else minimum, 0)
 
 
@@ -66,7 +66,7 @@ def running(
     queue: str = "default",
     share: str | None = None,
     priority: int = 0,
-    pool: str = "all",
+    compute_environment: str = "all",
     for_seconds: int = 100,
     timeout: int | None = None,
     preemptible: bool = False,
@@ -74,7 +74,17 @@ def running(
 ) -> Running:
     started = NOW - 1000 * for_seconds
     return Running(
-        f"{name}-0123456789", name, queue, share, priority, pool, placements, started, timeout, preemptible, ending
+        f"{name}-0123456789",
+        name,
+        queue,
+        share,
+        priority,
+        compute_environment,
+        placements,
+        started,
+        timeout,
+        preemptible,
+        ending,
     )
 
 
@@ -85,17 +95,17 @@ def on(name: str, cpus: float = 0, gpus: Iterable[int] = (), memory: int = 0) ->
 def queue(
     name: str = "default",
     priority: int = 1,
-    pools: tuple[str, ...] = ("all",),
+    compute_environments: tuple[str, ...] = ("all",),
     policy: FairShare | None = None,
     limits: tuple[TimeLimit, ...] = (),
 ) -> Queue:
-    return Queue(name, priority, pools, policy, limits)
+    return Queue(name, priority, compute_environments, policy, limits)
 
 
-def pool(
+def compute_environment(
     name: str = "all", hosts: tuple[str, ...] | None = None, enabled: bool = True, max_cpus: float | None = None
-) -> Pool:
-    return Pool(name, enabled, hosts, max_cpus)
+) -> ComputeEnvironment:
+    return ComputeEnvironment(name, enabled, hosts, max_cpus)
 
 
 def snapshot(
@@ -103,14 +113,14 @@ def snapshot(
     waiting: Sequence[Waiting],
     held: Sequence[Running] = (),
     queues: Sequence[Queue] = (),
-    pools: Sequence[Pool] = (),
+    compute_environments: Sequence[ComputeEnvironment] = (),
     usage: Mapping[tuple[str, str], float] | None = None,
     leading: Mapping[str, Leading] | None = None,
 ) -> Snapshot:
     return Snapshot(
         now=NOW,
         hosts=hosts,
-        pools={each.name: each for each in pools or [pool()]},
+        compute_environments={each.name: each for each in compute_environments or [compute_environment()]},
         queues={each.name: each for each in queues or [queue()]},
         waiting=waiting,
         running=held,
@@ -137,4 +147,4 @@ def started(decisions: Decisions) -> str:
 
 
 def reason(decisions: Decisions, name: str) -> str:
-    return decisions.board.reason(f"{name}-0123456789")
+    return decisions.report.reason(f"{name}-0123456789")

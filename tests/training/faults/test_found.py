@@ -6,7 +6,7 @@ import json
 import sqlite3
 from pathlib import Path
 
-from orchestrator.bus import Bus
+from orchestrator.control.bus import Bus
 from shared_store.checkpoints import CheckpointWriter, list_checkpoints
 from shared_store.epoch import raise_epoch
 from shared_store.layout import Store

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from orchestrator.spec import ALGORITHMS, Train
+from orchestrator.spec.model import ALGORITHMS, Train
 from shared_store.checkpoints import list_checkpoints
 from shared_store.layout import Store
 from tests.support.worker.point_task import Point

@@ -184,7 +184,7 @@ def test_a_cold_cache_is_filled_by_one_rank_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("warm", [True, False])
-def test_nobody_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, warm: bool) -> None:
+def test_no_rank_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, warm: bool) -> None:
     events = build(tmp_path if warm else tmp_path / "cold", ["a:cache", "a:cache" if warm else "b:cache"])
     assert [kind for kind, _ in events] == ["start", "start", "end", "end"]
 

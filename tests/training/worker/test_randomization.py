@@ -90,7 +90,7 @@ def test_what_a_world_is_like_depends_on_its_seed_and_global_index_alone(differi
     assert not (other == drawn).any()
 
 
-def test_what_is_off_changes_nothing_and_draws_nothing(plain: Quadruped) -> None:
+def test_a_disabled_randomisation_changes_nothing_and_draws_nothing(plain: Quadruped) -> None:
     put(plain)
     streams = plain.state_dict()["random"][:, 2].clone()
     plain.step(torch.zeros(8, 12))
@@ -137,7 +137,7 @@ def test_noise_has_its_deviation_and_leaves_the_simulation_alone() -> None:
     assert not torch.equal(noisy.observations[:, 0], wp.to_torch(noisy.worlds.arrays.joint_q)[:, 0])
 
 
-def test_controls_come_late_by_what_each_episode_drew() -> None:
+def test_controls_are_late_by_each_episode_s_latency() -> None:
     task = Quadruped(QuadrupedConfig(randomize={"action_latency": 3}, action_scale=1.0, stand_thigh=0.0), 64, seed=1)
     asked, given = [], []
     for step in range(8):

@@ -281,7 +281,7 @@ def test_a_whole_recording_and_one_without_a_step_are_not_recovered_and_nothing_
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap.partial", "whole.mcap"]
 
 
-def test_what_is_no_recording_is_not_recovered(tmp_path: Path) -> None:
+def test_a_file_other_than_a_recording_is_not_recovered(tmp_path: Path) -> None:
     (tmp_path / "text.mcap.partial").write_text("no recording")
     with pytest.raises(UserError, match="does not begin as an MCAP file does"):
         recover(tmp_path / "text.mcap.partial")

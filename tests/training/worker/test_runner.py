@@ -168,7 +168,7 @@ def test_a_finished_run_is_only_evaluated(tmp_path: Path, capsys: pytest.Capture
     assert [c.name for c in list_checkpoints(Store(tmp_path).run("run"))] == ["00000002-e1"]
 
 
-def test_what_a_run_leaves_behind(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_finished_run_has_all_its_files(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     train(training(tmp_path, iterations=3))
     output = capsys.readouterr().out
     run = Store(tmp_path).run("run")
@@ -206,7 +206,7 @@ def test_nan_stops_training_and_keeps_the_last_checkpoint(tmp_path: Path) -> Non
     assert [c.iteration for c in list_checkpoints(started.job.run)] == [1, 2]
 
 
-def test_a_save_that_the_volume_refuses_is_told_and_training_goes_on(
+def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Store(tmp_path).run("run")

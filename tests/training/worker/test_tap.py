@@ -38,7 +38,7 @@ def drawn(step: int, worlds: int = 6) -> torch.Tensor:
     return torch.rand(worlds, 1, generator=torch.Generator().manual_seed(step)) * 2.0 - 1.0
 
 
-def test_a_row_is_what_the_step_did(task: Cartpole) -> None:
+def test_a_row_holds_the_result_of_the_step(task: Cartpole) -> None:
     task.reset()
     tap = Tap(task, 4, rows=16)
     tap.open()
@@ -79,7 +79,7 @@ def test_the_terms_of_the_step_that_ends_an_episode_are_kept(task: Cartpole) -> 
     tap.close()
 
 
-def test_what_the_ring_could_not_hold_is_counted_as_lost(task: Cartpole) -> None:
+def test_rows_beyond_the_ring_are_counted_as_lost(task: Cartpole) -> None:
     tap = Tap(task, 1, rows=16)
     tap.open()
     reading = Reading(tap)
@@ -103,7 +103,7 @@ def test_the_worlds_do_not_notice_that_they_are_watched() -> None:
 
 
 @pytest.mark.parametrize("worlds", [0, 7])
-def test_worlds_that_there_are_not_can_not_be_watched(task: Cartpole, worlds: int) -> None:
+def test_worlds_that_do_not_exist_can_not_be_watched(task: Cartpole, worlds: int) -> None:
     with pytest.raises(ValueError, match=f"worlds is {worlds}; of these worlds 1 to 6 can be watched"):
         Tap(task, worlds)
 
@@ -125,7 +125,7 @@ def steps(segment: Segment) -> tuple[list[int], int]:
     return [rows.first + index for rows in found for index in range(len(rows))], sum(rows.lost for rows in found)
 
 
-def test_a_reader_of_shared_memory_gets_every_row_once_and_is_told_what_it_missed() -> None:
+def test_a_reader_of_shared_memory_gets_every_row_once_and_the_count_of_missed_ones() -> None:
     writer = Segment.create(LAYOUT)
     reader = Segment.open(writer.path, LAYOUT)
     assert stat.S_IMODE(os.stat(writer.path).st_mode) == 0o600

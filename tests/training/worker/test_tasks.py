@@ -111,7 +111,7 @@ def test_any_number_of_substeps_steps_equally(cartpole: Cartpole) -> None:
         assert torch.equal(coarse.observations, fine.observations)
 
 
-def test_replay_does_what_the_launches_do(cartpole: Cartpole) -> None:
+def test_a_replay_equals_the_launches(cartpole: Cartpole) -> None:
     put(cartpole)
     start = cartpole.state_dict()
     addresses = cartpole.observations.data_ptr(), cartpole.rewards.data_ptr(), cartpole.statistics.data_ptr()

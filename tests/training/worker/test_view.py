@@ -51,7 +51,7 @@ def shown(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return found
 
 
-def test_a_recording_reads_back_as_what_the_tap_saw(recorded: Recorded) -> None:
+def test_a_recording_reads_back_as_the_tap_s_rows(recorded: Recorded) -> None:
     replay = Replay(recorded.path)
     (part,) = replay.parts()
     assert replay.look.links == ("cart", "pole") and set(replay.look.shapes) == {"", "cart", "pole"}
@@ -116,7 +116,7 @@ def test_terms_and_returns_are_drawn(recorded: Recorded, shown: dict[str, Any]) 
     assert len(shown["/return/episodes"]["Scalars:scalars"]) == 4
 
 
-def test_what_a_camera_saw_is_shown_as_one_picture_of_all_worlds(recorded: Recorded, shown: dict[str, Any]) -> None:
+def test_camera_images_are_shown_as_one_picture_of_all_worlds(recorded: Recorded, shown: dict[str, Any]) -> None:
     blobs = shown["/images/eye"]["EncodedImage:blob"].to_pylist()
     assert Replay(recorded.path).look.cameras == ("eye",) and len(blobs) == STEPS
     picture = np.asarray(Image.open(io.BytesIO(bytes(blobs[7][0]))))
@@ -144,7 +144,7 @@ def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
     assert not page._home.exists()
 
 
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.telemetry.page.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'muster\[viz\]'"):
         Page(None, "64MB")

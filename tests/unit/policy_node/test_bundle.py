@@ -75,7 +75,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
         ),
     ],
 )
-def test_a_bundle_that_is_not_as_it_was_sealed_is_refused(
+def test_an_altered_bundle_is_refused(
     bundle: Path, change: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(bundle)

@@ -8,7 +8,7 @@ from muster_policy import lines as module
 from muster_policy.lines import Lines
 
 
-def test_a_terminal_that_is_stopped_stops_nobody_and_later_lines_are_dropped() -> None:
+def test_a_stopped_terminal_does_not_block_and_later_lines_are_dropped() -> None:
     goes_on, said = threading.Event(), list[str]()
 
     def tell(line: str) -> None:

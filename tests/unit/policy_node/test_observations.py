@@ -88,7 +88,7 @@ class Heard:
         return found
 
 
-def test_each_term_is_what_the_contract_says_of_the_messages() -> None:
+def test_each_term_follows_the_contract_from_the_messages() -> None:
     heard = Heard(contract())
     heard.all()
     heard.observations.acted(np.array([1.5], np.float32))
@@ -133,7 +133,7 @@ def test_a_commanded_velocity_that_is_too_old_is_0() -> None:
     assert heard.inputs.silent_commands(command.arrived + 0.4) == []
 
 
-def test_a_policy_never_goes_faster_than_it_is_told() -> None:
+def test_a_policy_never_goes_faster_than_commanded() -> None:
     heard = Heard(contract())
     heard.all()
     (command,) = (each for each in heard.inputs.all if each.topic == "cmd_vel")
@@ -268,7 +268,7 @@ def test_an_imu_that_can_t_be_used_is_ignored_with_one_line(message: Any, said: 
     assert line.startswith(f"/imu: message ignored: {said}")
 
 
-def test_an_imu_without_orientation_is_enough_for_who_reads_none() -> None:
+def test_an_imu_without_orientation_suffices_for_a_policy_that_reads_none() -> None:
     heard = Heard(contract(term("imu_angular_velocity", 0, 3, frame=UNIT)))
     without = imu((0.0, 0.0, 0.0, 0.0), orientation_covariance=np.array([-1.0] + [0.0] * 8))
     assert heard.hear("imu", without, IMU) == []
@@ -322,7 +322,7 @@ LEG = Frame("foot", "foot", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), False)
         ),
     ],
 )
-def test_a_policy_that_needs_what_no_message_has_is_refused_in_one_line(terms: tuple[Term, ...], said: str) -> None:
+def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(terms: tuple[Term, ...], said: str) -> None:
     with pytest.raises(Refused) as caught:
         Observations(for_node(contract(*terms)))
     line = str(caught.value)
@@ -349,7 +349,7 @@ def test_a_joint_of_another_name_on_the_robot_is_found_by_it() -> None:
     assert "no joint is called KneeMotor (knee of the policy)" in line
 
 
-def test_a_contract_of_format_1_is_read_and_refused_with_what_to_do() -> None:
+def test_a_contract_of_format_1_is_refused_with_a_remedy() -> None:
     document = contract(dataclasses.replace(term("joint_velocity", 0, 2, **JOINTS), library=False)).document()
     document["format"] = 1
     for each in document["groups"][0]["terms"]:

@@ -40,7 +40,7 @@ def test_a_key_is_domain_topic_type_and_hash() -> None:
         (Qos(depth=1, transient_local=True), ":1:,1:,:,:,,"),
     ],
 )
-def test_a_quality_of_service_leaves_out_what_is_default(qos: Qos, text: str) -> None:
+def test_a_quality_of_service_leaves_out_defaults(qos: Qos, text: str) -> None:
     assert str(qos) == text
 
 
@@ -71,7 +71,7 @@ def test_a_token_of_a_newer_ros_with_one_more_field_is_read() -> None:
         "@ros2_lv/0/ab12/0/4/NN/%//",
     ],
 )
-def test_what_is_no_token_tells_nothing(key: str) -> None:
+def test_a_malformed_token_gives_no_endpoint(key: str) -> None:
     assert parse_token(key) is None
 
 

@@ -55,7 +55,7 @@ def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> No
         (lambda path: (path / "manifest.json").write_text("{"), r"manifest\.json can't be read"),
     ],
 )
-def test_what_differs_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], said: str) -> None:
+def test_a_difference_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], said: str) -> None:
     damage(bundle)
     with pytest.raises(DamagedBundle, match=said) as caught:
         bundles.verify(bundle)
@@ -83,7 +83,7 @@ def test_a_manifest_can_not_name_a_path_that_leads_elsewhere_or_be_of_a_newer_fo
         bundles.verify(bundle)
 
 
-def test_a_copy_is_whole_or_not_there(bundle: Path, tmp_path: Path) -> None:
+def test_a_copy_is_atomic(bundle: Path, tmp_path: Path) -> None:
     bundles.copy(bundle, tmp_path / "out" / "copy")
     assert bundles.verify(tmp_path / "out" / "copy") == bundles.verify(bundle)
     with pytest.raises(FileExistsError):

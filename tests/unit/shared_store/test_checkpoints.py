@@ -64,7 +64,7 @@ def sweep_up(root: Path) -> None:
 # -- commit -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_committed_checkpoint_says_what_it_holds(run: Run) -> None:
+def test_a_committed_checkpoint_lists_its_contents(run: Run) -> None:
     checkpoint = commit(run, 25, epoch=3, world_size=2, worlds=64)
     assert (checkpoint.name, checkpoint.iteration, checkpoint.epoch) == ("00000025-e3", 25, 3)
     checkpoint.verify()
@@ -78,7 +78,7 @@ def test_a_committed_checkpoint_says_what_it_holds(run: Run) -> None:
     assert (run.checkpoints / "LATEST").read_text() == "00000025-e3\n"
 
 
-def test_facts_can_not_replace_what_the_manifest_says_of_itself(run: Run) -> None:
+def test_facts_can_not_replace_the_manifest_s_own_entries(run: Run) -> None:
     assert commit(run, 25, iteration=7, files={}).manifest["iteration"] == 25
 
 
@@ -99,7 +99,7 @@ def test_a_commit_killed_at_any_step_leaves_the_old_checkpoints_or_the_new_one_w
     assert set(newest) == {"00000050-e1", "00000075-e1"}
 
 
-def test_the_next_attempt_commits_over_what_a_crash_left(run: Run, tmp_path: Path) -> None:
+def test_the_next_attempt_commits_over_a_crash_s_leftovers(run: Run, tmp_path: Path) -> None:
     commit(run, 25)
     commit(run, 50)
     for left in killed_at_every_step(commit_another, run.path, tmp_path / "work"):
@@ -146,7 +146,7 @@ def test_a_commit_with_an_old_epoch_is_refused_and_publishes_nothing(run: Run) -
     assert names(run) == ["00000025-e1", "00000050-e2"]
 
 
-def test_what_is_not_committed_is_not_listed(run: Run) -> None:
+def test_an_uncommitted_checkpoint_is_not_listed(run: Run) -> None:
     assert list_checkpoints(run) == []
     assert newest_checkpoint(run) is None
     CheckpointWriter(run, 25, 1)
@@ -299,7 +299,7 @@ def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path
 # -- sweeping and retention -------------------------------------------------------------------------------------------
 
 
-def test_sweeping_deletes_what_crashes_left_and_nothing_else(run: Run) -> None:
+def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
     commit(run, 25)
     set_aside(commit(run, 50))
     CheckpointWriter(run, 75, 1)
@@ -316,7 +316,7 @@ def test_sweeping_a_run_without_checkpoints_is_nothing(run: Run) -> None:
     assert sweep(run) == []
 
 
-def test_sweeping_killed_at_any_step_spares_what_is_committed(run: Run, tmp_path: Path) -> None:
+def test_sweeping_killed_at_any_step_spares_committed_checkpoints(run: Run, tmp_path: Path) -> None:
     commit(run, 25)
     writer = CheckpointWriter(run, 50, 1)
     (writer.path / "rank-0.pt").write_bytes(b"half written")
@@ -353,7 +353,7 @@ def test_retention_never_deletes_the_newest(run: Run) -> None:
 
 
 @pytest.mark.parametrize("reward", [float("nan"), None, "high"])
-def test_a_reward_that_is_no_number_is_never_the_best(run: Run, reward: object) -> None:
+def test_a_reward_of_nan_is_never_the_best(run: Run, reward: object) -> None:
     commit(run, 10, reward=reward)
     commit(run, 20, reward=5.0)
     for iteration in (30, 40, 50):

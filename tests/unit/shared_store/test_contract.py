@@ -56,7 +56,7 @@ seconds = st.integers(0, 100_000).map(lambda n: n / 100)
         bus_token=st.none() | names,
     )
 )
-def test_a_node_reads_what_its_engine_set(given_contract: NodeContract) -> None:
+def test_a_node_reads_its_engine_s_variables(given_contract: NodeContract) -> None:
     assert NodeContract.from_env(given_contract.to_env()) == given_contract
 
 
@@ -74,14 +74,14 @@ def test_aws_variables_are_exactly_those_of_aws_on_the_main_node() -> None:
     }
 
 
-def test_children_alone_are_told_the_main_node_s_private_address() -> None:
+def test_only_children_get_the_main_node_s_private_address() -> None:
     name = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
     for main in range(3):
         told = [contract(node_index=i, main_index=main).to_env().get(name) for i in range(3)]
         assert told == [None if index == main else "127.64.0.1" for index in range(3)]
 
 
-def test_every_node_has_what_torch_distributed_asks_for() -> None:
+def test_every_node_has_torch_distributed_s_variables() -> None:
     for index in range(3):
         env = contract(node_index=index).to_env()
         assert (env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"]) == ("127.64.0.1", "29500", "3")
@@ -132,7 +132,7 @@ def test_a_missing_variable_is_named(name: str, how: str) -> None:
 
 @pytest.mark.parametrize("value", ["two", "1.5", "--5", "²", "1_000", " 1"])
 @pytest.mark.parametrize("name", ["AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MUSTER_EPOCH"])
-def test_a_malformed_whole_number_is_named_with_what_was_found(name: str, value: str) -> None:
+def test_a_malformed_whole_number_is_named_with_its_value(name: str, value: str) -> None:
     with pytest.raises(ContractError) as caught:
         NodeContract.from_env({**contract().to_env(), name: value})
     assert str(caught.value).startswith(f"{name} is {value!r}, not a whole number; ")
@@ -140,13 +140,13 @@ def test_a_malformed_whole_number_is_named_with_what_was_found(name: str, value:
 
 @pytest.mark.parametrize("value", ["soon", "", "nan", "inf", "-1"])
 @pytest.mark.parametrize("name", ["MUSTER_GRACE_SECONDS", "MUSTER_CPUS"])
-def test_a_malformed_number_is_named_with_what_was_found(name: str, value: str) -> None:
+def test_a_malformed_number_is_named_with_its_value(name: str, value: str) -> None:
     with pytest.raises(ContractError) as caught:
         NodeContract.from_env({**contract().to_env(), name: value})
     assert str(caught.value).startswith(f"{name} is {value!r}, not a number; ")
 
 
-def test_what_an_engine_may_leave_out_has_a_default() -> None:
+def test_optional_variables_have_defaults() -> None:
     env = {"MUSTER_JOB_ID": "j", "MUSTER_RUN": "r", "MUSTER_STORE": "/s", "MUSTER_EPOCH": "4"}
     assert NodeContract.from_env(env) == NodeContract(
         "j", 1, 0, 1, 0, "127.0.0.1", 29500, "r", "/s", 4, 4, is_gang=False

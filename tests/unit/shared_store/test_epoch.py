@@ -69,7 +69,7 @@ def test_a_controller_killed_while_it_raises_the_epoch_leaves_the_old_or_the_new
 
 
 @pytest.mark.parametrize("content", ["", "seven", "1.5", "-1", "9" * 16, "9" * 30, "1\n2"])
-def test_a_damaged_epoch_is_named_with_what_was_found(tmp_path: Path, content: str) -> None:
+def test_a_damaged_epoch_is_named_with_its_value(tmp_path: Path, content: str) -> None:
     (tmp_path / "EPOCH").write_text(content)
     with pytest.raises(ValueError) as refused:
         read_epoch(Run(tmp_path))

@@ -47,7 +47,7 @@ def test_an_evaluation_is_called_after_its_checkpoint_and_its_job() -> None:
     assert checkpoint_of("notes") is None and checkpoint_of("00000003-e1-../x") is None
 
 
-def test_evaluations_are_listed_by_time_and_what_is_damaged_is_passed_over(run: Run) -> None:
+def test_evaluations_are_listed_by_time_and_damaged_ones_are_skipped(run: Run) -> None:
     evaluate(run, "00000009-e1", 1.0, time=30.0)
     evaluate(run, "00000003-e1-b", 2.0, time=20.0)
     evaluate(run, "notes", 9.0, time=1.0)
@@ -88,7 +88,7 @@ def test_the_best_checkpoint_is_that_of_two_evaluated_ones_and_else_that_of_the_
     assert best() == 3
 
 
-def test_retention_keeps_what_was_evaluated_by_a_job(run: Run) -> None:
+def test_retention_keeps_checkpoints_that_a_job_evaluated(run: Run) -> None:
     evaluate(run, "00000003-e1-1f2e3d4c", 1.0)
     add_checkpoint(Store(run.path.parent.parent), "taught", 12)
     assert retain(run, keep=1) == ["00000009-e1"]

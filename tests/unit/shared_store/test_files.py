@@ -112,7 +112,7 @@ def test_json_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert read_json(tmp_path / "value.json") == value
 
 
-def test_json_that_is_not_there_is_none(tmp_path: Path) -> None:
+def test_a_missing_json_file_is_none(tmp_path: Path) -> None:
     assert read_json(tmp_path / "value.json") is None
 
 
@@ -146,7 +146,7 @@ def test_numbers_that_json_lacks_are_read_as_none(tmp_path: Path) -> None:
     assert read_json(tmp_path / "value.json") == {"reward": None, "worst": None}
 
 
-def test_syncing_what_is_not_there_is_an_error(tmp_path: Path) -> None:
+def test_syncing_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         sync_file(tmp_path / "missing")
     (tmp_path / "file").write_bytes(OLD)

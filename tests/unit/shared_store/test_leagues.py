@@ -66,7 +66,7 @@ def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> 
     assert not store.leagues.exists()
 
 
-def test_a_league_or_an_entry_that_is_not_there_is_told_with_what_there_is(store: Store) -> None:
+def test_an_unknown_league_or_entry_is_reported_with_the_existing_ones(store: Store) -> None:
     with pytest.raises(UnknownLeague, match=r"^league cpu does not exist; none was created yet$"):
         leagues.find(store, "cpu")
     cup = leagues.create(store, league())
@@ -79,7 +79,7 @@ def test_a_league_or_an_entry_that_is_not_there_is_told_with_what_there_is(store
         cup.disqualify(2, "x", "user ada")
 
 
-def test_entries_count_up_and_hold_what_was_handed_in(cup: StoredLeague) -> None:
+def test_entries_count_up_and_hold_the_submission(cup: StoredLeague) -> None:
     for number in (1, 2, 3):
         made = cup.enter(entry(version=number))
         assert made["entry"] == number and made["league"] == {"name": "cup", "digest": cup.digest()}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.api.log_events import LogFile
+from orchestrator.api.logs.events import LogFile
 from shared_store.layout import Run
 from shared_store.log_files import LEAST_LIMIT, LogWriter, left_out, log_segments, read_log, segments_of
 from shared_store.logs import REPLACED, LogFollower, format_line, timestamp
@@ -49,7 +49,7 @@ def test_a_log_within_its_limit_is_one_file(run: Run) -> None:
     assert [segment.path.name for segment in segments_of(run.log("job", 1, 0))] == ["node-0.log"]
 
 
-def test_of_a_log_beyond_its_limit_both_ends_are_kept_and_what_is_between_is_counted(run: Run) -> None:
+def test_a_log_beyond_its_limit_keeps_both_ends_and_counts_the_middle(run: Run) -> None:
     path, count = run.log("job", 1, 0), 50_000
     assert written(path, count).lines == count
     size = sum(segment.path.stat().st_size for segment in segments_of(path))
@@ -80,7 +80,7 @@ def test_a_follower_that_keeps_up_gets_every_line_once_whatever_is_deleted_behin
     assert numbers(texts) == list(range(count)) and len(texts) == count
 
 
-def test_a_follower_that_falls_behind_is_told_how_much_it_missed(run: Run) -> None:
+def test_a_follower_that_falls_behind_learns_how_much_it_missed(run: Run) -> None:
     writer, follower = written(run.log("job", 1, 0), 6000), LogFollower(run, "job")
     before = [line.text for line in follower.drain()]
     position = follower.offsets["1/0"]
@@ -192,7 +192,7 @@ def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: 
 
 
 @pytest.mark.parametrize("how", ["truncated", "replaced by a shorter one", "replaced by a longer one"])
-def test_a_log_that_is_truncated_or_replaced_is_said_and_followed_from_its_new_beginning(run: Run, how: str) -> None:
+def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_beginning(run: Run, how: str) -> None:
     path = run.log("job", 1, 0)
     LogWriter(path).append(lines_of(0, 100))
     follower, file = LogFollower(run, "job"), LogFile(path, "stream")

@@ -43,7 +43,7 @@ def test_a_line_comes_back_as_it_was_written(text: str, rank: int | None, stream
     assert parse_line(written[:-1], 2, 5) == LogLine(timestamp(START), 2, 5, rank, stream, plain)
 
 
-def test_what_is_not_a_line_is_not_one() -> None:
+def test_a_malformed_line_is_not_parsed() -> None:
     for text in ("", "text", "2026-01-01T00:00:00Z x o text", "2026-01-01T00:00:00Z 0 z text"):
         assert parse_line(text, 1, 0) is None
 
@@ -91,7 +91,7 @@ def test_a_follower_reads_each_line_once(tmp_path: Path) -> None:
     assert texts(follower.poll()) == ["late", "b"]
 
 
-def test_a_half_written_last_line_is_read_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_partial_last_line_is_read_once_it_is_whole(tmp_path: Path) -> None:
     run = Run(tmp_path)
     follower = LogFollower(run, "job")
     whole = line(1, "grüße").encode()

@@ -30,7 +30,7 @@ def test_a_run_without_metrics_has_an_empty_history(tmp_path: Path) -> None:
     assert read_metrics(Run(tmp_path)) == []
 
 
-def test_what_was_written_is_read_at_once(tmp_path: Path) -> None:
+def test_a_written_record_is_read_at_once(tmp_path: Path) -> None:
     writer = MetricsWriter(Run(tmp_path), 1, 0)
     writer.write({"iteration": 1, "reward": 2.5, "episode_length": None})
     assert read_metrics(Run(tmp_path)) == [{"iteration": 1, "reward": 2.5, "episode_length": None}]
@@ -44,7 +44,7 @@ def test_for_an_iteration_seen_twice_the_later_epoch_counts(tmp_path: Path) -> N
     assert history(run) == [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]
 
 
-def test_a_resume_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
+def test_a_resume_drops_records_after_its_checkpoint(tmp_path: Path) -> None:
     run = Run(tmp_path)
     attempt(run, 1, 0, 10)
     attempt(run, 2, 4, 6)
@@ -149,7 +149,7 @@ def test_the_newest_record_of_a_long_history_is_read_without_the_rest(
     assert len(parsed) < 2000
 
 
-def test_a_history_whose_file_was_replaced_is_read_anew(tmp_path: Path) -> None:
+def test_a_history_whose_file_was_replaced_is_read_from_the_start(tmp_path: Path) -> None:
     run = Run(tmp_path)
     attempt(run, 1, 0, 5)
     history = MetricsHistory(run)

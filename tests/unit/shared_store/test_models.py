@@ -66,7 +66,7 @@ def test_a_model_holds_its_bundle_and_where_it_comes_from(store: Store) -> None:
     assert (model.bundle / "policy.onnx").read_bytes() == b"weights"
 
 
-def test_versions_count_up_and_what_is_there_stays(store: Store) -> None:
+def test_versions_count_up_and_existing_ones_stay(store: Store) -> None:
     exported(store)
     first = register(store)
     before = {path: path.read_bytes() for path in first.path.rglob("*") if path.is_file()}
@@ -144,7 +144,7 @@ models.register(store, sys.argv[2], run, Checkpoint(run.checkpoints / "00000004-
 """
 
 
-def test_what_a_killed_registration_left_is_deleted_by_the_next_one_of_its_controller(store: Store) -> None:
+def test_the_leftovers_of_a_killed_registration_are_deleted_by_its_controller_s_next_one(store: Store) -> None:
     run, checkpoint = exported(store)
     for name, registrar in (("bee", "a1"), ("ant", "b2")):
         subprocess.run([sys.executable, "-c", KILLED, str(store.path), name, registrar], timeout=60)
@@ -196,7 +196,7 @@ def test_damage_of_a_model_is_found(store: Store) -> None:
         model.verify()
 
 
-def test_what_can_not_be_registered_is_refused_and_nothing_is_left(store: Store) -> None:
+def test_a_refused_registration_leaves_nothing_behind(store: Store) -> None:
     run, checkpoint = exported(store)
     other = Checkpoint(run.checkpoints / "00000008-e1", 8, 1)
     with pytest.raises(ModelError, match=r"is not exported; export it first: muster export ant@8$"):

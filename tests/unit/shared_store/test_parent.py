@@ -50,7 +50,7 @@ def test_the_new_run_has_the_weights_alone_and_its_lineage(store: Store) -> None
     assert parent_checkpoint(store.run("source")) is None
 
 
-def test_what_the_source_s_retention_deletes_is_still_in_the_clone(store: Store) -> None:
+def test_a_clone_keeps_weights_that_the_source_s_retention_deletes(store: Store) -> None:
     making = new(store)
     making.copy()
     run = making.publish("heir", {"run": "heir"})

@@ -11,7 +11,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.spec_schema import contract_schema
+from orchestrator.spec.json_schema import contract_schema
 from shared_store.documents import DocumentError
 from shared_store.policy_contract import (
     Action,
@@ -125,7 +125,7 @@ def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schem
         ),
     ],
 )
-def test_what_is_no_contract_is_refused_in_one_line(change: Callable[[dict[str, Any]], Any], said: str) -> None:
+def test_a_malformed_contract_is_refused_in_one_line(change: Callable[[dict[str, Any]], Any], said: str) -> None:
     with pytest.raises(DocumentError) as caught:
         read(document(change))
     assert str(caught.value) == said
@@ -173,7 +173,7 @@ def test_where_a_quantity_is_measured_counts_where_both_contracts_say_it() -> No
     )
 
 
-def test_a_contract_of_format_1_is_read_as_one_that_says_less() -> None:
+def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
     def older(found: dict[str, Any]) -> None:
         found["format"] = 1
         for each in found["groups"][0]["terms"]:
@@ -188,7 +188,7 @@ def test_a_contract_of_format_1_is_read_as_one_that_says_less() -> None:
     assert differences(there, CONTRACT) == [] == differences(CONTRACT, there)
 
 
-def test_names_that_come_go_and_move_are_told_by_name() -> None:
+def test_added_removed_and_moved_names_are_reported_by_name() -> None:
     swapped = dataclasses.replace(CONTRACT, actions=CONTRACT.actions[::-1], action_names=("right_knee", "left_knee"))
     assert differences(CONTRACT, swapped) == [
         "action 0: left_knee became action 1",
@@ -207,6 +207,6 @@ def test_numbers_that_a_compiler_rounded_and_what_only_training_is_about_are_no_
     ]
 
 
-def test_of_many_differences_the_first_are_told_and_how_many_there_are() -> None:
+def test_many_differences_are_shortened_to_the_first_ones_and_a_count() -> None:
     assert brief(["a", "b"]) == "a; b"
     assert brief([str(index) for index in range(8)]) == "0; 1; 2; 3; 4; and 3 more"

@@ -36,7 +36,7 @@ def test_the_rules_of_a_race_stand_above_its_config_and_every_lap_begins_at_the_
         (("front", "width"), "race.config.front.width"),
     ],
 )
-def test_what_is_wrong_is_told_by_its_place_in_the_job(path: tuple[str | int, ...], key: str) -> None:
+def test_an_error_is_reported_by_its_place_in_the_job(path: tuple[str | int, ...], key: str) -> None:
     assert key_of({"track": ["oval"]}, path) == key
 
 

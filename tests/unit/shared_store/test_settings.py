@@ -16,7 +16,7 @@ def test_a_dot_leads_into_a_section_and_an_empty_section_is_none() -> None:
     assert setting_at(None, "a") is None
 
 
-def test_the_first_difference_is_told_with_both_values() -> None:
+def test_the_first_difference_is_reported_with_both_values() -> None:
     old, new = {"sizes": [8], "net": {"depth": 3}}, {"sizes": [8], "net": {"depth": 0}, "rate": {}}
     assert first_difference(old, new, KIND.fixed) == ("net.depth", 3, 0)
     assert first_difference(old, new, ("sizes", "rate")) is None

@@ -53,7 +53,7 @@ def test_a_race_is_read_with_its_penalties() -> None:
         (lambda found: found["trials"][2].update(crashes="1"), "race.trials.2.crashes: expected a whole number"),
     ],
 )
-def test_what_is_no_race_is_told_with_its_place(change: Any, said: str) -> None:
+def test_a_malformed_race_is_refused_with_its_place(change: Any, said: str) -> None:
     found = race([12.0, 12.5, 13.0])
     change(found)
     with pytest.raises(BadRace, match=f"^{said}"):
@@ -63,7 +63,7 @@ def test_what_is_no_race_is_told_with_its_place(change: Any, said: str) -> None:
 
 
 @pytest.mark.parametrize(("ranking", "order"), [("total", [2, 1]), ("best", [3, 1, 2]), ("average", [3, 2, 1])])
-def test_the_ranking_says_who_is_ahead(ranking: Ranking, order: list[int]) -> None:
+def test_the_ranking_orders_the_entries(ranking: Ranking, order: list[int]) -> None:
     entries = [
         contender(1, [11_000, 13_000, 13_000]),
         contender(2, [12_000, 12_000, 12_000]),

@@ -39,7 +39,7 @@ def test_a_track_is_never_changed(store: Store) -> None:
     assert [path.name for path in store.tracks.iterdir()] == ["hills"], "nothing half made is left"
 
 
-def test_of_two_who_keep_a_track_at_once_one_does(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_simultaneous_additions_of_a_track_one_succeeds(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     tracks.add(store, "hills", b"rows", {})
     monkeypatch.setattr(tracks, "names", lambda store: [])  # it looked before the other one was done
     with pytest.raises(TrackError, match="exists already"):
@@ -55,7 +55,7 @@ def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> 
     assert not store.tracks.exists()
 
 
-def test_a_track_that_is_not_there_is_told_with_the_nearest_one(store: Store) -> None:
+def test_an_unknown_track_is_reported_with_the_nearest_name(store: Store) -> None:
     with pytest.raises(TrackError, match="track hils does not exist; none is kept yet"):
         tracks.find(store, "hils")
     tracks.add(store, "hills", b"rows", {})

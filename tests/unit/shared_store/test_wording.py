@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.errors import SpecError
-from orchestrator.spec import validate
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.model import validate
 from worker.errors import UserError
 from worker.learning.algorithms import find_algorithm, settings
 from worker.tasks.configs.cartpole import CartpoleConfig

@@ -57,7 +57,7 @@ def test_those_that_come_with_muster_are_algorithms(name: str) -> None:
     assert find_algorithm(name)
 
 
-def test_a_class_that_is_no_algorithm_is_refused_with_all_that_it_lacks() -> None:
+def test_an_incomplete_algorithm_is_refused_with_its_missing_members() -> None:
     lacks = "begin, act, record, load_state_dict, world_state, load_world_state, build_policy"
     with pytest.raises(UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is no algorithm: it lacks {lacks} \("):
         find_algorithm(f"{HERE}:OnlyLearns")
@@ -70,7 +70,7 @@ class WithoutPolicy(OnlyLearns):
         return {"weights": torch.ones(1)}
 
 
-def test_what_an_algorithm_of_ones_own_does_wrong_is_said_in_one_line() -> None:
+def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
     with pytest.raises(UserError, match=r'^train\.algorithm: own:A: state_dict\(\) must hold "policy"'):
         check_state(WithoutPolicy(), "own:A")  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"own:A: its config_type must be a dataclass, not dict$"):
@@ -121,6 +121,6 @@ def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algori
     assert loaded == [(module, "cpu", "algorithm") for module in modules]
 
 
-def test_what_is_common_to_all_algorithms_imports_none_of_them() -> None:
+def test_the_common_modules_import_no_algorithm() -> None:
     told = "import sys, worker.learning.setup as s; sys.exit(any(n.startswith('worker.learning.ppo.d') for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", told], cwd=REPOSITORY).returncode == 0

@@ -136,7 +136,7 @@ def test_robots_that_can_not_be_placed_or_called(make: Callable[[], Robot], mess
 
 
 @pytest.mark.parametrize("name", ["bytes.xml", "bytes.urdf"])
-def test_a_robots_file_that_is_no_text_is_named(tmp_path: Path, name: str) -> None:
+def test_a_robots_file_that_is_not_text_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(bytes(range(256)))
 
     class Unreadable(Sliders):

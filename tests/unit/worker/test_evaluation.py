@@ -163,7 +163,7 @@ def test_a_task_that_nothing_but_the_clock_ends_has_no_success() -> None:
     assert not without.says_success and without.meaning == "the task does not say"
 
 
-def test_who_is_asked_to_stop_records_nothing() -> None:
+def test_a_stopped_evaluation_records_nothing() -> None:
     with pytest.raises(Stopped):
         play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_asked_to_stop=lambda: True)
 
@@ -227,7 +227,7 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
     assert json.loads((run.evaluations / "00000006-e1-second-j.json").read_text()) == json.loads(json.dumps(second))
 
 
-def test_a_killed_evaluation_leaves_no_half_table_and_the_next_one_clears_what_it_left(
+def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_its_leftovers(
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
     run = Run(tmp_path / "run")

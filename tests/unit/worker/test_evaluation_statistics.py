@@ -69,7 +69,7 @@ def test_episodes_are_paired_where_seed_task_and_changes_of_the_worlds_are_the_s
     )
 
 
-def test_samples_without_spread_are_told_apart_and_those_of_one_value_are_not() -> None:
+def test_samples_without_spread_are_distinguished_unless_they_are_equal() -> None:
     assert difference(Sample(9, 2.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "better"
     assert difference(Sample(9, 1.0, 0.0), Sample(9, 1.0, 0.0))["verdict"] == "within noise"
     assert difference(Sample(1, 2.0, 0.0), Sample(9, 1.0, 1.0))["verdict"] == "unknown"

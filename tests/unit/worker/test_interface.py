@@ -131,7 +131,7 @@ def described(task: Task) -> dict[str, Any]:
     return describe(Training.of(job, type(task)), task)
 
 
-def test_a_checkpoint_holds_what_a_robot_needs(task: Task) -> None:
+def test_a_checkpoint_holds_the_policy_contract(task: Task) -> None:
     contract = json.loads(json.dumps(described(task)))["contract"]
     assert contract["control_hz"] == task.config.control_hz
     terms = contract["groups"][0]["terms"]

@@ -56,7 +56,7 @@ FULL = (
 )
 
 
-def test_an_allocation_that_fails_is_told_as_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_allocation_is_reported_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(is_out_of_memory(error) for error in FULL)
     assert not is_out_of_memory(RuntimeError("shapes do not fit"))
     assert not is_out_of_memory(ValueError("the memory of a GRU is of no use here"))

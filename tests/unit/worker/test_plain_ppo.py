@@ -171,7 +171,7 @@ class Part(Gang):
         return tensor
 
 
-def test_two_ranks_learn_what_the_fused_one_does_alone() -> None:
+def test_two_ranks_learn_the_same_as_the_fused_one_alone() -> None:
     """Worlds 0 and 1, and worlds 2 to 5; ranks draw weights of their own, which the main rank's replace."""
     torch.manual_seed(8)
     whole = Point(PointConfig(), WORLDS, seed=2)
@@ -254,7 +254,7 @@ def test_it_goes_on_from_its_state_with_the_same_bits() -> None:
         assert torch.equal(exported.network(exported.sample["policy"]), policy.act(exported.sample))
 
 
-def test_what_it_can_not_do_it_refuses_and_names_what_can() -> None:
+def test_an_unsupported_setting_is_refused_with_an_alternative() -> None:
     def refused(spaces: Spaces, **settings: Any) -> str:
         with pytest.raises(ValueError) as caught:
             PlainPPO(dataclasses.replace(PointPPO(), **settings), Setting(spaces, Share(0, 2, 2), alone(), 0))

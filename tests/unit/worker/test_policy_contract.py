@@ -92,7 +92,7 @@ def test_observations_are_rebuilt_from_the_document_alone(sliders: Sliders) -> N
     assert compared > WORLDS * 4 * 5
 
 
-def test_what_a_term_is_made_of_is_told(sliders: Sliders) -> None:
+def test_a_term_s_function_and_numbers_are_in_the_contract(sliders: Sliders) -> None:
     contract = published(sliders)
     terms = {term.name: term for term in contract.groups[0].terms}
     place, late, target = terms["place"], terms["late"], terms["target"]
@@ -107,7 +107,7 @@ def test_what_a_term_is_made_of_is_told(sliders: Sliders) -> None:
     assert [term.quantity for term in contract.groups[1].terms] == ["joint_position", "counted"]
 
 
-def test_a_recurrent_policy_s_inputs_and_state_are_told(sliders: Sliders) -> None:
+def test_a_recurrent_policy_s_inputs_and_state_are_in_the_contract(sliders: Sliders) -> None:
     exported: Any = SimpleNamespace(
         sample={"critic": None}, inputs={"obs": torch.zeros(1, 3), "h": torch.zeros(1, 1, 8)}, states=["h"]
     )
@@ -222,7 +222,7 @@ def test_gains_of_a_motor_whose_force_is_computed_are_its_own() -> None:
     assert (first["scale"], first["unit"], second["unit"], first["rule"]) == (0.25, "rad", "m", "")
 
 
-def test_a_share_of_a_range_is_told_as_scale_and_offset_within_limits() -> None:
+def test_a_share_of_a_range_becomes_scale_and_offset_within_limits() -> None:
     """value = 0.5 a + 0.2, within ±1, is a share of [-3, 1]: the target is -1 + 2 value."""
     servo = PositionActuator("*", 20.0, 0.5)
     first, second = driven_by(
@@ -233,7 +233,7 @@ def test_a_share_of_a_range_is_told_as_scale_and_offset_within_limits() -> None:
     assert first["clip"] == pytest.approx([-2.0, 1.6]) and first["rule"] == ""
 
 
-def test_what_a_scale_and_an_offset_do_not_say_is_told_in_words() -> None:
+def test_a_rule_beyond_scale_and_offset_is_given_in_words() -> None:
     servo = PositionActuator("*", 20.0, 0.5)
     first, _ = driven_by(terms.smoothed_position_target, servo, kind="position", share=0.25)
     assert first["rule"].startswith("A position target that follows ``value`` slowly: t = share * value")

@@ -48,7 +48,7 @@ def test_a_training_of_days_without_a_gpu_says_so_once_and_how_to_try_it(
     ]
 
 
-def test_what_is_left_of_a_resumed_training_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_remainder_of_a_resumed_training_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # 1,000 - 402 = 598 iterations of 60 s are 9.97 hours
     (line,) = said(tmp_path, capsys, 60.0, "cpu", resumed=400)
     assert "the other 598 iterations take about 10 hours" in line

@@ -25,7 +25,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return run
 
 
-def test_reports_are_made_in_order_and_nobody_waits_for_them() -> None:
+def test_reports_are_made_in_order_without_blocking_training() -> None:
     reporter, gate, done = Reporter(), threading.Event(), []
     reporter.do(gate.wait)
     for number in range(1000):

@@ -154,7 +154,7 @@ CASES: dict[str, tuple[Callable[[], Any], list[str]]] = {
 
 
 @pytest.mark.parametrize(("declare", "parts"), CASES.values(), ids=CASES)
-def test_what_is_wrong_is_said_in_one_line(declare: Callable[[], Any], parts: list[str]):
+def test_a_mistake_is_reported_in_one_line(declare: Callable[[], Any], parts: list[str]):
     with pytest.raises(ValueError) as refused:
         declare()
     message = str(refused.value)

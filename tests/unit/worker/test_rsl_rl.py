@@ -196,7 +196,7 @@ TAUGHT = {"teacher_checkpoint": "taught"}
         ({"torch_compile_mode": "reduce-overhead"}, r"algorithm: torch_compile_mode='reduce-overhead'"),
     ],
 )
-def test_what_rsl_rl_refuses_is_told_in_one_line_with_its_place(section: dict[str, Any], message: str) -> None:
+def test_rsl_rl_s_refusal_is_reported_in_one_line_with_its_place(section: dict[str, Any], message: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(ValueError, match=rf"^rsl_rl\.{message}") as refusal:

@@ -82,7 +82,7 @@ def test_settings_are_read_without_torch() -> None:
         ),
     ],
 )
-def test_what_it_can_not_do_is_refused(spaces: Spaces, settings: dict[str, Any], message: str) -> None:
+def test_an_unsupported_setting_is_refused(spaces: Spaces, settings: dict[str, Any], message: str) -> None:
     setting = Setting(spaces, Share(0, 2, 2), alone(), 0)
     with pytest.raises(ValueError, match=f"^sac.*{message}"):
         SAC(dataclasses.replace(SMALL, **settings), setting)

@@ -131,7 +131,7 @@ def test_log_probabilities_are_those_of_torch() -> None:
     torch.testing.assert_close(log_prob.double(), squashed.log_prob(inner).sum(1), atol=1e-3, rtol=1e-3)
 
 
-def test_the_first_policy_is_centred_and_as_wide_as_it_is_told() -> None:
+def test_the_first_policy_is_centred_with_the_configured_width() -> None:
     actor = Actor(dataclasses.replace(SMALL, init_std=0.3), 3, 2)
     mean, log_std = actor(torch.randn(50, 3))
     assert mean.abs().max() < 0.05
@@ -227,7 +227,7 @@ def test_gradients_are_clipped_by_their_norm() -> None:
     torch.testing.assert_close(learner._critic_gradient, before * 0.1 / before.norm(), rtol=1e-4, atol=1e-7)
 
 
-def test_critics_may_know_what_the_policy_does_not_see() -> None:
+def test_critics_may_have_observations_that_the_policy_lacks() -> None:
     setting = Setting(Spaces({"policy": (2,), "critic": (3,)}, 1), Share(0, 4, 4), alone(), 0)
     sac = SAC(dataclasses.replace(SMALL, critic_group="critic", warm_up=0), setting)
     assert sac.learner.critics.each[0][0].in_features == 4 and sac.learner.actor.body[0].in_features == 2

@@ -96,7 +96,7 @@ def test_the_main_writer_commits_only_when_every_rank_is_durable(run: Run) -> No
     other.close()
 
 
-def test_a_writer_that_dies_is_told_and_replaced(run: Run) -> None:
+def test_a_writer_that_dies_is_reported_and_replaced(run: Run) -> None:
     saver = Saver(run, 1, 0, 2, keep=None)  # the second rank never comes: the writer waits
     saver.save(1, content(1), {})
     assert saver._process is not None

@@ -131,7 +131,7 @@ def test_a_configuration_of_one_s_own_may_be_a_dataclass_of_either_kind(kind: ty
         assert str(refused.value) == said
 
 
-def test_a_task_whose_own_defaults_can_not_be_says_so() -> None:
+def test_a_task_with_invalid_defaults_says_so() -> None:
     @dataclasses.dataclass(frozen=True)
     class Careless(PendulumConfig):
         substeps: int = 0

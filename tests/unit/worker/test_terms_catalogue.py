@@ -54,6 +54,6 @@ def test_mjlabs_own_terms_have_one_here() -> None:
     assert set(wanted.split()) - ported == set()
 
 
-def test_a_page_that_there_is_none_of_is_refused_in_one_line() -> None:
+def test_an_unknown_page_is_refused_in_one_line() -> None:
     with pytest.raises(SystemExit, match=r"there is no page 'portnig'; there are reference, porting"):
         main(["portnig"])

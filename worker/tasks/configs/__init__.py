@@ -1,1 +1,1 @@
-"""The configurations of the built-in tasks, apart from the tasks themselves: the controller checks jobs with them, without torch."""
+"""The configurations of the built-in tasks, separate from the tasks: the controller checks jobs with them, without torch."""

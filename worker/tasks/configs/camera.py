@@ -16,10 +16,10 @@ Place = Annotated[tuple[Finite, Finite, Finite], Field(strict=False), expecting(
 
 @dataclass(frozen=True, config=STRICT)
 class CameraConfig:
-    """Where the camera of a world stands and what an image is.
+    """Position of a world's camera, and format of its images.
 
     Raises:
-        ValueError: A size is out of range, or the camera stands where it looks to.
+        ValueError: A size is out of range, or the camera stands at its target.
     """
 
     width: Annotated[int, Field(ge=1, le=1024)] = 64
@@ -27,7 +27,7 @@ class CameraConfig:
     height: Annotated[int, Field(ge=1, le=1024)] = 64
     """Height of an image [px]."""
     position: Place = (0.0, -3.0, 1.0)
-    """Where it stands in its world [m]."""
+    """Its position in the world [m]."""
     target: Place = (0.0, 0.0, 1.0)
     """The point in the middle of the image [m]."""
     fov: Annotated[float, Field(gt=0, lt=math.pi)] = 0.9
@@ -35,7 +35,7 @@ class CameraConfig:
     frames: Annotated[int, Field(ge=1, le=16)] = 2
     """Images of one observation: the present one and those of the control steps before, since one alone shows no velocity."""
     samples: Annotated[int, Field(ge=1, le=64)] = 1
-    """Rays of each pixel; with 4 or more, edges that move by less than a pixel are seen to move."""
+    """Rays of each pixel; 4 or more show motions of edges by less than a pixel."""
 
     def __post_init__(self) -> None:
         if math.dist(self.position, self.target) < 1e-6:

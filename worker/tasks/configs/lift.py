@@ -22,7 +22,7 @@ class LiftCubeConfig(TaskConfig):
     """Grip a cube, bring it to the target and hold it there. All numbers are those of mjlab 1.6's ``Mjlab-Lift-Cube-Yam``.
 
     Raises:
-        ValueError: A range is no range, besides what :class:`TaskConfig` refuses.
+        ValueError: A range is malformed, or :class:`TaskConfig` refuses a value.
     """
 
     control_hz: Positive = 50.0
@@ -32,7 +32,7 @@ class LiftCubeConfig(TaskConfig):
     episode_seconds: Positive = 20.0
     """Simulated time after which the clock ends an episode [s]."""
     command_seconds: Range = (8.0, 12.0)
-    """Time for which a target holds [s]; with the next one the cube is put elsewhere, too."""
+    """Duration of a target [s]; with the next one, the cube is moved, too."""
     target_x: Range = (0.3, 0.5)
     """Targets along the world's x, in front of the arm [m], uniform."""
     target_y: Range = (-0.2, 0.2)
@@ -40,13 +40,13 @@ class LiftCubeConfig(TaskConfig):
     target_z: Range = (0.2, 0.4)
     """Heights of targets [m], uniform."""
     cube_x: Range = (0.2, 0.4)
-    """Where the cube is put along x [m], uniform."""
+    """Positions of the cube along x [m], uniform."""
     cube_y: Range = (-0.2, 0.2)
     """Where the cube is put along y [m], uniform."""
     cube_z: Range = (0.02, 0.05)
     """Height from which the cube drops [m], uniform; it lies at 0.02."""
     cube_yaw: Range = (-3.14, 3.14)
-    """How the cube is turned about the vertical [rad], uniform."""
+    """Yaw of the cube [rad], uniform."""
     ground_force: Positive = 10.0
     """Force of a contact of the gripper with the ground above which the episode ends [N]."""
     rewards: Mapping[str, float] = reward_weights(
@@ -80,13 +80,13 @@ class LiftCubeConfig(TaskConfig):
 
 @dataclass(frozen=True, config=STRICT)
 class LiftCubesConfig(LiftCubeConfig):
-    """Grip one of several cubes, the one that is chosen, as :class:`LiftCubeConfig`; what the rewards say of the cube is of that one.
+    """Grip the chosen one of several cubes, as :class:`LiftCubeConfig`; the rewards refer to the chosen cube.
 
     Ranges are those of mjlab 1.6's ``Mjlab-Multi-Cube-Seg-Yam``.
     """
 
     cubes: Annotated[int, Field(ge=1, le=6)] = 3
-    """How many cubes there are, 1 to 6."""
+    """Number of cubes, 1 to 6."""
     cube_x: Range = (0.25, 0.4)
     """Where each cube is put along x [m], uniform."""
     cube_y: Range = (-0.15, 0.15)

@@ -18,7 +18,7 @@ class QuadrupedConfig(TaskConfig):
     """Follow velocity commands, level and smoothly; do not touch the ground with the trunk.
 
     Raises:
-        ValueError: A range of commands is no range, besides what :class:`TaskConfig` refuses.
+        ValueError: A range of commands is malformed, or :class:`TaskConfig` refuses a value.
     """
 
     control_hz: Positive = 50.0
@@ -28,9 +28,9 @@ class QuadrupedConfig(TaskConfig):
     episode_seconds: Positive = 20.0
     """Simulated time after which the clock ends an episode [s]."""
     fastest: Positive = 100.0
-    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 40."""
+    """Joint velocity at which the physics counts as failed [m/s, rad/s]; a healthy robot stays below 40."""
     action_scale: float = 0.5
-    """How far an action of 1 moves a joint's target from its standing angle [rad]."""
+    """Offset of a joint's target from its standing angle for an action of 1 [rad]."""
     stand_hip: float = 0.0
     """Standing angle of the hips [rad]."""
     stand_thigh: float = 0.8
@@ -52,9 +52,9 @@ class QuadrupedConfig(TaskConfig):
     command_turn: Range = (-1.0, 1.0)
     """Commanded turning velocities about the trunk's +z [rad/s], uniform."""
     command_stand: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """Share of the commands that ask to stand still instead."""
+    """Share of commands to stand still."""
     command_seconds: Positive = 5.0
-    """Simulated time for which a command holds [s]; an episode begins with a new one."""
+    """Duration of a command, in simulated time [s]; an episode begins with a new one."""
     velocity_scale: float = 0.05
     """Factor on joint velocities in observations [s/rad]."""
     rewards: Mapping[str, float] = reward_weights(

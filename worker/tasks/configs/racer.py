@@ -39,32 +39,32 @@ class ObstacleConfig:
     """A box on the road: 0.4 m long, 0.24 m wide, 0.2 m high."""
 
     distance: Amount = 0.0
-    """From the start line along the centre line, in the order of the waypoints [m]."""
+    """Distance from the start line along the centre line, in the order of the waypoints [m]."""
     lane: Literal["inner", "center", "outer"] = "outer"
-    """In the middle of the half at the inner or the outer border, or on the centre line."""
+    """Middle of the inner or outer half of the road, or the centre line."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class LidarConfig:
-    """A lidar on the car's middle, which sees obstacles and nothing of the road.
+    """A lidar at the car's centre, which sees obstacles but not the road.
 
     Raises:
-        ValueError: Its range ends before it begins.
+        ValueError: ``least`` is not below ``range``.
     """
 
     sectors: Annotated[int, Field(ge=1, le=128)] = 8
-    """Parts of the field, from the right to the left; each sees the nearest obstacle in it."""
+    """Sectors of the field of view, from right to left; each sees its nearest obstacle."""
     rays: Annotated[int, Field(ge=1, le=64)] = 8
-    """Of each sector, in equal angles from each other."""
+    """Rays of each sector, at equal angles."""
     levels: Annotated[int, Field(ge=0, le=64)] = 0
-    """0: a sector is the distance to that obstacle [m]; else so many numbers, one of which is 1: that of its part of the range. 1: whether
-    there is one at all."""
+    """0: a sector is the distance to that obstacle [m]; n: it is n numbers, of which the one for its part of the range is 1; with 1, the
+    number says whether there is an obstacle."""
     field: Annotated[float, Field(gt=0, le=2 * math.pi)] = 5.236
-    """Angle that it sees, half of it to each side of the car's heading [rad]; 5.236 are 300 degrees."""
+    """Field of view, half of it to each side of the car's heading [rad]; 5.236 is 300 degrees."""
     least: Amount = 0.15
-    """A nearer obstacle is as one here [m]."""
+    """Distances of nearer obstacles are raised to this [m]."""
     range: Positive = 1.0
-    """A farther obstacle is not seen [m]; where there is none, a distance is this."""
+    """Farther obstacles are not seen [m]; without an obstacle, this is the distance."""
 
     def __post_init__(self) -> None:
         if self.least >= self.range:
@@ -93,9 +93,9 @@ class FrontCameraConfig:
     fov: Annotated[float, Field(gt=0, lt=math.pi)] = 0.887
     """Vertical field of view [rad]: with 4:3 the horizontal one is 1.13."""
     position: Annotated[tuple[Finite, Finite, Finite], Field(strict=False), expecting("[x, y, z]")] = (0.05, 0.0, 0.14)
-    """On the car: ahead of its middle, to the left, above the road [m]."""
+    """On the car: ahead of its centre, to the left, above the road [m]."""
     pitch: Annotated[float, Field(gt=-1.5, lt=1.5)] = 0.262
-    """How far it looks down [rad]; 0.262 are 15 degrees."""
+    """Downward tilt [rad]; 0.262 is 15 degrees."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -103,8 +103,8 @@ class RacerConfig(TaskConfig):
     """A car of 1:18 on a track, which drives laps.
 
     Raises:
-        ValueError: An action is out of range, or physics are to differ that the car does not have, besides what :class:`TaskConfig`
-            refuses.
+        ValueError: An action is out of range, ``randomize`` names physics that the car does not have, or :class:`TaskConfig` refuses
+            a value.
     """
 
     races: ClassVar[bool] = True
@@ -124,29 +124,29 @@ class RacerConfig(TaskConfig):
         },
         metadata=kept_file("json"),
     )
-    """What a ``model_metadata.json`` holds, or the path of one; steering in degrees, speed in m/s."""
+    """Contents or path of a ``model_metadata.json``; steering in degrees, speed in m/s."""
     reward_function: Annotated[
         Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
     ] = field(default=None, metadata=kept_file("text", check="worker.racer.rewards", needs=("numpy", "scipy")))
-    """Path of a file with ``def reward_function(params)``, which takes the place of all other rewards."""
+    """Path of a file with ``def reward_function(params)``, which replaces all other rewards."""
     speed_lag: Amount = 0.2
-    """Time constant with which the speed follows what is asked [s]."""
+    """Time constant of the speed's response [s]."""
     steering_lag: Amount = 0.05
     """Time constant of the steering [s]."""
     speed_factor: PositiveFactors = (1.0, 1.0)
-    """Factor on the speed that is asked, uniform, drawn in every episode."""
+    """Factor on the requested speed, uniform, drawn in every episode."""
     steering_factor: PositiveFactors = (1.0, 1.0)
-    """Factor on the steering that is asked, uniform, drawn in every episode."""
+    """Factor on the requested steering, uniform, drawn in every episode."""
     steering_offset: Range = (0.0, 0.0)
-    """What is added to the steering that is asked [rad], uniform, drawn in every episode."""
+    """Offset of the requested steering [rad], uniform, drawn in every episode."""
     start: Literal["round_robin", "random", "line"] = "round_robin"
-    """Where an episode begins: ``start_step`` of the track farther than the one before, anywhere, or at the start line."""
+    """Start of an episode: ``start_step`` of the track farther than the previous one, anywhere, or at the start line."""
     start_step: Annotated[float, Field(ge=0, le=1)] = 0.05
     """A share of the track."""
     start_sideways: Range = (0.0, 0.0)
-    """How far left of the centre line [m], uniform."""
+    """Start position left of the centre line [m], uniform."""
     start_turned: Range = (0.0, 0.0)
-    """How far the car points to the left of its heading [rad], uniform."""
+    """Start heading to the left of the track's direction [rad], uniform."""
     alternate_direction: bool = False
     """Whether every other episode drives against the order of the waypoints."""
     obstacles: Annotated[
@@ -154,33 +154,33 @@ class RacerConfig(TaskConfig):
     ] = ()
     """Boxes on every track."""
     lidar: Annotated[LidarConfig | None, from_mapping(LidarConfig)] = None
-    """Where the policy sees obstacles by a lidar; a lidar among the action space's sensors is one, too."""
+    """A lidar through which the policy sees obstacles; the action space's sensors can also name one."""
     stuck_steps: Count = 15
-    """Control steps in a row of standing, or of coming back, that end an episode."""
+    """Consecutive control steps of standing, or of driving back, that end an episode."""
     continuous: bool = False
-    """Whether a car that leaves the road, crashes, stands or comes back is put back and drives on, instead of ending its episode."""
+    """Whether a car that leaves the road, crashes, stands or drives back is put back and drives on, instead of ending its episode."""
     put_back: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """How far behind where it was [m]."""
+    """Distance by which it is put back [m]."""
     off_track_penalty: Amount = 1.0
-    """Added to a lap's time for each time that the car left the road [s]."""
+    """Time penalty of a lap each time that the car leaves the road [s]."""
     crash_penalty: Amount = 1.0
-    """For each obstacle that it touched [s]."""
+    """Time penalty for each touched obstacle [s]."""
     max_resets: Annotated[int, Field(ge=0, le=1_000_000)] = 100
-    """How often a car is put back in an episode; the next time the episode ends."""
+    """Number of times that a car is put back in an episode; the next time, the episode ends."""
     trace: bool = False
-    """Whether each control step is noted on the device for the files of a race; a race sets it."""
+    """Whether to record each control step on the device for the files of a race; a race sets it."""
     waypoints: Annotated[int, Field(ge=1, le=64)] = 8
-    """Points of the centre line ahead that the policy sees."""
+    """Number of observed points of the centre line ahead."""
     waypoint_spacing: Positive = 0.3
-    """Between them along the centre line [m]."""
+    """Their spacing along the centre line [m]."""
     rewards: Mapping[str, float] = reward_weights(progress=1.0, off_track=-10.0, crashed=-10.0)
     """Weights of these terms:
 
-    - ``progress``: how far the car came on, in percent of the track: a whole lap is 100;
+    - ``progress``: progress of the car, in percent of the track: a whole lap is 100;
     - ``off_track``: leaving the road, once;
     - ``crashed``: touching an obstacle, once;
 
-    or, where there is a ``reward_function``, of the one term ``reward``: what it returns."""
+    or, with a ``reward_function``, of the one term ``reward``: its result."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             steps=32, hidden_sizes=(64, 64), epochs=5, minibatches=4, learning_rate=1.0e-3, entropy_coef=0.002
@@ -268,7 +268,7 @@ class RacerPixelsConfig(RacerConfig):
             normalize_observations=True,
         )
     )
-    """How the task is trained: the critic sees the numbers that the policy does not."""
+    """How the task is trained: the critic also sees the numbers."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -46,7 +46,7 @@ class RunningConfig(TaskConfig):
     episode_seconds: Positive = 16.0
     """Simulated time after which the clock ends an episode [s]."""
     fastest: Positive = 100.0
-    """Velocity of a joint from which on the physics has failed [m/s, rad/s]; a healthy robot stays below 70."""
+    """Joint velocity at which the physics counts as failed [m/s, rad/s]; a healthy robot stays below 70."""
     fall_height: float = 0.0
     """Height of the torso under which the episode ends [m]."""
     start_height: float = 1.0
@@ -77,7 +77,7 @@ class RunningConfig(TaskConfig):
 
 @dataclass(frozen=True, config=STRICT)
 class AntConfig(RunningConfig):
-    """Run fast, straight and upright; do not drop the torso. What the rewards are: :class:`RunningConfig`."""
+    """Run fast, straight and upright; do not drop the torso. Rewards: see :class:`RunningConfig`."""
 
     fall_height: float = 0.31
     """Height of the torso under which the episode ends [m]."""
@@ -92,14 +92,14 @@ class AntConfig(RunningConfig):
 
 @dataclass(frozen=True, config=STRICT)
 class HumanoidConfig(RunningConfig):
-    """Run fast, straight and upright; do not fall. What the rewards are: :class:`RunningConfig`."""
+    """Run fast, straight and upright; do not fall. Rewards: see :class:`RunningConfig`."""
 
     fall_height: float = 0.8
     """Height of the torso under which the episode ends [m]."""
     start_height: float = 1.34
     """Height of the torso at the start [m]: the feet are 5 cm above the ground."""
     sac: SACConfig = field(default_factory=lambda: dataclasses.replace(SAC, gamma=0.99, v_max=1400.0))
-    """How ``algorithm: sac`` trains it: it has to look further ahead than an ant."""
+    """How ``algorithm: sac`` trains it: with a longer horizon than the ant."""
     rewards: Mapping[str, float] = reward_weights(
         forward=1.0, heading=0.5, up=0.1, alive=2.0, action=-0.01, energy=-0.05, limits=-0.25, fall=-1.0
     )

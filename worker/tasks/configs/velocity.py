@@ -72,7 +72,7 @@ class VelocityConfig(TaskConfig):
     """Follow velocity commands with a natural gait, through pushes.
 
     Raises:
-        ValueError: The stages of a command are none, besides what :class:`TaskConfig` refuses.
+        ValueError: The stages of a command are malformed, or :class:`TaskConfig` refuses a value.
 
     ``rewards`` weighs these terms, each per second. Those of feet count only while more than 0.05 is commanded, speed [m/s] + turning
     velocity [rad/s]:
@@ -102,26 +102,26 @@ class VelocityConfig(TaskConfig):
     episode_seconds: Positive = 20.0
     """Simulated time after which the clock ends an episode [s]."""
     command_forward: Stages = ((0, -1.0, 1.0), (5000, -1.5, 2.0), (10000, -2.0, 3.0))
-    """Commanded velocities forward [m/s], uniform: stages ``[iteration, least, greatest]``, each of which holds from its iteration of
-    the training on; an iteration of mjlab's has 24 steps."""
+    """Commanded velocities forward [m/s], uniform: stages ``[iteration, least, greatest]``, each valid from its iteration on; an
+    iteration of mjlab's has 24 steps."""
     command_left: Stages = ((0, -1.0, 1.0),)
     """Commanded velocities to the left [m/s], as ``command_forward``."""
     command_turn: Stages = ((0, -0.5, 0.5), (5000, -0.7, 0.7))
     """Commanded turning velocities to the left [rad/s], as ``command_forward``."""
     command_seconds: Range = (3.0, 8.0)
-    """Simulated time for which a command holds [s], uniform; an episode begins with a new one."""
+    """Duration of a command, in simulated time [s], uniform; an episode begins with a new one."""
     command_stand: Share = 0.1
-    """Share of the commands that ask to stand still instead."""
+    """Share of commands to stand still."""
     command_heading: Share = 0.3
-    """Share of the commands that turn the robot to a heading, uniform in all directions."""
+    """Share of commands to turn to a heading, uniform in all directions."""
     command_ahead: Share = 0.2
-    """Share of the commands that ask to go straight ahead, with 0.3 m/s or more."""
+    """Share of commands to go straight ahead, at 0.3 m/s or more."""
     heading_stiffness: Amount = 0.5
-    """Turning velocity that such a command asks for [rad/s] for each rad that is left to its heading."""
+    """Turning velocity of a heading command per rad of heading error [1/s]."""
     push_seconds: Range = (1.0, 3.0)
     """Simulated time between two pushes of a world [s], uniform."""
     solver_iterations: Count = 10
-    """Limit of the solver's iterations; fewer are faster, and contacts less exact."""
+    """Limit of the solver's iterations; fewer are faster, with less exact contacts."""
     solver_line_search: Count = 20
     """Limit of the iterations of its line search."""
     ppo: PPOConfig = field(default_factory=lambda: PPO)
@@ -150,14 +150,14 @@ _G1 = {**_WALK, "body_ang_vel": -0.05, "angular_momentum": -0.02, "self_collisio
 
 @dataclass(frozen=True, config=STRICT)
 class Go1FlatConfig(VelocityConfig):
-    """A four-legged robot on a plane. What the rewards are: :class:`VelocityConfig`."""
+    """A four-legged robot on a plane. Rewards: see :class:`VelocityConfig`."""
 
     rewards: Mapping[str, float] = reward_weights(**_WALK)
 
 
 @dataclass(frozen=True, config=STRICT)
 class Go1RoughConfig(VelocityConfig):
-    """A four-legged robot on stairs, slopes and rough ground. What the rewards are: :class:`VelocityConfig`."""
+    """A four-legged robot on stairs, slopes and rough ground. Rewards: see :class:`VelocityConfig`."""
 
     rewards: Mapping[str, float] = reward_weights(
         **_WALK, self_collisions=-0.1, shank_collision=-0.1, trunk_head_collision=-0.1
@@ -166,13 +166,13 @@ class Go1RoughConfig(VelocityConfig):
 
 @dataclass(frozen=True, config=STRICT)
 class G1FlatConfig(VelocityConfig):
-    """A humanoid on a plane. What the rewards are: :class:`VelocityConfig`."""
+    """A humanoid on a plane. Rewards: see :class:`VelocityConfig`."""
 
     rewards: Mapping[str, float] = reward_weights(**_G1)
 
 
 @dataclass(frozen=True, config=STRICT)
 class G1RoughConfig(VelocityConfig):
-    """A humanoid on stairs, slopes and rough ground. What the rewards are: :class:`VelocityConfig`."""
+    """A humanoid on stairs, slopes and rough ground. Rewards: see :class:`VelocityConfig`."""
 
     rewards: Mapping[str, float] = reward_weights(**_G1)

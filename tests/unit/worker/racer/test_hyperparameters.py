@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from orchestrator.definition import compile_definition
-from orchestrator.errors import SpecError
-from orchestrator.spec import Spec, validate
-from orchestrator.spec_schema import schema
-from orchestrator.specfile import load
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.compile import compile_definition
+from orchestrator.spec.file import load
+from orchestrator.spec.json_schema import schema
+from orchestrator.spec.model import Spec, validate
 
 USUAL = {
     **{"batch_size": 64, "beta_entropy": 0.01, "discount_factor": 0.99, "e_greedy_value": 0.05, "epsilon_steps": 10000},
@@ -93,6 +93,7 @@ def test_a_stack_is_the_frames_of_the_camera() -> None:
         ({"lr": "fast"}, ".lr: expected a number from 1e-08 to 0.001, found 'fast'"),
         ({"lr": None}, ".lr: expected a number from 1e-08 to 0.001, found None"),
         ({"lrr": 1e-4}, ".lrr: DeepRacer has no such hyperparameter; did you mean lr?"),
+        ({"lerning_rate": 1e-4}, ".lerning_rate: DeepRacer has no such hyperparameter; did you mean lr?"),
         ({"batch_size": 63}, ".batch_size: expected one of 32, 64, 128, 256, 512, found 63"),
         ({"num_epochs": 2}, ".num_epochs: expected a whole number from 3 to 10, found 2"),
         ({"num_epochs": 5.5}, ".num_epochs: expected a whole number from 3 to 10, found 5.5"),
@@ -110,12 +111,12 @@ def test_a_stack_is_the_frames_of_the_camera() -> None:
         ("hyperparameters.json", ": a file is read for a job YAML alone; write its settings out"),
     ],
 )
-def test_one_that_can_not_be_used_is_refused_in_one_line(given: Any, words: str) -> None:
+def test_an_unusable_hyperparameter_is_refused_in_one_line(given: Any, words: str) -> None:
     found = refused(given)
     assert found.startswith(words) and "\n" not in found
 
 
-def test_what_is_given_as_a_setting_too_is_refused() -> None:
+def test_a_hyperparameter_that_is_also_a_setting_is_refused() -> None:
     assert refused({"lr": 1e-4}, ppo={"learning_rate": 1e-3}) == (
         ".lr: it is train.ppo.learning_rate here, which is given, too; leave one of them out"
     )

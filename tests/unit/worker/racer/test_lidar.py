@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.errors import SpecError
-from orchestrator.spec import validate
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.model import validate
 from worker.racer.car_arrays import CarArrays
 from worker.racer.circuit import BOX
 from worker.tasks.configs.racer import LidarConfig, ObstacleConfig, RacerConfig, RacerPixelsAndStateConfig

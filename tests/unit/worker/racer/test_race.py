@@ -106,7 +106,7 @@ def test_penalties_are_part_of_a_lap_s_time_and_not_of_its_lap_time() -> None:
         ("immobilized", {"config": {"speed_factor": [1e-4, 1e-4]}, "continuous": True, "max_resets": 2}, 45),
     ],
 )
-def test_what_ends_a_trial_is_its_status(status: str, section: dict[str, Any], steps: int) -> None:
+def test_the_cause_of_a_trial_s_end_is_its_status(status: str, section: dict[str, Any], steps: int) -> None:
     (trial,) = drive(trials=1, **section)[2].summary()["trials"]
     assert (trial["status"], trial["steps"], trial["lap_time"]) == (status, steps, None)
     assert trial["immobilized"] == (0 if "config" not in section else steps // 15)
@@ -154,7 +154,7 @@ def test_a_step_log_has_a_row_a_step_as_deepracer_s_tools_read_it(tmp_path: Path
     assert known(task, "tracks").tolist() == [0]
 
 
-def test_a_choice_is_told_by_its_number(tmp_path: Path) -> None:
+def test_a_choice_is_identified_by_its_number(tmp_path: Path) -> None:
     choices = [{"steering_angle": 0, "speed": 0.6}, {"steering_angle": 0, "speed": 1.0}]
     space = {"action_space": choices, "action_space_type": "discrete"}
     config = configured(RacerConfig, {"action_space": space, **race_changes({"seconds": 1.0})})

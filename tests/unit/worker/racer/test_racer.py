@@ -261,14 +261,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_no_car_can_have_is_refused_in_one_line_before_anything_is_built(case: str) -> None:
+def test_an_impossible_car_is_refused_in_one_line_before_anything_is_built(case: str) -> None:
     overrides, message = REFUSED[case]
     with pytest.raises(UserError) as refused:
         configure(Racer, {"config": overrides})
     assert str(refused.value).removeprefix("train.") == message
 
 
-def test_what_only_a_rank_can_see_is_refused_in_one_line(tmp_path: Any) -> None:
+def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) -> None:
     for fields, message in (
         ({"track": "ovall"}, "config.track: track 'ovall': there is no such track; did you mean oval?"),
         ({"action_space": f"{tmp_path}/none.json"}, f"config.{tmp_path}/none.json: it can't be read (No such file"),

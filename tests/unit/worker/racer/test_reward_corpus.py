@@ -73,7 +73,7 @@ def interpreted(source: str) -> Any:
 
 
 @pytest.mark.parametrize("name", [name for name in CORPUS if name not in OUTSIDE])
-def test_a_compiled_reward_function_gives_what_python_gives(name: str, rewarded: Any) -> None:
+def test_a_compiled_reward_function_equals_python_s(name: str, rewarded: Any) -> None:
     drawn, results = rewarded
     rewards, errors = results[name]
     function, expected, raised = interpreted(CORPUS[name]), [], 0
@@ -89,7 +89,7 @@ def test_a_compiled_reward_function_gives_what_python_gives(name: str, rewarded:
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_a_function_outside_the_subset_is_told_with_its_line_and_the_reason(name: str) -> None:
+def test_a_function_outside_the_subset_is_refused_with_its_line_and_the_reason(name: str) -> None:
     with pytest.raises(Outside) as outside:
         translate(CORPUS[name])
     assert str(outside.value) == OUTSIDE[name]

@@ -175,14 +175,14 @@ def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monk
     assert not kept.exists() or kept.stat().st_size == 0
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.py"
     assert str(check(path)) == f"{path}: TEST_FAILURE: the file can't be read: No such file or directory"
     path.write_bytes(b"\xff\xfe\x00")
     assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is no text: ")
 
 
-def test_the_command_says_what_is_wrong_or_how_it_runs(tmp_path: Path) -> None:
+def test_the_command_reports_errors_or_the_mode_of_execution(tmp_path: Path) -> None:
     good, slow, bad = tmp_path / "good.py", tmp_path / "slow.py", tmp_path / "bad.py"
     good.write_text(f"{HEAD}print(1)\n    return params['speed']\n")
     slow.write_text(f"{HEAD}seen = []\n    seen.append({{}})\n    return 1.0\n")

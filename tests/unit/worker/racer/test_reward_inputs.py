@@ -211,7 +211,7 @@ def test_the_function_is_the_one_term_and_has_a_weight() -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "kept = []\n"])
-def test_a_world_whose_function_fails_begins_afresh_and_is_counted(prefix: str) -> None:
+def test_a_world_whose_function_fails_is_reset_and_counted(prefix: str) -> None:
     text = prefix + (FAILING.replace("    return", "    kept.append(1)\n    return") if prefix else FAILING)
     task = racer(text, 2, track="oval", start="line")
     assert task.failures() == {}

@@ -187,7 +187,7 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
         ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
     ],
 )
-def test_what_is_outside_the_subset_is_told_with_line_and_reason(body: str, reason: str) -> None:
+def test_code_outside_the_subset_is_refused_with_line_and_reason(body: str, reason: str) -> None:
     with pytest.raises(Outside) as outside:
         translate(f"{HEAD}    {body}\n")
     assert str(outside.value) == f"{reason}: such functions run in Python workers"
@@ -249,7 +249,7 @@ def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
     assert said.stdout.splitlines()[-1:] == ["reason  True"], said.stderr
 
 
-def test_what_the_guard_refuses_is_not_run() -> None:
+def test_code_that_the_guard_refuses_does_not_run() -> None:
     with pytest.raises(RewardRefused, match=r"^r\.py:1: IMPORT_ERROR: os can't be imported"):
         RewardFunction(f"import os\n{SOURCE}", TRACKS, 2, file="r.py")
 

@@ -110,14 +110,14 @@ def test_a_call_that_does_not_end_or_floods_ends_the_pool_with_its_line_and_car(
         workers.rewards()
 
 
-def test_a_process_that_dies_is_told_with_its_cars() -> None:
+def test_a_process_that_dies_is_reported_with_its_cars() -> None:
     workers = pool("return 1.0")
     workers._processes[1].kill()
     with pytest.raises(RewardFailed, match=r"reward.py: cars 5 to 8: the process of the function ended \(signal 9\)"):
         workers.rewards()
 
 
-def test_a_file_that_cannot_be_loaded_is_told_at_the_start() -> None:
+def test_a_file_that_cannot_be_loaded_is_reported_at_the_start() -> None:
     with pytest.raises(RewardFailed, match=r"^reward.py:1: ZeroDivisionError: division by zero$"):
         Workers("A = 1 / 0\ndef reward_function(params):\n    return 1.0\n", "reward.py", [oval()], 2, 1)
 

@@ -46,7 +46,7 @@ def test_any_array_of_real_numbers_is_read(rows: np.ndarray) -> None:
     np.testing.assert_allclose(from_bytes(saved(rows), "oval").track.center, OVAL.center, atol=1e-6)
 
 
-def test_a_waypoint_that_stands_there_twice_is_left_out_and_told() -> None:
+def test_a_repeated_waypoint_is_left_out_and_reported() -> None:
     rows = OVAL.rows()
     twice = np.vstack((rows[:41], rows[40:41], rows[40:41], rows[41:], rows[-1:]))
     found = from_bytes(saved(twice), "oval")
@@ -103,7 +103,7 @@ def spoilt(row: int, column: int, value: float) -> bytes:
         (saved(OVAL.rows() * 1e6), "is farther than 10000 m from the origin"),
     ],
 )  # fmt: skip
-def test_a_file_that_is_no_track_is_refused_in_one_line(tmp_path: Path, data: bytes, words: str) -> None:
+def test_a_file_other_than_a_track_is_refused_in_one_line(tmp_path: Path, data: bytes, words: str) -> None:
     path = tmp_path / "track.npy"
     path.write_bytes(data)
     with pytest.raises(BadTrack) as told:
@@ -111,7 +111,7 @@ def test_a_file_that_is_no_track_is_refused_in_one_line(tmp_path: Path, data: by
     assert str(told.value).startswith(f"{path}: ") and words in str(told.value) and "\n" not in str(told.value)
 
 
-def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
+def test_an_irregular_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.npy")
     (tmp_path / "folder.npy").mkdir()
     for name in ("pipe.npy", "folder.npy"):

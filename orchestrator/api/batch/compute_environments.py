@@ -1,0 +1,258 @@
+"""Compute environments (hosts of an engine, by a name) and scheduling policies."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+
+from orchestrator.api import permissions
+from orchestrator.api.arns import ACCOUNT, ecs_arn, environment_arn, plain_name, policy_arn
+from orchestrator.api.batch import rules
+from orchestrator.api.batch.engine_tags import check_engine_tags
+from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation, Shared
+from orchestrator.control.compute_environments import is_built_in
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy
+
+_MOST_ENVIRONMENTS = 50
+_SERVICE_ROLE = "/aws-service-role/batch.amazonaws.com/AWSServiceRoleForBatch"
+
+
+def create_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CreateComputeEnvironment. Subnets, instance types and the like are kept and shown, and mean nothing to the engine."""
+    permissions.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
+    name = request["computeEnvironmentName"]
+    rules.check_name("computeEnvironmentName", name)
+    rules.check_tags(request.get("tags") or {})
+    if context.session.get(ComputeEnvironment, name):
+        raise ClientError(f"Compute environment {name} exists already; UpdateComputeEnvironment changes it")
+    if len(context.session.scalars(select(ComputeEnvironment.name)).all()) >= _MOST_ENVIRONMENTS:
+        raise ClientError(f"there are {_MOST_ENVIRONMENTS} compute environments; delete one first")
+    if request["type"] not in ("MANAGED", "UNMANAGED"):
+        raise ClientError(f"type is {request['type'][:50]!r}; it is MANAGED or UNMANAGED")
+    if request.get("eksConfiguration"):
+        raise ClientError("eksConfiguration is not supported; leave it out")
+    resources = request.get("computeResources")
+    if request["type"] == "MANAGED" and not resources:
+        raise ClientError("a MANAGED compute environment needs computeResources")
+    _check_resources(resources or {})
+    document = {key: value for key, value in request.items() if key not in ("tags", "state")}
+    environment = ComputeEnvironment(name=name, document=document, tags=request.get("tags") or {})
+    environment.state = _state(request.get("state", "ENABLED"))
+    check_engine_tags(context, environment, environment.tags)
+    context.session.add(environment)
+    return {"computeEnvironmentName": name, "computeEnvironmentArn": environment_arn(name)}
+
+
+def describe_compute_environments(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeComputeEnvironments, by names or ARNs, or all."""
+    query = select(ComputeEnvironment).order_by(ComputeEnvironment.name)
+    if named := request.get("computeEnvironments"):
+        query = query.where(ComputeEnvironment.name.in_([plain_name(each, "compute-environment") for each in named]))
+    rows, token = page(context.session, query, request, page_size(request, 100), (ComputeEnvironment.name,), (False,))
+    return {"computeEnvironments": [_describe(context, environment) for environment in rows], **token}
+
+
+def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
+    environment = _environment(context, request["computeEnvironment"])
+    permissions.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, environment)
+    if (state := request.get("state")) is not None:
+        environment.state = _state(state)
+    if changes := request.get("computeResources"):
+        if environment.document["type"] != "MANAGED":
+            raise ClientError(f"Compute environment {environment.name} is UNMANAGED and has no computeResources")
+        _check_resources(changes)
+        resources = {**(environment.document.get("computeResources") or {}), **changes}
+        environment.document = {**environment.document, "computeResources": resources}
+    for key in ("serviceRole", "unmanagedvCpus", "context"):
+        if key in request:
+            environment.document = {**environment.document, key: request[key]}
+    return {"computeEnvironmentName": environment.name, "computeEnvironmentArn": environment_arn(environment.name)}
+
+
+def delete_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DeleteComputeEnvironment of one that is DISABLED and in no queue."""
+    permissions.check(Operation.DELETE_COMPUTE_ENVIRONMENT, Shared())
+    environment = context.session.get(
+        ComputeEnvironment, plain_name(request["computeEnvironment"], "compute-environment")
+    )
+    if environment is None:
+        return {}
+    if environment.state != "DISABLED":
+        raise ClientError(f"Compute environment {environment.name} is ENABLED; disable it first")
+    users = [
+        queue.name
+        for queue in context.session.scalars(select(JobQueue))
+        if environment.name in queue.compute_environments
+    ]
+    if users:
+        raise ClientError(f"Compute environment {environment.name} is used by job queue {users[0]}; delete that first")
+    context.session.delete(environment)
+    return {}
+
+
+def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CreateSchedulingPolicy with a fairsharePolicy."""
+    permissions.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
+    name = request["name"]
+    rules.check_name("name", name)
+    rules.check_tags(request.get("tags") or {})
+    if request.get("quotaSharePolicy"):
+        raise ClientError("quotaSharePolicy is for service jobs, which are not supported; use fairsharePolicy")
+    if context.session.get(SchedulingPolicy, name):
+        raise ClientError(f"Scheduling policy {name} exists already; UpdateSchedulingPolicy changes it")
+    fairshare = request.get("fairsharePolicy")
+    if fairshare is None:
+        raise ClientError(f"Scheduling policy {name}: give a fairsharePolicy; {{}} is one with the defaults")
+    _check_fairshare(fairshare)
+    context.session.add(SchedulingPolicy(name=name, fairshare=fairshare, tags=request.get("tags") or {}))
+    return {"name": name, "arn": policy_arn(name)}
+
+
+def describe_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeSchedulingPolicies by ARNs; unknown ones are passed over."""
+    found = [context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy")) for arn in request["arns"]]
+    return {
+        "schedulingPolicies": [
+            {"name": each.name, "arn": policy_arn(each.name), "fairsharePolicy": each.fairshare, "tags": each.tags}
+            for each in found
+            if each is not None
+        ]
+    }
+
+
+def list_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """ListSchedulingPolicies."""
+    query = select(SchedulingPolicy).order_by(SchedulingPolicy.name)
+    rows, token = page(context.session, query, request, page_size(request, 100), (SchedulingPolicy.name,), (False,))
+    return {"schedulingPolicies": [{"arn": policy_arn(policy.name)} for policy in rows], **token}
+
+
+def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """UpdateSchedulingPolicy: the fairsharePolicy is replaced."""
+    policy = _policy(context, request["arn"])
+    permissions.check(Operation.UPDATE_SCHEDULING_POLICY, policy)
+    if request.get("quotaSharePolicy"):
+        raise ClientError(f"Scheduling policy {policy.name} has a fairsharePolicy; its kind can't change")
+    if (fairshare := request.get("fairsharePolicy")) is not None:
+        _check_fairshare(fairshare)
+        policy.fairshare = fairshare
+    return {}
+
+
+def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DeleteSchedulingPolicy of one that no queue uses."""
+    policy = _policy(context, request["arn"])
+    permissions.check(Operation.DELETE_SCHEDULING_POLICY, policy)
+    user = context.session.scalars(select(JobQueue).where(JobQueue.policy == policy.name).limit(1)).first()
+    if user is not None:
+        raise ClientError(f"Scheduling policy {policy.name} is used by job queue {user.name}; delete that first")
+    context.session.delete(policy)
+    return {}
+
+
+def _environment(context: Context, reference: str) -> ComputeEnvironment:
+    environment = context.session.get(ComputeEnvironment, plain_name(reference, "compute-environment"))
+    if environment is None:
+        raise ClientError(f"Compute environment {reference[:300]} does not exist")
+    return environment
+
+
+def _policy(context: Context, arn: str) -> SchedulingPolicy:
+    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
+    if policy is None:
+        raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
+    return policy
+
+
+def _state(state: str) -> str:
+    if state not in ("ENABLED", "DISABLED"):
+        raise ClientError(f"state is {state[:50]!r}; it is ENABLED or DISABLED")
+    return state
+
+
+def _check_resources(resources: Mapping[str, Any]) -> None:
+    if str(resources.get("type", "EC2")).startswith("FARGATE"):
+        raise ClientError(f"computeResources type {resources['type'][:50]} is not supported; use EC2")
+    for key in ("minvCpus", "maxvCpus", "desiredvCpus"):
+        if resources.get(key) is not None and not 0 <= resources[key] <= 10_000_000:
+            raise ClientError(f"computeResources {key} is {resources[key]}; it must be 0 to 10000000")
+
+
+def _check_fairshare(fairshare: Mapping[str, Any]) -> None:
+    decay, reservation = fairshare.get("shareDecaySeconds", 0), fairshare.get("computeReservation", 0)
+    if not 0 <= decay <= 604_800:
+        raise ClientError(f"shareDecaySeconds is {decay}; it must be 0 to 604800")
+    if not 0 <= reservation <= 99:
+        raise ClientError(f"computeReservation is {reservation}; it must be 0 to 99")
+    _check_shares(fairshare.get("shareDistribution") or [])
+
+
+def _check_shares(shares: Sequence[Mapping[str, Any]]) -> None:
+    if len(shares) > 500:
+        raise ClientError(f"shareDistribution has {len(shares)} entries; at most 500")
+    names = [each["shareIdentifier"] for each in shares]
+    for each in shares:
+        if not re.fullmatch(r"[A-Za-z0-9]{0,254}([A-Za-z0-9]|\*)", each["shareIdentifier"]):
+            raise ClientError(
+                f"shareIdentifier {each['shareIdentifier'][:100]!r}: 1 to 255 letters and digits, a * at the end at most"
+            )
+        if not 0.0001 <= each.get("weightFactor", 1.0) <= 999.9999:
+            raise ClientError(f"weightFactor is {each['weightFactor']}; it must be 0.0001 to 999.9999")
+    for i, name in enumerate(names):
+        for other in names[:i]:
+            if _matches(name, other) or _matches(other, name):
+                raise ClientError(f"shareDistribution: {other} and {name} overlap")
+
+
+def _matches(pattern: str, name: str) -> bool:
+    """Whether an entry (a name, or a prefix and ``*``) speaks of what another one does."""
+    return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
+
+
+def _describe(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "containerOrchestrationType": "ECS",
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_OID, f"{environment.name}/{environment.created_at}")),
+        "ecsClusterArn": ecs_arn("cluster", environment.name),
+        **environment.document,
+        "computeEnvironmentName": environment.name,
+        "computeEnvironmentArn": environment_arn(environment.name),
+        "state": environment.state,
+        "status": "VALID",
+        "statusReason": "ComputeEnvironment Healthy",
+        "tags": environment.tags,
+    }
+    if document["type"] == "MANAGED":
+        document.setdefault("serviceRole", f"arn:aws:iam::{ACCOUNT}:role{_SERVICE_ROLE}")
+        document.setdefault("updatePolicy", {"terminateJobsOnUpdate": False, "jobExecutionTimeoutMinutes": 30})
+    if is_built_in(environment):
+        document["computeResources"] = {**_own_resources(context, environment), **document.get("computeResources", {})}
+    return document
+
+
+def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[str, Any]:
+    """``computeResources`` of a built-in environment: the hosts that its engine has now."""
+    engine = context.controller.engine
+    served = [environment.name] if environment.name in engine.names else []
+    cpus = int(sum(host.cpus for host in engine.capacity(served, FRESH)))
+    return {
+        "type": "EC2",
+        "allocationStrategy": "BEST_FIT_PROGRESSIVE",
+        "minvCpus": 0 if engine.is_elastic(served) else cpus,
+        "maxvCpus": cpus,
+        "desiredvCpus": cpus,
+        "instanceTypes": ["optimal"],
+        "subnets": [],
+        "securityGroupIds": [],
+        "instanceRole": f"arn:aws:iam::{ACCOUNT}:instance-profile/muster",
+        "tags": {},
+    }

@@ -1,0 +1,62 @@
+"""``ecsProperties`` of one container: the newer way to say what ``containerProperties`` says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrator.api.errors import ClientError
+
+_OF_TASK = {"executionRoleArn": "executionRoleArn", "taskRoleArn": "jobRoleArn", "volumes": "volumes"}
+"""Members of the task, and what they are called in ``containerProperties``."""
+_UNSUPPORTED_OF_TASK = (
+    *("ephemeralStorage", "platformVersion", "ipcMode", "pidMode", "networkConfiguration", "runtimePlatform"),
+    *("enableExecuteCommand", "networkMode"),
+)
+_UNSUPPORTED_OF_CONTAINER = ("dependsOn", "firelensConfiguration", "startTimeout", "stopTimeout")
+
+
+def from_ecs(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The ``containerProperties`` that mean the same. Raises ClientError for what they can't say."""
+    task = _only(properties["taskProperties"], "task", where)
+    container = _only(task["containers"], "container", where)
+    for given, keys in ((task, _UNSUPPORTED_OF_TASK), (container, _UNSUPPORTED_OF_CONTAINER)):
+        for key in keys:
+            if given.get(key):
+                raise ClientError(f"{where}: {key} is not supported; leave it out")
+    if container.get("essential") is False:
+        raise ClientError(f"{where}: the only container of a job is essential; leave essential out")
+    same = {key: value for key, value in container.items() if key not in ("name", "essential")}
+    return {**same, **{ours: task[theirs] for theirs, ours in _OF_TASK.items() if theirs in task}}
+
+
+def override_from_ecs(override: Mapping[str, Any], there: str, where: str) -> dict[str, Any]:
+    """The ``containerOverrides`` that mean the same as ``ecsPropertiesOverride`` of a container called ``there``. Raises ClientError."""
+    if not override.get("taskProperties"):
+        return {}
+    containers = _only(override["taskProperties"], "task", where).get("containers")
+    if not containers:
+        return {}
+    changes = dict(_only(containers, "container", where))
+    if (name := changes.pop("name", None)) is not None and name != there:
+        raise ClientError(f"{where}: there is no container {name[:100]!r}; the definition's is called {there!r}")
+    return changes
+
+
+def container_name(properties: Mapping[str, Any]) -> str:
+    """The container's name in the definition."""
+    return str(properties["taskProperties"][0]["containers"][0].get("name") or "default")
+
+
+def to_ecs(container: Mapping[str, Any], name: str, task: Mapping[str, Any]) -> dict[str, Any]:
+    """``ecsProperties`` of a container detail; ``task``: what belongs to the whole task, such as ``taskArn``."""
+    own = {key: value for key, value in container.items() if key not in (*_OF_TASK.values(), *task)}
+    of_task = {theirs: container[ours] for theirs, ours in _OF_TASK.items() if ours in container}
+    return {"taskProperties": [{"containers": [{**own, "name": name, "essential": True}], **of_task, **task}]}
+
+
+def _only(entries: Any, what: str, where: str) -> Mapping[str, Any]:
+    if len(entries) != 1:
+        raise ClientError(f"{where}: {len(entries)} {what}s; a job has one {what} here, with one container")
+    only: Mapping[str, Any] = entries[0]
+    return only

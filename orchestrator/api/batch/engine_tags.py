@@ -1,0 +1,33 @@
+"""Tags ``muster:…`` of compute environments and queues: options of their engines."""
+
+from __future__ import annotations
+
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by
+from orchestrator.engines.api import EngineError
+from orchestrator.engines.installed import ENGINES, check_tags
+from orchestrator.persistence.models import ComputeEnvironment, JobQueue
+from shared_store.wording import nearest
+
+
+def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) -> None:
+    """Raises ClientError where the resource can't have these tags, for an option that is misspelt or has a wrong value."""
+    first = context.controller.engine.names[0]
+    if isinstance(resource, ComputeEnvironment):
+        engines = [engine_named_by(tags, first)]
+    elif isinstance(resource, JobQueue):
+        found = [context.session.get(ComputeEnvironment, name) for name in resource.compute_environments]
+        engines = [engine_named_by(each.tags, first) for each in found if each is not None]
+    else:
+        return
+    if not any(tag.startswith("muster:") for tag in tags):
+        return
+    if isinstance(resource, ComputeEnvironment) and engines[0] not in (*ENGINES, *context.controller.engine.names):
+        raise ClientError(
+            f"tag {ENGINE_TAG} is {engines[0][:100]!r}: there is no such engine; {nearest(engines[0], ENGINES)}"
+        )
+    try:
+        check_tags(tags, [each for each in engines if each in ENGINES], of_a_queue=isinstance(resource, JobQueue))
+    except (ValueError, EngineError) as error:
+        raise ClientError(str(error)) from None

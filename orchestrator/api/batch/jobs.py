@@ -1,0 +1,234 @@
+"""DescribeJobs, ListJobs, TerminateJob(s), CancelJob(s)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, func, or_, select
+from sqlalchemy.orm import selectinload
+
+from orchestrator.api import permissions
+from orchestrator.api.arns import definition_arn, queue_arn, split_reference
+from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
+from orchestrator.api.batch.paging import decode, encode, page, page_size
+from orchestrator.api.context import Context
+from orchestrator.api.damaged import DamagedRow, reading
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.domain.excerpts import LONGEST_REASON
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.queries import ask_to_end
+
+_BEFORE_NAME = len(definition_arn("", 1)) - 1
+"""Where the name begins in a definition's ARN, from 1."""
+_EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
+
+
+def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeJobs for jobs, nodes (``id#N``, ``arn#N``) and array children (``id:N``); unknown ids are passed over."""
+    found = []
+    for reference in request["jobs"]:
+        job_id, node = split_reference(reference)
+        job = context.session.get(Job, job_id)
+        if job is None or not permissions.is_visible(job):
+            continue
+        reason = context.reason(job)
+        try:
+            with reading(job):
+                if node is not None and not (job.kind == "multinode" and 0 <= node < job.node_properties["numNodes"]):
+                    continue
+                detail = describe_job(job, context.definition_of(job), node, reason)
+        except DamagedRow:
+            detail = {**describe_damaged(job, reason), "jobQueue": queue_arn(job.queue)}
+        if (array := array_properties(job, _count_children(context, job))) is not None:
+            detail["arrayProperties"] = array
+        found.append(detail)
+    return {"jobs": found}
+
+
+def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """ListJobs of a queue, of an array's children, or of a gang's nodes.
+
+    Without a status only RUNNING ones are listed. A filter applies to a queue only, and lists jobs in all states.
+    """
+    given = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
+    if len(given) != 1:
+        raise ClientError("ListJobs: give exactly one of jobQueue, arrayJobId, multiNodeJobId")
+    if (status := request.get("jobStatus")) and status not in list(Status):
+        raise ClientError(f"jobStatus is {status[:50]!r}; it is one of {', '.join(Status)}")
+    if request.get("multiNodeJobId"):
+        return _list_nodes(context, request)
+    if array := request.get("arrayJobId"):
+        job_id, _ = split_reference(array)
+        if (parent := context.session.get(Job, job_id)) is not None:
+            permissions.check(Operation.LIST_JOBS, parent)
+        status = request.get("jobStatus", Status.RUNNING)
+        query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
+        query = query.options(selectinload(Job.attempts))
+        rows, token = page(
+            context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
+        )
+    else:
+        queue = context.queue(request["jobQueue"], deleting=True)
+        permissions.check(Operation.LIST_JOBS, JobsOf(queue.name))
+        conditions = _conditions(request)
+        query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
+        query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
+        most = 100 if request.get("filters") else 1000
+        keys = (Job.created_at, Job.id)
+        rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))
+    return {"jobSummaryList": [_summary(job, context.reason(job)) for job in rows], **token}
+
+
+def _summary(job: Job, reason: str | None) -> dict[str, Any]:
+    try:
+        with reading(job):
+            return summarize(job, reason)
+    except DamagedRow:
+        return describe_damaged(job, reason)
+
+
+def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
+    job = context.session.get(Job, split_reference(request["multiNodeJobId"])[0])
+    if job is None or job.kind != "multinode":
+        return {"jobSummaryList": []}
+    permissions.check(Operation.LIST_JOBS, job)
+    wanted, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
+    with reading(job):
+        nodes = [node for node in range(int(job.node_properties["numNodes"])) if node_status(job, node) == wanted]
+    token = request.get("nextToken")
+    start = decode(token, [int])[0] if token else 0
+    if start < 0:
+        raise ClientError(f"nextToken {str(token)[:100]!r} is not one that was given out")
+    end = start + page_size(dict(request), 1000)
+    more = {"nextToken": encode([end])} if len(nodes) > end else {}
+    with reading(job):
+        return {"jobSummaryList": [summarize(job, reason, node) for node in nodes[start:end]], **more}
+
+
+def _conditions(request: Mapping[str, Any]) -> Sequence[Any]:
+    filters = request.get("filters") or []
+    if len(filters) > 1:
+        raise ClientError("ListJobs takes one filter at a time")
+    if not filters:
+        return [Job.status == request.get("jobStatus", Status.RUNNING)]
+    name, values = filters[0].get("name"), filters[0].get("values") or []
+    if len(values) != 1:
+        raise ClientError(f"ListJobs: filter {name} has {len(values)} values; it takes one")
+    value = values[0]
+    match name:
+        case "JOB_NAME":
+            if value.endswith("*"):
+                return [func.lower(Job.name).startswith(value[:-1].lower(), autoescape=True)]
+            return [func.lower(Job.name) == value.lower()]
+        case "JOB_DEFINITION":
+            return [_by_definition(value)]
+        case "BEFORE_CREATED_AT" | "AFTER_CREATED_AT":
+            if not (value.isascii() and value.isdigit() and len(value) < 16):
+                raise ClientError(f"ListJobs: filter {name} takes a time in milliseconds, not {value[:50]!r}")
+            return [Job.created_at < int(value) if name == "BEFORE_CREATED_AT" else Job.created_at > int(value)]
+        case "SHARE_IDENTIFIER":
+            status = request.get("jobStatus")  # the one filter that goes with a status
+            return [Job.share == value, *([Job.status == status] if status else [])]
+    raise ClientError(
+        f"ListJobs: filter {str(name)[:50]!r} is not known; use JOB_NAME, JOB_DEFINITION, BEFORE_CREATED_AT, "
+        "AFTER_CREATED_AT or SHARE_IDENTIFIER"
+    )
+
+
+def _by_definition(value: str) -> Any:
+    """A definition's name (any revision), name:revision or ARN; only a name may end in ``*``. The case matters."""
+    if value.startswith("arn:"):
+        return Job.definition == value
+    name, _, revision = value.partition(":")
+    if revision and not value.endswith("*"):
+        return func.substr(Job.definition, _BEFORE_NAME) == value
+    start = value[:-1] if value.endswith("*") else f"{name}:"
+    return func.substr(Job.definition, _BEFORE_NAME, len(start)) == start  # LIKE would not heed the case in SQLite
+
+
+def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """TerminateJob: SIGTERM, grace, SIGKILL, FAILED; a job that does not run yet is cancelled; a finished job is left unchanged."""
+    _check_reason(request, Operation.TERMINATE_JOB)
+    _terminate(context, _target(context, request["jobId"], Operation.TERMINATE_JOB), request["reason"])
+    return {}
+
+
+def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
+    _check_reason(request, Operation.CANCEL_JOB)
+    _cancel(context, _target(context, request["jobId"], Operation.CANCEL_JOB), request["reason"])
+    return {}
+
+
+def terminate_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """TerminateJobs: TerminateJob for up to 50 jobs, each with its own result."""
+    return _each(context, request, Operation.TERMINATE_JOBS, _terminate)
+
+
+def cancel_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CancelJobs: CancelJob for up to 50 jobs, each with its own result."""
+    return _each(context, request, Operation.CANCEL_JOBS, _cancel)
+
+
+def _each(
+    context: Context,
+    request: Mapping[str, Any],
+    operation: Operation,
+    end: Callable[[Context, ColumnElement[bool], str], None],
+) -> dict[str, Any]:
+    """The result for each job; as on AWS, one that does not exist counts as ended."""
+    _check_reason(request, operation)
+    if not request["jobs"]:
+        raise ClientError(f"{operation} takes at least one job")
+    successful: list[str] = []
+    errors: list[dict[str, str]] = []
+    for reference in request["jobs"]:
+        try:
+            end(context, _target(context, reference, operation), request["reason"])
+        except UnknownJob:
+            pass
+        except ClientError as error:
+            code = "AccessDenied" if error.status == 403 else "ValidationException"
+            errors.append({"job": reference, "code": code, "message": str(error)})
+            continue
+        successful.append(reference)
+    return {"successful": successful, "errors": errors}
+
+
+def _terminate(context: Context, target: ColumnElement[bool], reason: str) -> None:
+    ask_to_end(context.session, target, reason)
+
+
+def _cancel(context: Context, target: ColumnElement[bool], reason: str) -> None:
+    ask_to_end(context.session, and_(target, Job.status.in_(_EARLY)), reason, cancelled=True)
+
+
+class UnknownJob(ClientError):
+    """There is no job of this id."""
+
+
+def _check_reason(request: Mapping[str, Any], operation: Operation) -> None:
+    if len(request["reason"]) > LONGEST_REASON:
+        raise ClientError(f"{operation}: the reason is longer than {LONGEST_REASON} characters")
+
+
+def _target(context: Context, reference: str, operation: Operation) -> ColumnElement[bool]:
+    """The row of the job; of an array those of its children too. Raises ClientError, UnknownJob."""
+    job_id, node = split_reference(reference)
+    if node is not None:
+        raise ClientError(f"{operation}: a single node can't be ended; give the job's id")
+    job = context.session.get(Job, job_id)
+    if job is None:
+        raise UnknownJob(f"Job {reference[:300]} does not exist")
+    permissions.check(operation, job)
+    return or_(Job.id == job.id, Job.parent == job.id) if job.kind == "array" else Job.id == job.id
+
+
+def _count_children(context: Context, job: Job) -> Mapping[str, int]:
+    if job.kind != "array":
+        return {}
+    query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
+    return {status: count for status, count in context.session.execute(query)}

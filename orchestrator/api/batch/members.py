@@ -1,0 +1,96 @@
+"""Members of AWS's model that are not supported here: refused by name, in one line.
+
+Members that are ignored are listed in docs/aws-differences.md; a test checks every member of the model against both.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrator.api.errors import ClientError
+
+_FARGATE = "is for Fargate, which is not supported; leave it out"
+_REFUSED = {
+    "networkConfiguration": _FARGATE,
+    "fargatePlatformConfiguration": _FARGATE,
+    "ephemeralStorage": _FARGATE,
+    "runtimePlatform": _FARGATE,
+    "enableExecuteCommand": "is not supported; leave it out",
+    "repositoryCredentials": "is not supported; log the controller's Docker in to the registry: docker login",
+}
+"""Members of ``containerProperties`` that a definition can't have, with what to do. False and empty values say nothing."""
+_LOG_OPTIONS = (
+    *("awslogs-region", "awslogs-create-group", "awslogs-stream-prefix", "awslogs-endpoint", "mode"),
+    "max-buffer-size",
+)
+"""Options of the driver ``awslogs`` that change nothing in what can be read here."""
+_USER = re.compile(r"[a-z0-9_][a-z0-9_-]{0,30}(:[a-z0-9_][a-z0-9_-]{0,30})?")
+_VOLUME_KINDS = ("host", "efsVolumeConfiguration", "s3filesVolumeConfiguration")
+LOG_GROUP = "/aws/batch/job"
+
+
+def check_consumables(request: Mapping[str, Any], where: str) -> None:
+    """Raises ClientError where the request counts on consumable resources."""
+    for key in ("consumableResourceProperties", "consumableResourcePropertiesOverride"):
+        if (request.get(key) or {}).get("consumableResourceList"):
+            raise ClientError(
+                f"{where}: {key} is not supported; a job queue with a compute environment of its own limits what runs at once"
+            )
+
+
+def check_members(container: Mapping[str, Any], where: str) -> None:
+    """``containerProperties``: refuse what would have no effect. Raises ClientError."""
+    for key, advice in _REFUSED.items():
+        if container.get(key):
+            raise ClientError(f"{where}: {key} {advice}")
+    for volume in container.get("volumes") or []:
+        if volume.get("s3filesVolumeConfiguration"):
+            raise ClientError(
+                f"{where}: volume {volume.get('name')!r}: s3filesVolumeConfiguration is not supported; use host or "
+                "efsVolumeConfiguration"
+            )
+        if not (volume.get("host") or {}).get("sourcePath") and not volume.get("efsVolumeConfiguration"):
+            raise ClientError(
+                f"{where}: volume {volume.get('name')!r} names no directory: give host.sourcePath or efsVolumeConfiguration"
+            )
+    if (user := container.get("user")) is not None and not _USER.fullmatch(user):
+        raise ClientError(
+            f"{where}: user {user[:60]!r}: a name or number, and after a colon a group, in small letters, digits, _ and -"
+        )
+    _check_log(container.get("logConfiguration") or {}, where)
+    _check_secrets(container, where)
+
+
+def _check_log(log: Mapping[str, Any], where: str) -> None:
+    """Logs are kept in the store and read as CloudWatch Logs; nothing else can be configured."""
+    if not log:
+        return
+    if log["logDriver"] != "awslogs":
+        raise ClientError(
+            f"{where}: logConfiguration logDriver {log['logDriver'][:50]!r} is not supported; use awslogs, or leave it out"
+        )
+    if log.get("secretOptions"):
+        raise ClientError(f"{where}: logConfiguration secretOptions is not supported; leave it out")
+    for name, value in (log.get("options") or {}).items():
+        if name == "awslogs-group" and value != LOG_GROUP:
+            raise ClientError(
+                f"{where}: logConfiguration awslogs-group {value[:200]!r}: all logs are in {LOG_GROUP}; name that, or leave it out"
+            )
+        if name not in (*_LOG_OPTIONS, "awslogs-group"):
+            raise ClientError(f"{where}: logConfiguration option {name[:100]!r} is not supported; leave it out")
+
+
+def _check_secrets(container: Mapping[str, Any], where: str) -> None:
+    variables = {pair.get("name") for pair in container.get("environment") or []}
+    names: set[str] = set()
+    for secret in container.get("secrets") or []:
+        name = secret["name"]
+        if not name or "=" in name or "\0" in name or name.startswith(("AWS_BATCH", "MUSTER_")):
+            raise ClientError(
+                f"{where}: secret {name[:100]!r}: the name of a variable, without '=', not AWS_BATCH… and not MUSTER_…"
+            )
+        if name in names or name in variables:
+            raise ClientError(f"{where}: {name[:100]} is given twice among secrets and environment")
+        names.add(name)

@@ -1,0 +1,122 @@
+"""AWS Batch operations in AWS's own shapes: from a request to a response.
+
+Requests are validated against the service model that botocore ships (data, not code of ours), then against the rules that the
+model can't say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from botocore.validate import ParamValidator
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import compute_environments as environments
+from orchestrator.api.batch import definitions, jobs, queues, submission, tags
+from orchestrator.api.batch.service_model import service_model
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http import limits
+from orchestrator.api.permissions import Operation
+from orchestrator.api.sources import with_teacher
+from orchestrator.control.reconciler import Controller
+from shared_store.parent import TeacherCopy
+
+OPERATIONS: dict[str, Callable[[Context, dict[str, Any]], dict[str, Any]]] = {
+    "RegisterJobDefinition": definitions.register_job_definition,
+    "DescribeJobDefinitions": definitions.describe_job_definitions,
+    "DeregisterJobDefinition": definitions.deregister_job_definition,
+    "SubmitJob": submission.submit_job,
+    "DescribeJobs": jobs.describe_jobs,
+    "ListJobs": jobs.list_jobs,
+    "TerminateJob": jobs.terminate_job,
+    "CancelJob": jobs.cancel_job,
+    "TerminateJobs": jobs.terminate_jobs,
+    "CancelJobs": jobs.cancel_jobs,
+    "CreateJobQueue": queues.create_job_queue,
+    "DescribeJobQueues": queues.describe_job_queues,
+    "UpdateJobQueue": queues.update_job_queue,
+    "DeleteJobQueue": queues.delete_job_queue,
+    "GetJobQueueSnapshot": queues.get_job_queue_snapshot,
+    "CreateComputeEnvironment": environments.create_compute_environment,
+    "DescribeComputeEnvironments": environments.describe_compute_environments,
+    "UpdateComputeEnvironment": environments.update_compute_environment,
+    "DeleteComputeEnvironment": environments.delete_compute_environment,
+    "CreateSchedulingPolicy": environments.create_scheduling_policy,
+    "DescribeSchedulingPolicies": environments.describe_scheduling_policies,
+    "ListSchedulingPolicies": environments.list_scheduling_policies,
+    "UpdateSchedulingPolicy": environments.update_scheduling_policy,
+    "DeleteSchedulingPolicy": environments.delete_scheduling_policy,
+    "TagResource": tags.tag_resource,
+    "UntagResource": tags.untag_resource,
+    "ListTagsForResource": tags.list_tags_for_resource,
+}
+_INSTEAD = {
+    "ServiceJob": "SubmitJob with a job definition of type multinode or container",
+    "ServiceEnvironment": "CreateComputeEnvironment",
+    "QuotaShare": "CreateSchedulingPolicy with a fairsharePolicy",
+    "ConsumableResource": "a job queue with its own compute environment, whose size limits what runs at once",
+}
+"""Substitutes for unsupported operations, by a part of their names."""
+
+
+_ADDING = ("Submit", "Register", "Create", "Tag")
+"""Prefixes of the operations that need space in the database; the others change or end existing objects."""
+
+
+@cache
+def operation_names() -> dict[str, str]:
+    """Path name (lower case) → operation, of every operation that AWS Batch has."""
+    return {name.lower(): name for name in service_model("batch").operation_names}
+
+
+def validate(operation: str, request: object) -> dict[str, Any]:
+    """The request, checked against AWS's model. Raises ClientError with what is wrong, in one line."""
+    if not isinstance(request, dict):
+        raise ClientError(f"{operation}: expected a JSON object")
+    limits.check_size(operation, request)
+    report = ParamValidator().validate(request, service_model("batch").operation_model(operation).input_shape)
+    if report.has_errors():
+        message = " ".join(report.generate_report().split())
+        raise ClientError(f"Error executing request, Exception : {message[:2000]}")
+    return request
+
+
+def call(controller: Controller, operation: str, request: object, idempotency_key: str | None = None) -> dict[str, Any]:
+    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Controller.check_writable`)."""
+    handler = OPERATIONS.get(operation)
+    if handler is None:
+        instead = next((use for part, use in _INSTEAD.items() if part in operation), None)
+        known = operation in operation_names().values()
+        hint = f"use {instead}" if instead else f"supported are {', '.join(OPERATIONS)}"
+        raise ClientError(
+            f"{operation[:100]} {'is not supported here' if known else 'is not an operation of AWS Batch'}; {hint}"
+        )
+    checked = validate(operation, request)
+    permitted = Operation(operation)
+    permissions.check(permitted)
+    if permitted.reads:
+        with controller.database.session() as session:
+            answer: dict[str, Any] = permissions.shown(handler(Context(session, controller), checked))
+            return answer
+
+    def carry_out(session: Session, teacher: TeacherCopy | None = None) -> dict[str, Any]:
+        return handler(Context(session, controller, idempotency_key, teacher=teacher), checked)
+
+    controller.check_writable(adds=operation.startswith(_ADDING))
+    try:
+        if operation == "SubmitJob":
+            response = with_teacher(
+                controller, lambda teacher: controller.submissions.call(lambda session: carry_out(session, teacher))
+            )
+        else:
+            with controller.writing, controller.database.session() as session:
+                response = carry_out(session)
+    except IntegrityError as error:  # two calls at the same instant
+        raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
+    controller.wake()
+    return response

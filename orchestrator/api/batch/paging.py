@@ -1,0 +1,68 @@
+"""Pages by position in an order, not by count: no row is repeated or skipped when rows are added or deleted between two calls."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import Select, and_, or_
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from orchestrator.api.errors import ClientError
+
+
+def page_size(request: dict[str, Any], most: int) -> int:
+    """``maxResults``, at most ``most``."""
+    return max(1, min(request.get("maxResults") or most, most))
+
+
+def page(
+    session: Session,
+    query: Select[Any],
+    request: dict[str, Any],
+    size: int,
+    keys: Sequence[InstrumentedAttribute[Any]],
+    descending: Sequence[bool] = (False, True),
+) -> tuple[list[Any], dict[str, str]]:
+    """The rows behind ``nextToken``, and the token of the next page where there is one.
+
+    Args:
+        session: The session.
+        query: Rows, ordered by ``keys``.
+        request: Holds ``nextToken``.
+        size: Rows a page.
+        keys: The columns of the order; together they are unique.
+        descending: Of each key.
+    """
+    if token := request.get("nextToken"):
+        values = decode(token, [key.type.python_type for key in keys])
+        behind = []
+        for index, (key, value) in enumerate(zip(keys, values, strict=True)):
+            same = [keys[i] == values[i] for i in range(index)]
+            behind.append(and_(*same, key < value if descending[index] else key > value))
+        query = query.where(or_(*behind))
+    rows = list(session.scalars(query.limit(size + 1)))
+    if len(rows) <= size:
+        return rows, {}
+    last = rows[size - 1]
+    return rows[:size], {"nextToken": encode([getattr(last, key.key) for key in keys])}
+
+
+def encode(values: Sequence[Any]) -> str:
+    return base64.urlsafe_b64encode(json.dumps(values).encode()).decode()
+
+
+def decode(token: str, kinds: Sequence[type]) -> list[Any]:
+    """The position in a token: one value of each kind (``int`` or ``str``). Raises ClientError for one that was not given out."""
+    try:
+        values = json.loads(base64.b64decode(token.encode(), altchars=b"-_", validate=True))
+        if isinstance(values, list) and [type(value) for value in values] == list(kinds):
+            text = json.dumps(values, ensure_ascii=False)
+            text.encode()  # no database takes half of a character
+            if "\\u0000" not in text and all(abs(value) < 2**63 for value in values if isinstance(value, int)):
+                return values
+    except (ValueError, RecursionError):
+        pass
+    raise ClientError(f"nextToken {token[:100]!r} is not one that was given out")

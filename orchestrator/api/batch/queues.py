@@ -1,0 +1,193 @@
+"""Job queues: create, describe, update, delete, and what GetJobQueueSnapshot shows of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+
+from orchestrator.api import permissions
+from orchestrator.api.arns import environment_arn, job_arn, plain_name, policy_arn, queue_arn
+from orchestrator.api.batch import rules
+from orchestrator.api.batch.engine_tags import check_engine_tags
+from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import JobsOf, Operation, Shared
+from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
+
+_MOST_ENVIRONMENTS, _MOST_QUEUES = 3, 50
+_REASONS = (
+    "CAPACITY:INSUFFICIENT_INSTANCE_CAPACITY",
+    "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE",
+    "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT",
+)
+
+
+def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """CreateJobQueue."""
+    name = request["jobQueueName"]
+    rules.check_name("jobQueueName", name)
+    rules.check_tags(request.get("tags") or {})
+    permissions.check(Operation.CREATE_JOB_QUEUE, Shared())
+    if context.session.get(JobQueue, name):
+        raise ClientError(f"Job queue {name} exists already; UpdateJobQueue changes it")
+    if len(context.session.scalars(select(JobQueue.name)).all()) >= _MOST_QUEUES:
+        raise ClientError(f"there are {_MOST_QUEUES} job queues; delete one first")
+    _check_kind(request)
+    if not request.get("computeEnvironmentOrder"):
+        raise ClientError("computeEnvironmentOrder is missing: name 1 to 3 compute environments")
+    queue = JobQueue(name=name, compute_environments=[], limits=[], tags=request.get("tags") or {})
+    _apply(context, queue, request)
+    check_engine_tags(context, queue, queue.tags)
+    if policy := request.get("schedulingPolicyArn"):
+        queue.policy = _policy(context, policy)
+    context.session.add(queue)
+    return {"jobQueueName": name, "jobQueueArn": queue_arn(name)}
+
+
+def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DescribeJobQueues, by names or ARNs, or all."""
+    query = select(JobQueue).order_by(JobQueue.name)
+    if named := request.get("jobQueues"):
+        query = query.where(JobQueue.name.in_([plain_name(each, "job-queue") for each in named]))
+    rows, token = page(context.session, query, request, page_size(request, 100), (JobQueue.name,), (False,))
+    return {"jobQueues": [_describe(queue) for queue in rows], **token}
+
+
+def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """UpdateJobQueue; a scheduling policy can be replaced, but neither added nor removed, as on AWS."""
+    queue = context.queue(request["jobQueue"])
+    permissions.check(Operation.UPDATE_JOB_QUEUE, queue)
+    if (policy := request.get("schedulingPolicyArn")) is not None:
+        if queue.policy is None:
+            raise ClientError(
+                f"Job queue {queue.name} is first in, first out; a scheduling policy can't be added to it"
+            )
+        queue.policy = _policy(context, policy)
+    _check_kind(request)
+    _apply(context, queue, request)
+    return {"jobQueueName": queue.name, "jobQueueArn": queue_arn(queue.name)}
+
+
+def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """DeleteJobQueue of a queue that is DISABLED: its jobs are ended, and with the last one it is gone."""
+    permissions.check(Operation.DELETE_JOB_QUEUE, Shared())
+    queue = context.session.get(JobQueue, plain_name(request["jobQueue"], "job-queue"))
+    if queue is None or queue.deleting:
+        return {}
+    if queue.state != "DISABLED":
+        raise ClientError(f"Job queue {queue.name} is ENABLED; disable it first: UpdateJobQueue with state DISABLED")
+    queue.deleting = True
+    context.controller.drain(context.session, queue)
+    return {}
+
+
+def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and what is in use."""
+    queue = context.queue(request["jobQueue"], deleting=True)
+    permissions.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
+    order, times = context.controller.front(queue.name, 100)
+    jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
+    return {
+        "frontOfQueue": {"jobs": jobs, "lastUpdatedAt": now()},
+        "queueUtilization": _utilization(context, queue),
+    }
+
+
+def _utilization(context: Context, queue: JobQueue) -> dict[str, Any]:
+    used, by_share = context.controller.utilization(context.session, queue.name)
+    detail: dict[str, Any] = {
+        "totalCapacityUsage": [{"capacityUnit": unit, "quantity": amount} for unit, amount in used.items()],
+        "lastUpdatedAt": now(),
+    }
+    if queue.policy is not None:
+        usage = [
+            {
+                "shareIdentifier": share,
+                "capacityUsage": [{"capacityUnit": unit, "quantity": amount} for unit, amount in amounts.items()],
+            }
+            for share, amounts in sorted(by_share.items())
+        ]
+        detail["fairshareUtilization"] = {"activeShareCount": len(usage), "topCapacityUtilization": usage[:20]}
+    return detail
+
+
+def _apply(context: Context, queue: JobQueue, request: Mapping[str, Any]) -> None:
+    """The part shared by CreateJobQueue and UpdateJobQueue."""
+    if (state := request.get("state")) is not None:
+        if state not in ("ENABLED", "DISABLED"):
+            raise ClientError(f"state is {state[:50]!r}; it is ENABLED or DISABLED")
+        queue.state = state
+    if (priority := request.get("priority")) is not None:
+        if not 0 <= priority <= 1_000_000:
+            raise ClientError(f"priority is {priority}; it must be 0 to 1000000")
+        queue.priority = priority
+    if order := request.get("computeEnvironmentOrder"):
+        queue.compute_environments = _environments(context, order)
+    if (limits := request.get("jobStateTimeLimitActions")) is not None:
+        queue.limits = _limits(limits)
+
+
+def _check_kind(request: Mapping[str, Any]) -> None:
+    for key in ("serviceEnvironmentOrder", "jobQueueType"):
+        if request.get(key) not in (None, [], "EC2", "ECS"):
+            raise ClientError(f"{key} is not supported; use computeEnvironmentOrder")
+
+
+def _environments(context: Context, order: Sequence[Mapping[str, Any]]) -> list[str]:
+    if len(order) > _MOST_ENVIRONMENTS:
+        raise ClientError(f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_ENVIRONMENTS}")
+    names = [
+        plain_name(each["computeEnvironment"], "compute-environment")
+        for each in sorted(order, key=lambda each: each["order"])
+    ]
+    if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
+        raise ClientError("computeEnvironmentOrder: every environment and every order once")
+    for name in names:
+        if context.session.get(ComputeEnvironment, name) is None:
+            raise ClientError(f"Compute environment {name[:200]} does not exist")
+    return names
+
+
+def _limits(limits: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    for limit in limits:
+        if limit["reason"] not in _REASONS:
+            raise ClientError(
+                f"jobStateTimeLimitActions reason {limit['reason'][:100]!r}: it is {' or '.join(_REASONS)}"
+            )
+        if not 600 <= limit["maxTimeSeconds"] <= 86400:
+            raise ClientError(
+                f"jobStateTimeLimitActions maxTimeSeconds is {limit['maxTimeSeconds']}; it must be 600 to 86400"
+            )
+        if limit["state"] != "RUNNABLE" or limit["action"] != "CANCEL":
+            raise ClientError("jobStateTimeLimitActions: the state is RUNNABLE and the action CANCEL")
+    return [dict(limit) for limit in limits]
+
+
+def _policy(context: Context, arn: str) -> str:
+    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
+    if policy is None:
+        raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
+    return policy.name
+
+
+def _describe(queue: JobQueue) -> dict[str, Any]:
+    order = [
+        {"order": i, "computeEnvironment": environment_arn(name)}
+        for i, name in enumerate(queue.compute_environments, 1)
+    ]
+    return {
+        "jobQueueName": queue.name,
+        "jobQueueArn": queue_arn(queue.name),
+        "state": queue.state,
+        "status": "DELETING" if queue.deleting else "VALID",
+        "statusReason": "its jobs are being ended" if queue.deleting else "JobQueue Healthy",
+        "priority": queue.priority,
+        "computeEnvironmentOrder": order,
+        "jobStateTimeLimitActions": queue.limits,
+        "jobQueueType": "ECS",
+        "tags": queue.tags,
+        **({"schedulingPolicyArn": policy_arn(queue.policy)} if queue.policy else {}),
+    }

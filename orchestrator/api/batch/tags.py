@@ -1,0 +1,67 @@
+"""TagResource, UntagResource, ListTagsForResource."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orchestrator.api import permissions
+from orchestrator.api.arns import split_arn
+from orchestrator.api.batch import rules
+from orchestrator.api.batch.engine_tags import check_engine_tags
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.persistence.models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+
+_TABLES = {
+    "job": Job,
+    "job-queue": JobQueue,
+    "compute-environment": ComputeEnvironment,
+    "scheduling-policy": SchedulingPolicy,
+}
+
+
+def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """Add tags, or replace their values."""
+    resource = _resource(context, request["resourceArn"], Operation.TAG_RESOURCE)
+    tags = {**resource.tags, **request["tags"]}
+    rules.check_tags(tags)
+    check_engine_tags(context, resource, tags)
+    resource.tags = tags
+    return {}
+
+
+def untag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """Remove tags; those that are not there are passed over."""
+    resource = _resource(context, request["resourceArn"], Operation.UNTAG_RESOURCE)
+    resource.tags = {key: value for key, value in resource.tags.items() if key not in request["tagKeys"]}
+    return {}
+
+
+def list_tags_for_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
+    """The resource's tags."""
+    return {"tags": _resource(context, request["resourceArn"], Operation.LIST_TAGS_FOR_RESOURCE).tags}
+
+
+def _resource(context: Context, arn: str, operation: Operation) -> Any:
+    """The resource, where the caller may do this to it. Raises ClientError."""
+    resource = _find(context, arn)
+    permissions.check(operation, resource)
+    return resource
+
+
+def _find(context: Context, arn: str) -> Any:
+    """The row that an ARN names; the nodes of a job and the children of an array have no tags of their own, as on AWS."""
+    kind, name = split_arn(arn)
+    found: Any
+    if kind == "job-definition":
+        name, _, revision = name.partition(":")
+        is_number = revision.isascii() and revision.isdigit() and len(revision) < 10
+        found = context.session.get(JobDefinition, (name, int(revision))) if is_number else None
+    elif kind == "job" and ("#" in name or ":" in name):
+        raise ClientError(f"{arn[:300]}: nodes and children have no tags of their own; tag the job")
+    else:
+        found = context.session.get(_TABLES[kind], name) if kind in _TABLES else None
+    if found is None:
+        raise ClientError(f"Resource {arn[:300]} does not exist")
+    return found

@@ -1,0 +1,158 @@
+"""The HTTP application: routes, the guard in front of them, and errors in the shapes that clients expect."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from sqlalchemy.exc import DataError
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.context import IDEMPOTENCY_HEADER
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http import docs_page
+from orchestrator.api.http.auth import Access, Guard, error_response, kind_of
+from orchestrator.api.http.limits import RateLimit, parse
+from orchestrator.api.logs import operations as logs
+from orchestrator.api.native import routes as native
+from orchestrator.control import monitoring
+from orchestrator.control.deliveries import Deliveries
+from orchestrator.control.reconciler import Controller
+from orchestrator.persistence.session import DatabaseError
+from shared_store import __version__
+from shared_store.files import DamagedFile
+
+BROWSER_HEADERS = [
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "DENY"),
+    ("Content-Security-Policy", "frame-ancestors 'none'"),
+    ("Referrer-Policy", "no-referrer"),
+]
+"""Headers of every answer, errors and refusals too, which the server adds: no page may frame an answer or guess its type."""
+
+
+def create_app(
+    controller: Controller,
+    access: Access | None = None,
+    limit: RateLimit | None = None,
+    deliveries: Deliveries | None = None,
+) -> FastAPI:
+    """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
+    app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
+    app.state.controller = controller
+    app.state.deliveries = deliveries
+    app.state.closing = threading.Event()
+    app.include_router(native.router)
+    app.add_middleware(Guard, access=access or Access(), limit=limit or RateLimit())
+    app.add_exception_handler(ClientError, _client_error)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(DataError, _refused_by_database)
+    app.add_exception_handler(DatabaseError, _database_away)
+    app.add_exception_handler(DamagedFile, _damaged_file)
+
+    @app.get("/healthz")
+    def healthz() -> JSONResponse:
+        """Alive, and which version; 503 with the reason while the database can't be used."""
+        try:
+            controller.database.check()
+            trouble = controller.trouble
+        except DatabaseError as error:
+            trouble = str(error)
+        if trouble is not None:
+            return JSONResponse({"status": "unavailable", "message": trouble, "version": __version__}, 503)
+        return JSONResponse({"status": "ok", "version": __version__})
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    def metrics() -> Response:
+        """Metrics for Prometheus: jobs, waits, restarts, GPU-seconds used and lost, steps a second, hosts; for keys with all queues."""
+        permissions.check_all_queues(permissions.Operation.READ_MONITORING)
+        return Response(monitoring.exposition(controller), media_type=monitoring.CONTENT_TYPE)
+
+    @app.post("/v1/{operation}", include_in_schema=False)
+    async def aws_batch(operation: str, request: Request) -> JSONResponse:
+        """AWS Batch: one POST an operation (rest-json)."""
+        body = await _body(request)
+        name = batch.operation_names().get(operation, operation)
+        key = request.headers.get(IDEMPOTENCY_HEADER)
+        return JSONResponse(await run_in_threadpool(batch.call, controller, name, body, key))
+
+    @app.api_route("/v1/tags/{arn:path}", methods=["GET", "POST", "DELETE"], include_in_schema=False)
+    async def aws_tags(arn: str, request: Request) -> JSONResponse:
+        """AWS Batch's tags: the resource's ARN is in the path, percent-encoded."""
+        name = {"GET": "ListTagsForResource", "POST": "TagResource", "DELETE": "UntagResource"}[request.method]
+        body = await _body(request) if request.method == "POST" else {}
+        if not isinstance(body, dict):
+            raise ClientError(f"{name}: expected a JSON object")
+        if request.method == "DELETE":
+            body = {"tagKeys": request.query_params.getlist("tagKeys")}
+        return JSONResponse(await run_in_threadpool(batch.call, controller, name, {**body, "resourceArn": arn}))
+
+    @app.get("/api/docs", include_in_schema=False)
+    def describe() -> HTMLResponse:
+        """The native API."""
+        page = docs_page.render(app.openapi(), "/api/openapi.json")
+        return HTMLResponse(page, headers={"Content-Security-Policy": docs_page.POLICY})
+
+    @app.get("/", include_in_schema=False)
+    def front() -> RedirectResponse:
+        """For browsers: the pages of the API."""
+        return RedirectResponse("/api/docs")
+
+    @app.post("/", include_in_schema=False)
+    async def cloudwatch_logs(request: Request) -> Response:
+        """CloudWatch Logs: the operation in a header (JSON 1.1)."""
+        target = request.headers.get("x-amz-target", "")
+        return await logs.answer(controller, app.state.closing, target, lambda: _body(request))
+
+    return app
+
+
+async def _body(request: Request) -> Any:
+    """The request's JSON; its size is bounded by the guard."""
+    try:
+        text = (await request.body()).decode()
+        value = parse(text or "{}")
+        if "\\u" in text:  # JSON can say half of a character, which no answer and no log could repeat
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
+    except (ValueError, RecursionError):
+        raise ClientError("the request is not JSON") from None
+
+
+async def _client_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ClientError)
+    return error_response(str(error), error.status, kind_of(error))
+
+
+async def _invalid(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    return error_response(f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}", 400)
+
+
+async def _http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return error_response(f"{request.method} {request.url.path}: {error.detail}", error.status_code)
+
+
+async def _refused_by_database(request: Request, error: Exception) -> JSONResponse:
+    """A zero byte, say, which PostgreSQL can't store nor look for."""
+    assert isinstance(error, DataError)
+    return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
+
+
+async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
+    """Files on the volume are written by jobs and may hold anything: that is no error of the server."""
+    return error_response(f"the store holds a damaged file: {error}", 409)
+
+
+async def _database_away(request: Request, error: Exception) -> JSONResponse:
+    return error_response(str(error), 503, "ServerException")

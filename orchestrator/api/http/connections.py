@@ -1,0 +1,235 @@
+"""Connections before authentication: limits on their number, and on the time that each may take to send a request.
+
+uvicorn bounds the time between two requests and nothing else. Here a connection that does not send its request in time is closed,
+and when there are too many, those that have waited longest for their client give way. A client that reads its answer is never cut
+off: a log may be followed for days.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import resource
+import time
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from orchestrator.api.http.callers import Caller
+
+HEADER_TIMEOUT = 10.0
+"""Seconds from the opening of a connection, or from the last answer, to the end of the next request's headers."""
+BODY_TIMEOUT = 60.0
+"""Seconds from there to the end of its body."""
+_FLUSH_TIMEOUT = 60.0
+"""Seconds without any progress after which a closing connection that still has something to send is cut off."""
+BACKLOG = 128
+"""Connections that are accepted at once, and so how far the most may be exceeded for a moment."""
+_PIECE = 16 << 10
+"""Bytes that are parsed at once. A head of more than h11's limit (64 KiB) and one piece is always refused."""
+_MOST_DESCRIPTORS = 65_536
+_MOST_CONNECTIONS = 4096
+_SAID = 60.0
+"""Seconds between two lines about the same trouble."""
+
+log = logging.getLogger("muster.api")
+
+
+def raise_descriptor_limit() -> int:
+    """Raise this process's limit of open files as far as it may, at most to 65,536; returns the limit."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        return wanted
+    return _MOST_DESCRIPTORS if soft == resource.RLIM_INFINITY else soft
+
+
+class Connections:
+    """The open connections of one server; used in its event loop only."""
+
+    def __init__(self, descriptors: int) -> None:
+        """``descriptors``: the limit of open files. Half are for connections; the rest starts jobs and serves the database."""
+        self.most = max(16, min(descriptors // 2, _MOST_CONNECTIONS))
+        self.most_of_a_peer = self.most * 3 // 4
+        self._peers: dict[str, int] = {}
+        self._waiting: dict[str, dict[Connection, None]] = {}
+        """By peer, the longest first: those whose request is not complete, or whose answer is not read."""
+        self._count, self._said = 0, -_SAID
+
+    def admit(self, connection: Connection) -> bool:
+        """Count a new connection; where there are too many, another gives way. False where none can."""
+        peer = connection.peer
+        victim: Connection | None = None
+        if self._peers.get(peer, 0) >= self.most_of_a_peer:
+            victim = next(iter(self._waiting.get(peer, ())), None)
+        elif self._count >= self.most:
+            greatest = max(self._waiting.values(), key=len, default={})
+            victim = next(iter(greatest), None)
+        else:
+            self._add(connection)
+            return True
+        if time.monotonic() - self._said > _SAID:
+            self._said = time.monotonic()
+            log.warning(
+                "%d connections are open, %d of them from %s; those that have waited longest for their client are closed",
+                *(self._count, self._peers.get(peer, 0), peer),
+            )
+        if victim is None:
+            return False
+        self.remove(victim)
+        victim.give_way()
+        self._add(connection)
+        return True
+
+    def _add(self, connection: Connection) -> None:
+        self._count += 1
+        self._peers[connection.peer] = self._peers.get(connection.peer, 0) + 1
+        connection.counted = True
+
+    def remove(self, connection: Connection) -> None:
+        """It is closed, or about to be."""
+        if not connection.counted:
+            return
+        connection.counted = False
+        self.has_request(connection)
+        self._count -= 1
+        self._peers[connection.peer] -= 1
+        if not self._peers[connection.peer]:
+            del self._peers[connection.peer]
+
+    def awaits_client(self, connection: Connection) -> None:
+        """From now on it may be closed in favour of others."""
+        if connection.counted:
+            self._waiting.setdefault(connection.peer, {})[connection] = None
+
+    def has_request(self, connection: Connection) -> None:
+        """It is being answered, and is not closed in favour of others."""
+        waiting = self._waiting.get(connection.peer, {})
+        waiting.pop(connection, None)
+        if not waiting:
+            self._waiting.pop(connection.peer, None)
+
+
+class Connection(H11Protocol):
+    """One connection: uvicorn's, with deadlines for what the client sends."""
+
+    def __init__(self, connections: Connections, **uvicorns: Any) -> None:
+        super().__init__(**uvicorns)
+        self._connections = connections
+        self._phase = ""
+        self._deadline: asyncio.TimerHandle | None = None
+        self.peer = ""
+        self.counted = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.peer = self.client[0] if self.client else ""
+        if self.client and self.server and self.server[1] is not None:
+            caller = Caller(self.client, (self.server[0], self.server[1]))
+            self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
+        if not self._connections.admit(self):
+            self._refuse()
+            return
+        self._look()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._set_deadline(None)
+        self._connections.remove(self)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        # h11 checks the size of a request's head only while the head is incomplete: one that arrives at once would pass at any size
+        for start in range(0, len(data), _PIECE):
+            if not self.transport.is_closing():
+                super().data_received(data[start : start + _PIECE])
+        self._look()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._look()
+
+    def pause_writing(self) -> None:
+        """The client has stopped reading its answer, such as a pager at rest: it may stay until others need the place."""
+        super().pause_writing()
+        self._connections.awaits_client(self)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._phase == "answer":
+            self._connections.has_request(self)
+
+    def give_way(self) -> None:
+        """Close, since others need the place."""
+        self._set_deadline(None)
+        self.transport.abort()
+
+    def _look(self) -> None:
+        """Which phase the connection is in; a deadline runs from the beginning of a phase, whatever trickles in."""
+        if self.transport.is_closing():
+            return
+        answering = self.cycle is not None and not self.cycle.response_complete
+        phase = "header" if not answering else "body" if self.cycle.more_body else "answer"
+        if phase == self._phase:
+            return
+        self._phase = phase
+        if phase == "answer":
+            self._set_deadline(None)
+            self._connections.has_request(self)
+        else:
+            self._set_deadline(HEADER_TIMEOUT if phase == "header" else BODY_TIMEOUT)
+            self._connections.awaits_client(self)
+
+    def _set_deadline(self, seconds: float | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None if seconds is None else self.loop.call_later(seconds, self._expire)
+
+    def _expire(self) -> None:
+        if self._phase == "header" and self.transport.get_write_buffer_size():
+            self._set_deadline(HEADER_TIMEOUT)  # the last answer is not all sent: its reader may be slow
+            return
+        self._close()
+
+    def _close(self) -> None:
+        """Close when all is sent, or when nothing has been sent for a while."""
+        self.transport.close()
+        self._flush(self.transport.get_write_buffer_size() + 1)
+
+    def _flush(self, before: int) -> None:
+        left = self.transport.get_write_buffer_size()
+        if left < before:
+            self._deadline = self.loop.call_later(_FLUSH_TIMEOUT, self._flush, left)
+        else:
+            self.transport.abort()
+
+    def _refuse(self) -> None:
+        message = "too many connections are open; close some, or try again later"
+        body = json.dumps({"__type": "ServiceUnavailableException", "message": message}).encode()
+        head = "HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 1\r\ncontent-type: application/json\r\n"
+        self.transport.write(f"{head}content-length: {len(body)}\r\n\r\n".encode() + body)
+        self._close()
+
+    def _should_upgrade(self) -> bool:
+        return False  # there is no websocket here, and uvicorn would log each attempt
+
+
+class Seldom(logging.Filter):
+    """Logs the same message once a minute, without a traceback: any client can cause it at any rate."""
+
+    def __init__(self, *messages: str) -> None:
+        super().__init__()
+        self._said = dict.fromkeys(messages, -_SAID)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = next((each for each in self._said if each in str(record.msg)), None)
+        if message is None:
+            return True
+        record.exc_info = record.exc_text = None
+        record.msg, record.args = str(record.msg).splitlines()[0], ()
+        now = time.monotonic()
+        if now - self._said[message] < _SAID:
+            return False
+        self._said[message] = now
+        return True

@@ -1,0 +1,1 @@
+"""The native API, for everything beyond AWS Batch: ``/api/``."""

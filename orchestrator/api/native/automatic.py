@@ -1,0 +1,245 @@
+"""Automatic evaluations: jobs that the controller submits beside a training whose spec has a section ``evaluation``.
+
+What is known of a training's checkpoints is a row of the database (:class:`orchestrator.persistence.models.AutomaticEvaluation`), which changes in
+the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
+waits for one, and the reconcile loop neither: this has a thread of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.api import permissions
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.continuing import submit
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.job import Status
+from orchestrator.engines.registry import FRESH
+from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.models import AutomaticEvaluation, Job
+from orchestrator.persistence.ownership import is_of_earlier_run
+from orchestrator.persistence.session import DatabaseError
+from orchestrator.spec.evaluations import (
+    AUTOMATIC_TAG,
+    Counted,
+    automatic_evaluation,
+    due,
+    first_count,
+    place_of,
+    wanted_of,
+)
+from orchestrator.spec.sections import Evaluation
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
+from shared_store.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
+from shared_store.layout import Run
+
+LOOK = 2.0
+"""Seconds between two looks at the checkpoints of running trainings: a listing of a directory each."""
+
+log = logging.getLogger("muster.evaluations")
+
+
+@dataclass(frozen=True)
+class _Training:
+    """The part that does not change while a job trains."""
+
+    job: str
+    run: Run
+    owner: str
+    first_epoch: int
+    spec: Mapping[str, Any]
+    place: dict[str, str]
+    """Queue and share of its evaluations."""
+    directory: str
+    wanted: Evaluation
+
+
+class AutomaticEvaluations:
+    """The thread that sees new checkpoints and submits their evaluations."""
+
+    def __init__(self, controller: Controller, interval: float = LOOK) -> None:
+        """``interval``: seconds between two looks."""
+        self._controller, self._interval = controller, interval
+        self._known: dict[str, _Training | None] = {}
+        """By job, of those that run; None of one without a section ``evaluation``."""
+        self._backoff = Backoff(log)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="evaluations", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop looking; what was submitted goes on."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+
+    def _loop(self) -> None:
+        self._isolated("checkpoints kept for nobody", self._let_go)
+        while not self._ending.wait(self._interval):
+            if self._controller.trouble is None:
+                self.look()
+
+    def look(self) -> None:
+        """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
+        self._backoff.tidy()
+        self._isolated("open evaluations", self._close_ended)
+        active = self._controller.work_queue.active()
+        self._known = {job: self._known[job] for job in active if job in self._known}
+        for job in active:
+            self._isolated(f"job {job}", partial(self._look_at, job))
+
+    def _isolated(self, subject: str, body: Callable[[], None]) -> None:
+        if self._backoff.waits(subject):
+            return
+        try:
+            body()
+            self._backoff.worked(subject)
+        except DatabaseError:
+            pass  # said by the controller
+        except (OSError, ValueError, DamagedCheckpoint) as error:
+            self._backoff.failed(subject, f"automatic evaluations, {subject}: {' '.join(str(error).split())}")
+        except Exception as error:
+            self._backoff.failed(subject, f"automatic evaluations, {subject}: {type(error).__name__}", error)
+
+    # -- what was submitted ---------------------------------------------------------------------------------------------
+
+    def _let_go(self) -> None:
+        """Give up the claims of a controller that was killed before it submitted their evaluations."""
+        with self._controller.database.session() as session:
+            rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open.is_(False))).all()
+            names = [row.run for row in rows]
+        for name in names:
+            run = self._controller.store.run(name)
+            for checkpoint in wanted_checkpoints(run):
+                evaluation_is_over(run, checkpoint)
+
+    def _close_ended(self) -> None:
+        """Give up the claim on checkpoints whose evaluation has ended, well or not."""
+        with self._controller.database.session() as session:
+            rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open)).all()
+            ended = [(row.run, row.checkpoint or "") for row in rows if not _is_open(session, row)]
+        for name, checkpoint in ended:
+            self._isolated(f"run {name}", partial(self._close, name, checkpoint))
+
+    def _close(self, name: str, checkpoint: str) -> None:
+        evaluation_is_over(self._controller.store.run(name), checkpoint)
+        with self._controller.writing, self._controller.database.session() as session:
+            row = session.get_one(AutomaticEvaluation, name)
+            row.open = False
+            job = session.get(Job, row.job)
+        if job is not None and job.status == Status.FAILED:
+            log.warning("run %s: the evaluation of checkpoint %s failed: %s", name, checkpoint, job.status_reason)
+
+    # -- what is due ----------------------------------------------------------------------------------------------------
+
+    def _look_at(self, job_id: str) -> None:
+        training = self._training(job_id)
+        if training is None:
+            return
+        run, iterations = training.run, int(training.spec["train"]["iterations"])
+        checkpoints = list_checkpoints(run)
+        with self._controller.database.session() as session:
+            job, row = session.get(Job, job_id), session.get(AutomaticEvaluation, run.name)
+            if job is None or job.is_terminal or job.stop_reason is not None:
+                return
+            busy = row is not None and row.open
+            before = _counted(row, training, checkpoints)
+        counted, chosen = due(checkpoints, before, training.wanted.every, iterations, busy)
+        if chosen is not None and self._claimed(run, chosen):
+            self._submit(training, counted, chosen)
+        elif chosen is None and (row is None or row.training != job_id or counted != before):
+            self._note(training, counted)
+
+    def _training(self, job_id: str) -> _Training | None:
+        if job_id not in self._known:
+            with self._controller.database.session() as session:
+                job = session.get(Job, job_id)
+                if job is None or job.first_epoch is None:
+                    return None
+                self._known[job_id] = self._read(job)
+        return self._known[job_id]
+
+    def _read(self, job: Job) -> _Training | None:
+        gang = job.gang
+        try:
+            wanted = wanted_of(gang.spec)
+        except SpecError as error:  # it was checked when it was submitted
+            raise ValueError(str(error)) from None
+        if wanted is None or job.first_epoch is None:
+            return None
+        owner, directory = job.owner or permissions.THIS_PROCESS.name, gang.options.directory
+        run, place = self._controller.store.run(job.run), place_of(job.queue, job.share, wanted)
+        return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, place, directory, wanted)
+
+    @staticmethod
+    def _claimed(run: Run, chosen: Checkpoint) -> bool:
+        """Keep the checkpoint from retention; False if that was faster. Raises DamagedCheckpoint, OSError."""
+        if run.description() is None:  # deleted
+            return False
+        keep_for_evaluation(run, chosen.name)
+        return chosen.path.is_dir() and bool(chosen.manifest)
+
+    def _note(self, training: _Training, counted: Counted, problem: str | None = None) -> None:
+        with self._controller.writing, self._controller.database.session() as session:
+            row = _row(session, training, counted)
+            row.problem = problem or row.problem  # it stands until an evaluation is submitted
+
+    def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
+        """Submit the evaluation, as the training's owner, in one transaction with what is known of the training's checkpoints."""
+        controller, run = self._controller, training.run
+        controller.check_writable(adds=True)
+        controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+        token = permissions.current_identity.set(permissions.Identity(training.owner))
+        try:
+            spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
+            with controller.writing, controller.database.session() as session:
+                context = Context(session, controller)
+                tags = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}
+                answer, _ = submit(context, spec, training.directory, f"evaluation of run {run.name}", {}, tags)
+                row = _row(session, training, counted)
+                row.checkpoint, row.job, row.open, row.problem = chosen.name, answer["jobId"], True, None
+        except (ClientError, SpecError) as error:
+            # a queue that takes no jobs, say: the next checkpoint that is due is tried
+            evaluation_is_over(run, chosen.name)
+            self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")
+            log.warning("run %s: checkpoint %s is not evaluated: %s", run.name, chosen.name, error)
+            return
+        finally:
+            permissions.current_identity.reset(token)
+        controller.wake()
+        passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
+        log.info("job %s evaluates %s@%d%s", answer["jobId"][:8], run.name, chosen.iteration, passed)
+
+
+def _is_open(session: Session, row: AutomaticEvaluation) -> bool:
+    job = session.get(Job, row.job)
+    return job is not None and not job.is_terminal
+
+
+def _counted(row: AutomaticEvaluation | None, training: _Training, checkpoints: list[Checkpoint]) -> Counted:
+    if row is None or row.training != training.job:
+        return first_count(checkpoints, training.first_epoch)
+    return Counted(row.seen, row.waiting, row.passed)
+
+
+def _row(session: Session, training: _Training, counted: Counted) -> AutomaticEvaluation:
+    row = session.get(AutomaticEvaluation, training.run.name)
+    if row is None:
+        row = AutomaticEvaluation(run=training.run.name)
+        session.add(row)
+    elif (before := session.get(Job, row.training)) is not None and is_of_earlier_run(before, training.run):
+        row.checkpoint, row.job, row.open, row.problem = None, None, False, None
+    row.training, row.seen, row.waiting, row.passed = training.job, counted.seen, counted.waiting, counted.passed
+    return row

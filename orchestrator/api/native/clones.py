@@ -1,0 +1,181 @@
+"""The rules of cloning: a new run that begins with the weights of a checkpoint and nothing else of it.
+
+The weights are copied when the clone is submitted (:mod:`shared_store.parent`): its job may wait for days, so pruning or deleting
+the source does no harm.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.api.batch import submission
+from orchestrator.api.checkpoints import CONFLICT, choose, refusal
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.continuing import Changes, answered, check, submit
+from orchestrator.api.native.runs import spec_of
+from orchestrator.api.sources import with_teacher
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.excerpts import shown
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.models import Job
+from orchestrator.persistence.ownership import first_description, forget_gone_run
+from orchestrator.spec.changes import override
+from orchestrator.spec.model import ALGORITHMS, Spec, validate
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.layout import Run
+from shared_store.parent import NewRun, RunExists, TeacherCopy
+from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+
+
+def clone(
+    controller: Controller, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+) -> dict[str, Any]:
+    """Submit a job whose run begins at iteration 0 with the weights of ``source``; what can be refused is refused before a job exists.
+
+    Args:
+        controller: The controller.
+        source: Whose weights.
+        name: Of the new run, and of its job.
+        changes: What is different in it, and which checkpoint is meant.
+        idempotency_key: A second call with it answers what the first one did.
+
+    Raises:
+        ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
+            impossible, or the weights can't fit what was changed.
+    """
+    return with_teacher(controller, lambda teacher: _clone(controller, source, name, changes, idempotency_key, teacher))
+
+
+def _clone(
+    controller: Controller,
+    source: Run,
+    name: str,
+    changes: Changes,
+    idempotency_key: str | None,
+    teacher: TeacherCopy | None,
+) -> dict[str, Any]:
+    with controller.database.session() as session:
+        context = Context(session, controller, idempotency_key)
+        if earlier := _answered(context, name):
+            return earlier
+        spec = _changed(session, source, name, changes)
+        new = context.run(name)
+        _check_free(session, new)
+        chosen = _choose(source, changes)
+        _check_weights(source, chosen, spec)
+    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    with controller.database.session() as session:  # before the copy: not for who may not submit it
+        check(Context(session, controller), spec, changes.directory, f"clone {name}")
+    controller.check_writable(adds=True)
+    if shortage := controller.disk.shortage("store"):
+        raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
+    making = NewRun(controller.store, controller.peers.id, source.name, chosen)
+    environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
+    try:
+        with making:
+            try:
+                making.copy()
+            except DamagedCheckpoint as error:
+                raise refusal(source, chosen, error) from None
+            with controller.writing, controller.database.session() as session:
+                context = Context(session, controller, idempotency_key, making, teacher)
+                if earlier := _answered(context, name):
+                    return earlier
+                _check_free(session, new)
+                forget_gone_run(session, new)
+                answer, job = submit(context, spec, changes.directory, f"clone {name}", environment)
+                # before the commit: a job without its weights must not start
+                making.publish(new.name, first_description(new, job, job.owner, job.queue))
+    except RunExists:
+        raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
+    except OSError as error:
+        raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
+    controller.wake()
+    return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+
+
+def _answered(context: Context, name: str) -> dict[str, Any] | None:
+    """What an earlier call with the same idempotency key has done. Raises ClientError where that was for another run."""
+    job = answered(context, name)
+    if job is None:
+        return None
+    parent = (context.run(job.run).description() or {}).get("parent")
+    return {**submission.answer(job), "run": job.run, "parent": parent, "kind": "train"}
+
+
+def _changed(session: Session, source: Run, name: str, changes: Changes) -> Spec:
+    """The spec of the new run. Raises ClientError."""
+    document = spec_of(session, source)
+    if document is None:
+        raise ClientError(f"run {source.name} was not started from a YAML spec: there is nothing to clone")
+    named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)
+    if named is not None:
+        raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")
+    try:
+        before = validate(document, f"run {source.name}", merged=False)
+        spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
+    except SpecError as error:
+        raise ClientError(str(error)) from None
+    for which in (before, spec):
+        if which.train is None:
+            what = f"run {source.name} is" if which is before else "the changes make it"
+            kind = f"{'an' if which.kind[0] in 'aeiou' else 'a'} {which.kind} job"
+            raise ClientError(f"{what} {kind}, and only a training has weights to begin with")
+    return spec
+
+
+def _choose(source: Run, changes: Changes) -> Checkpoint:
+    """Raises ClientError where there is no such checkpoint, or what it says of itself can't be read."""
+    chosen = choose(source, changes.checkpoint)
+    if chosen is None:
+        raise ClientError(f"run {source.name} has no checkpoint yet, so there are no weights to begin with", 404)
+    try:
+        _ = chosen.manifest
+    except DamagedCheckpoint as error:
+        raise refusal(source, chosen, error) from None
+    return chosen
+
+
+def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
+    """Refuse what the weights can't fit, as far as settings tell; shapes of observations and actions only the rank knows."""
+    assert spec.train is not None
+    manifest, name = chosen.manifest, spec.train.algorithm
+    where = f"run {source.name}: checkpoint {chosen.name}"
+    learnt = manifest.get("algorithm")
+    if not isinstance(learnt, str) or not isinstance(manifest.get("settings"), dict):
+        raise ClientError(f"{where} is of an older Muster, which knew no algorithms: it can't be cloned", CONFLICT)
+    if learnt != name:
+        if learnt in ALGORITHMS and name in ALGORITHMS:
+            raise ClientError(
+                f"{where} has weights of algorithm {learnt}, which {name} can't read; clone it with train.algorithm={learnt}, "
+                "or with a module:Class of your own whose load_state_dict reads them"
+            )
+        return  # whether a class of the user's own reads them, or is read, only the rank can say
+    settings, given = manifest["settings"], spec.train.given()
+    fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
+    asked = [key for key in fixed if setting_at(given, key) is not None]
+    if difference := first_difference(settings, given, asked):
+        key, there, here = innermost(*difference)
+        raise ClientError(
+            f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
+        )
+
+
+_EXISTS = "run {} exists already: give the clone another --name"
+
+
+def _check_free(session: Session, new: Run) -> None:
+    """Raises ClientError where the name is taken."""
+    if not (new.path.is_symlink() or new.path.exists()):
+        return
+    hint = ""
+    if session.scalars(select(Job.id).where(Job.run == new.name).limit(1)).first() is None:
+        # as after a crash between the run and its job
+        hint = f"; no job has begun it: `muster resume {new.name}` does, or delete {new.path}"
+    raise ClientError(_EXISTS.format(new.name) + hint, CONFLICT)

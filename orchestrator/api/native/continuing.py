@@ -1,0 +1,96 @@
+"""The part shared by resuming and cloning a run: the checkpoint, the changed spec, and the job that is submitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import definitions, submission
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import Context
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http import limits
+from orchestrator.control.snapshot import fit_in_queue
+from orchestrator.domain.excerpts import excerpt
+from orchestrator.domain.gang import gang_needs
+from orchestrator.persistence.models import Job
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.model import Spec
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The request for the new job."""
+
+    checkpoint: int | Literal["best", "latest"] | None = None
+    """Iteration, or what :func:`shared_store.checkpoints.best_checkpoint` says; the newest where None."""
+    assignments: tuple[str, ...] = ()
+    """``key.path=value`` changes of the run's spec."""
+    directory: str = ""
+    """Working directory of the job."""
+    nodes: int | None = None
+    """Another number of nodes."""
+
+    def all(self) -> list[str]:
+        """The assignments, with the one that sets the number of nodes. Raises ClientError where both do."""
+        if self.nodes is None:
+            return [*self.assignments]
+        for assignment in self.assignments:
+            if assignment.partition("=")[0].partition(".")[0] == "nodes":
+                raise ClientError(
+                    f"--set {excerpt(assignment, 100)}: --nodes {self.nodes} sets the number of nodes; give one of them"
+                )
+        return [*self.assignments, f"nodes={self.nodes}"]
+
+
+def answered(context: Context, run: str) -> Job | None:
+    """The job that an earlier call with the same idempotency key has submitted. Raises ClientError where that was for another run."""
+    job = submission.answered(context)
+    if job is not None and job.run != run:
+        raise ClientError(
+            f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", CONFLICT
+        )
+    return job
+
+
+def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:
+    """The definition of the job, which the caller may submit and which the queue could have. Raises ClientError."""
+    definition = compile_definition(spec, directory)
+    queue = context.queue(spec.queue)
+    permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
+    shape = gang_needs(definition["nodeProperties"]).shape
+    if problem := fit_in_queue(context.session, context.controller.engine, queue, shape).problem:
+        raise ClientError(f"{what}: {problem}")
+    limits.check_document("RegisterJobDefinition", definition)
+    return definition
+
+
+def submit(
+    context: Context,
+    spec: Spec,
+    directory: str,
+    what: str,
+    environment: Mapping[str, str],
+    tags: Mapping[str, str] | None = None,
+) -> tuple[dict[str, Any], Job]:
+    """Register and submit the job; nothing is committed. Raises ClientError.
+
+    Args:
+        context: The call.
+        spec: Of the job.
+        directory: Its working directory.
+        what: Begins the words of a refusal.
+        environment: Added on every node.
+        tags: Of the job.
+    """
+    definition = check(context, spec, directory, what)
+    registered = definitions.register_job_definition(context, batch.validate("RegisterJobDefinition", definition))
+    request = compile_submission(spec, registered["jobDefinitionArn"], environment, tags)
+    answer = submission.submit_job(context, batch.validate("SubmitJob", request))
+    context.session.flush()
+    job = context.session.get(Job, answer["jobId"])
+    assert job is not None
+    return answer, job

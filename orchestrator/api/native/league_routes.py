@@ -1,0 +1,417 @@
+"""The native API of leagues: create one, race a model in it, enter the race, read the table."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from dataclasses import asdict
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import submission
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import IDEMPOTENCY_HEADER, Context, controller_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http.callers import user_name
+from orchestrator.api.native.continuing import submit
+from orchestrator.api.native.model_routes import find_model, owner_of_model
+from orchestrator.api.permissions import LeagueOf, Operation
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.job import Status
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.queries import find_job
+from orchestrator.spec.league_races import race_job
+from orchestrator.spec.settings import task_config
+from shared_store import bundles, leagues
+from shared_store.bundles import DamagedBundle
+from shared_store.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
+from shared_store.evaluations import list_evaluations
+from shared_store.files import DamagedFile
+from shared_store.leagues import League, LeagueError, Rules, StoredLeague, UnknownLeague
+from shared_store.models import Model
+from shared_store.standings import BadRace, Ranking, read_race, table
+from shared_store.wording import shown
+
+router = APIRouter()
+
+_RACER = re.compile(r"\w[\w .'-]{0,63}")
+_Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+_Moment = Annotated[float, Field(ge=0, lt=1e11, allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class CreateRequest(_Strict):
+    """The rules of a new league."""
+
+    name: str = Field(max_length=128)
+    track: list[str] = Field(min_length=1, max_length=64, description="a preset, random:SEED, or a track of the store")
+    laps: int = Field(default=3, ge=1, le=100)
+    ranking: Ranking = "total"
+    continuous: bool = Field(default=False, description="a car that leaves the road is put back and goes on")
+    off_track_penalty: _Seconds = 1.0
+    crash_penalty: _Seconds = 1.0
+    max_resets: int = Field(default=100, ge=0, le=10_000, description="in one lap")
+    seconds: float = Field(default=1200.0, gt=0, le=3600, description="simulated, that a lap may take")
+    seed: int = Field(default=1, ge=0, lt=2**31)
+    opens: _Moment | None = Field(default=None, description="Unix time in seconds; at once where absent")
+    closes: _Moment | None = Field(default=None, description="Unix time in seconds; never where absent")
+    most_entries: int = Field(default=99, ge=1, le=10_000, description="of each key or user")
+
+
+class RaceRequest(_Strict):
+    """Which model races."""
+
+    model: str = Field(max_length=128)
+    version: int | None = Field(default=None, ge=1, description="the newest where absent")
+    racer: str | None = Field(
+        default=None, max_length=200, description="who races; the name of the key or user where absent"
+    )
+    directory: str = Field(default="", description="working directory of the job")
+
+
+class EnterRequest(RaceRequest):
+    """Which race becomes an entry."""
+
+    job: str = Field(max_length=200, description="the evaluation's job, which has ended")
+
+
+class RerunRequest(_Strict):
+    """Where an entry is raced once more."""
+
+    directory: str = Field(default="", description="working directory of the job")
+
+
+class DisqualifyRequest(_Strict):
+    """Why an entry does not count."""
+
+    reason: str = Field(min_length=1, max_length=500)
+
+
+@router.get("/leagues")
+def list_leagues(request: Request) -> list[dict[str, Any]]:
+    """All leagues by name, with their rules; ``problem`` says of one what is altered."""
+    store = controller_of(request).store
+    try:
+        return [_described(leagues.find(store, name)) for name in leagues.names(store)]
+    except LeagueError as error:
+        raise _refused(error) from None
+
+
+@router.post("/leagues")
+def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
+    """Create a league; its rules are never changed."""
+    controller = controller_of(request)
+    permissions.check(Operation.CREATE_LEAGUE)
+    controller.check_writable(adds=True)
+    if body.opens is not None and body.closes is not None and body.opens >= body.closes:
+        raise ClientError("opens: the league would close before it opens")
+    given = body.model_dump()
+    rules = Rules(**{key: given[key] for key in asdict(Rules())})
+    try:
+        digests = {name: leagues.digest_of_track(controller.store, name) for name in body.track}
+        league = League(
+            name=body.name,
+            track=tuple(body.track),
+            rules=rules,
+            seed=body.seed,
+            owner=_caller(),
+            created=time.time(),
+            opens=body.opens,
+            closes=body.closes,
+            most_entries=body.most_entries,
+            track_digests={name: digest for name, digest in digests.items() if digest is not None},
+        )
+        return _described(leagues.create(controller.store, league))
+    except LeagueError as error:
+        raise ClientError(str(error)) from None
+    except OSError as error:
+        raise ClientError(f"league {body.name} can't be written ({error.strerror or error})", 503) from None
+
+
+@router.get("/leagues/{name}")
+def read_league(request: Request, name: str) -> dict[str, Any]:
+    """The rules of a league, and how many entries it has."""
+    return _described(_find(controller_of(request), name)[0])
+
+
+@router.get("/leagues/{name}/entries")
+def league_table(
+    request: Request, name: str, every: bool = Query(default=False, description="all entries of each racer")
+) -> list[dict[str, Any]]:
+    """The table, the first one ahead: of each racer the best entry, then those that are not ranked and why."""
+    stored, league = _find(controller_of(request), name)
+    try:
+        return [row.document() for row in table(stored.contenders(), league.rules.ranking, every=every)]
+    except LeagueError as error:
+        raise _refused(error) from None
+
+
+@router.get("/leagues/{name}/entries/{number}")
+def read_entry(request: Request, name: str, number: int) -> Any:
+    """An entry with its race and, where it is disqualified, the ruling; ``problem`` says what is altered of it or of its model."""
+    controller = controller_of(request)
+    stored, _ = _find(controller, name)
+    found: dict[str, Any] = {"entry": number}
+    try:
+        found = stored.entry(number)
+        model = find_model(controller, found["model"]["name"], found["model"]["version"])
+        _verify(model)
+        _check_digest(model, found)
+    except UnknownLeague as error:
+        raise _refused(error) from None
+    except (LeagueError, ClientError) as error:
+        found["problem"] = str(error)
+    return permissions.shown({**found, "ruling": stored.ruling(number)})
+
+
+@router.post("/leagues/{name}/races")
+def race(
+    request: Request,
+    name: str,
+    body: RaceRequest,
+    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+) -> dict[str, Any]:
+    """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key answers what the first one did."""
+    controller = controller_of(request)
+    stored, league = _find(controller, name)
+    model = find_model(controller, body.model, body.version)
+    permissions.check(Operation.RACE, owner_of_model(model))
+    try:
+        if closed := league.closed(time.time()):
+            raise LeagueError(closed)
+        stored.admit(_caller(), _racer(body))
+    except LeagueError as error:
+        raise _refused(error) from None
+    return _submit(controller, league, model, body.directory, idempotency_key)
+
+
+@router.post("/leagues/{name}/entries/{number}/races")
+def rerun(
+    request: Request,
+    name: str,
+    number: int,
+    body: RerunRequest,
+    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+) -> dict[str, Any]:
+    """Submit the race of an entry once more, whether the league is open or not; on a CPU its laps are the same."""
+    controller = controller_of(request)
+    stored, league = _find(controller, name)
+    try:
+        entry = stored.entry(number)
+    except LeagueError as error:
+        raise _refused(error) from None
+    model = find_model(controller, entry["model"]["name"], entry["model"]["version"])
+    permissions.check(Operation.RERUN_ENTRY, owner_of_model(model))
+    _check_digest(model, entry)
+    return _submit(controller, league, model, body.directory, idempotency_key)
+
+
+@router.post("/leagues/{name}/entries")
+def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
+    """Make an entry of a race that has ended: the model's digest, the evaluation and its laps, for good."""
+    controller = controller_of(request)
+    stored, league = _find(controller, name)
+    model = find_model(controller, body.model, body.version)
+    permissions.check(Operation.ENTER_LEAGUE, owner_of_model(model))
+    controller.check_writable(adds=True)
+    checkpoint = _checked(controller, league, model)
+    job = _race_of(controller, league, body.job)
+    summary = _summary(controller, league, model, checkpoint, job)
+    entry = {
+        "racer": _racer(body),
+        "owner": _caller(),
+        "model": {"name": model.name, "version": model.version, "digest": _digest(model), "task": summary.get("task")},
+        "evaluation": {"run": model.facts()["run"], "name": summary["name"], "job": job, "time": summary["time"]},
+        "versions": summary.get("versions"),
+        "race": summary["race"],
+    }
+    try:
+        return stored.enter(entry)
+    except LeagueError as error:
+        raise _refused(error) from None
+    except OSError as error:
+        raise ClientError(f"league {name}: the entry can't be written ({error.strerror or error})", 503) from None
+
+
+@router.post("/leagues/{name}/entries/{number}/disqualify")
+def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest) -> dict[str, Any]:
+    """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
+    controller = controller_of(request)
+    stored, league = _find(controller, name)
+    permissions.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
+    controller.check_writable(adds=True)
+    try:
+        stored.disqualify(number, body.reason, _caller())
+    except LeagueError as error:
+        raise _refused(error) from None
+    except OSError as error:
+        raise ClientError(f"league {name}: the ruling can't be written ({error.strerror or error})", 503) from None
+    return {"entry": number, "ruling": stored.ruling(number)}
+
+
+def _find(controller: Controller, name: str) -> tuple[StoredLeague, League]:
+    """Raises ClientError: there is no such league, or its rules were altered."""
+    try:
+        stored = leagues.find(controller.store, name)
+        return stored, stored.definition()
+    except LeagueError as error:
+        raise _refused(error) from None
+
+
+def _refused(error: LeagueError) -> ClientError:
+    return ClientError(str(error), 404 if isinstance(error, UnknownLeague) else CONFLICT)
+
+
+def _described(stored: StoredLeague) -> dict[str, Any]:
+    try:
+        league = stored.definition()
+        found: dict[str, Any] = {**asdict(league), "digest": stored.digest(), "entries": len(stored.numbers())}
+        return {**found, "closed": league.closed(time.time())}
+    except LeagueError as error:
+        return {"name": stored.name, "problem": str(error)}
+
+
+def _caller() -> str:
+    """Whose the caller's leagues and entries are: a command with a controller of its own is this user's, as one on loopback is."""
+    identity = permissions.current_identity.get()
+    return f"user {user_name(os.getuid())}" if identity == permissions.THIS_PROCESS else identity.name
+
+
+def _racer(body: RaceRequest) -> str:
+    """Who races: the caller, unless it says another name. Raises ClientError."""
+    if body.racer is None:
+        return _caller().removeprefix("key ").removeprefix("user ")
+    if not _RACER.fullmatch(body.racer):
+        raise ClientError(
+            f"racer {shown(body.racer)}: use letters, digits, spaces, dots, hyphens, apostrophes and '_', at most 64, the first a "
+            "letter or digit"
+        )
+    return body.racer
+
+
+def _suffix() -> str:
+    """Ends the names of a key's races: a job definition belongs to the key that registered it, and each may race any model of a queue."""
+    identity = permissions.current_identity.get()
+    return "" if identity.queues is None else identity.name.removeprefix("key ")
+
+
+def _submit(
+    controller: Controller, league: League, model: Model, directory: str, idempotency_key: str | None
+) -> dict[str, Any]:
+    """Submit the race of a model. Raises ClientError."""
+    _checked(controller, league, model)
+    facts = model.facts()
+    controller.check_writable(adds=True)
+    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    with controller.writing, controller.database.session() as session:
+        context = Context(session, controller, idempotency_key)
+        earlier = submission.answered(context)
+        if earlier is not None:
+            answer = submission.answer(earlier)
+        else:
+            queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
+            try:
+                spec = race_job(league, model.reference, facts, queue, _suffix())
+            except SpecError as error:
+                raise ClientError(str(error)) from None
+            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {})
+    controller.wake()
+    return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
+
+
+def _checked(controller: Controller, league: League, model: Model) -> Checkpoint:
+    """The checkpoint that a sound model was made of, which a race loads. Raises ClientError."""
+    _verify(model)
+    facts = model.facts()
+    try:
+        league.check_tracks(controller.store)
+    except LeagueError as error:
+        raise _refused(error) from None
+    kind = task_config(str(facts.get("task")))
+    if kind is None or not kind.races:  # what a class of the user's own drives is unknown
+        raise ClientError(
+            f"model {model.reference} is of task {facts.get('task')}; a league takes models of the racer's installed tasks"
+        )
+    name, run = str(facts.get("checkpoint")), controller.store.run(str(facts.get("run")))
+    found = checkpoint_called(run.checkpoints, name)
+    gone = ClientError(
+        f"model {model.reference}: checkpoint {name} of run {run.name}, which a race loads, is gone; register one that is there",
+        CONFLICT,
+    )
+    if found is None or not found.path.is_dir():
+        raise gone
+    try:
+        found.verify()
+    except DamagedCheckpoint as error:
+        raise ClientError(f"model {model.reference}: run {run.name}: {error}", CONFLICT) from None
+    if found.manifest["files"] != facts.get("checkpoint_files"):
+        raise gone  # another run has the name of the one that was trained
+    return found
+
+
+def _race_of(controller: Controller, league: League, reference: str) -> str:
+    """Id of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
+    with controller.database.session() as session:
+        job = find_job(session, reference, permissions.visible_queues())
+        if job is None:
+            raise ClientError(f"job {reference} does not exist; `muster list` shows the jobs", 404)
+        permissions.check(Operation.ENTER_LEAGUE, job)
+        if job.status != Status.SUCCEEDED:
+            raise ClientError(
+                f"job {job.name} ({job.id[:8]}) is {job.status}: only a race that has SUCCEEDED is entered", CONFLICT
+            )
+        if closed := league.closed(job.created_at / 1000):
+            raise ClientError(f"{closed}, and job {job.name} ({job.id[:8]}) was not submitted in between", CONFLICT)
+        return job.id
+
+
+def _summary(controller: Controller, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:
+    """The evaluation that a job made of the model's checkpoint, which is a race of this league. Raises ClientError."""
+    run = controller.store.run(model.facts()["run"])
+    found = next((each for each in list_evaluations(run) if each.get("job") == job), None)
+    if found is None:
+        raise ClientError(
+            f"job {job[:8]} has left no evaluation of run {run.name}, of which {model.reference} is", CONFLICT
+        )
+    what = f"league {league.name}: evaluation {found['name']} can't be entered"
+    if found["checkpoint"] != checkpoint.name:
+        raise ClientError(
+            f"{what}: it is of checkpoint {found['checkpoint']}, the model of {checkpoint.name}", CONFLICT
+        )
+    if problem := league.misfit(found):
+        raise ClientError(f"{what}: {problem}", CONFLICT)
+    try:
+        read_race(found["race"])
+    except BadRace as error:
+        raise ClientError(f"{what}: {error}", CONFLICT) from None
+    return found
+
+
+def _verify(model: Model) -> None:
+    """Raise ClientError where the model is not as it was registered."""
+    try:
+        model.verify()
+    except DamagedBundle as error:
+        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+
+
+def _digest(model: Model) -> str:
+    """SHA-256 of the manifest of a model, which has the digests of all its files. Raises ClientError."""
+    try:
+        return str(bundles.read_manifest(model.path)["digest"])
+    except (DamagedBundle, DamagedFile) as error:
+        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+
+
+def _check_digest(model: Model, entry: dict[str, Any]) -> None:
+    """Raise ClientError where the model is not the one that was entered."""
+    if _digest(model) != entry["model"].get("digest"):
+        raise ClientError(f"model {model.reference} is another one than the one that was entered", CONFLICT)

@@ -1,0 +1,125 @@
+"""The native API of the model registry: list models, register an exported policy."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
+
+from orchestrator.api import permissions
+from orchestrator.api.checkpoints import CONFLICT, choose
+from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.control.reconciler import Controller
+from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.ownership import owner_of
+from shared_store import bundles, models
+from shared_store.bundles import DamagedBundle
+from shared_store.files import DamagedFile
+from shared_store.models import AlreadyRegistered, Model, ModelError, UnknownModel
+
+router = APIRouter()
+
+
+class RegisterRequest(BaseModel):
+    """Which policy of the run becomes the next version of which model."""
+
+    name: str = Field(max_length=128, description="of the model")
+    checkpoint: int | Literal["best", "latest"] | None = Field(
+        default=None, description="iteration; best; latest, the newest, where absent"
+    )
+    again: bool = Field(default=False, description="register a checkpoint that is a version of the model already")
+
+
+@router.get("/models")
+def list_models(request: Request) -> Any:
+    """The newest version of each model that the caller may see, by name."""
+    store = controller_of(request).store
+    newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
+    return permissions.shown([_described(model) for model in newest if permissions.is_visible(owner_of_model(model))])
+
+
+@router.get("/models/{name}")
+def read_model(
+    request: Request,
+    name: str,
+    version: int | None = Query(default=None, ge=1, description="the newest where absent"),
+    verify: bool = Query(default=False, description="read every file and check its digest"),
+) -> Any:
+    """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` says what is damaged."""
+    controller = controller_of(request)
+    model = find_model(controller, name, version)
+    permissions.check(Operation.READ_MODEL, owner_of_model(model))
+    found = _described(model, verify)
+    try:
+        found["contract"] = model.contract().document()
+        found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
+    except DamagedBundle as error:
+        found["problem"] = found.get("problem") or str(error)
+    return permissions.shown({**found, "versions": [each.version for each in models.versions(controller.store, name)]})
+
+
+@router.post("/runs/{name}/models")
+def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
+    """Keep the exported bundle of a checkpoint as the next version of a model, permanently."""
+    controller = controller_of(request)
+    run = permitted_run(controller, name, Operation.REGISTER_MODEL)
+    controller.check_writable(adds=True)
+    if shortage := controller.disk.shortage("store"):
+        raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
+    checkpoint = choose(run, body.checkpoint)
+    if checkpoint is None:
+        raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
+    with controller.database.session() as session:
+        record = owner_of(session, run)
+        queue, owner = (record.queue, record.owner) if record else ("", None)
+    try:
+        there = models.versions(controller.store, body.name)
+        if there:
+            permissions.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+        facts = {"queue": queue, "owner": owner, "registered_by": permissions.current_identity.get().name}
+        model = models.register(
+            controller.store, body.name, run, checkpoint, facts, controller.peers.id, again=body.again
+        )
+    except AlreadyRegistered as error:
+        raise ClientError(str(error), CONFLICT) from None
+    except ModelError as error:
+        raise ClientError(str(error)) from None
+    except (DamagedBundle, DamagedFile) as error:
+        raise ClientError(str(error), CONFLICT) from None
+    except OSError as error:
+        raise ClientError(f"model {body.name} can't be written ({error.strerror or error})", 503) from None
+    return permissions.shown(_described(model))
+
+
+def find_model(controller: Controller, name: str, version: int | None) -> Model:
+    """A version of a model, the newest where none is named. Raises ClientError."""
+    try:
+        return models.find(controller.store, name, version)
+    except UnknownModel as error:
+        raise ClientError(str(error), 404) from None
+    except (ModelError, DamagedFile) as error:
+        raise ClientError(str(error)) from None
+
+
+def owner_of_model(model: Model) -> RunRecord:
+    """Whose a model is: of the queue of the run that it comes from; of one that is damaged, nobody's but of keys with all queues."""
+    try:
+        queue = model.facts().get("queue")
+    except DamagedBundle:
+        queue = ""
+    return RunRecord(name=model.reference, queue=queue if isinstance(queue, str) else "")
+
+
+def _described(model: Model, verify: bool = False) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": model.name, "version": model.version, "path": str(model.path)}
+    try:
+        found = {**model.facts(), **found}
+        if verify:
+            model.verify()
+            found["verified"] = True
+    except DamagedBundle as error:
+        found["problem"] = str(error)
+    return found

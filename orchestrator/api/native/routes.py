@@ -1,0 +1,421 @@
+"""The native API: capacity, plans, jobs with all their attempts, logs as a stream; of runs, :mod:`orchestrator.api.native.run_routes`."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from fastapi import APIRouter, Request
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import rules
+from orchestrator.api.batch.operations import validate
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import controller_of, permitted_run, queue_names
+from orchestrator.api.damaged import reading
+from orchestrator.api.errors import ClientError
+from orchestrator.api.evaluated import check_evaluation
+from orchestrator.api.native import league_routes, model_routes, run_routes, runs, webhook_routes
+from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.sources import sources_of
+from orchestrator.control.bus import BusError
+from orchestrator.control.compute_environments import own_queues, queue_engines
+from orchestrator.control.reconciler import Controller
+from orchestrator.control.snapshot import fit_in_queue, new_nodes
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.job import Status
+from orchestrator.engines.api import EngineError, Gang, Plan
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.models import Attempt, Job, JobQueue
+from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
+from orchestrator.persistence.queries import find_job, short_id
+from orchestrator.persistence.session import DatabaseError
+from orchestrator.scheduling.placement import needs
+from orchestrator.spec.compile import compile_definition
+from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
+from orchestrator.spec.model import KINDS
+from shared_store.logs import LogFollower, LogLine, timestamp
+
+router = APIRouter(prefix="/api")
+router.include_router(run_routes.router)
+router.include_router(model_routes.router)
+router.include_router(league_routes.router)
+router.include_router(webhook_routes.router)
+
+_LARGEST_PLAN = 4 << 20
+"""Characters of all nodes' variables together."""
+_POLL = 0.05
+"""Seconds between two looks at a log that is followed."""
+_HEARTBEAT = 5.0
+"""Seconds after which an idle stream sends an empty line, which is how a client that left is noticed."""
+
+
+class PlanRequest(BaseModel):
+    """A job that is not submitted."""
+
+    definition: dict[str, Any] = Field(description="a RegisterJobDefinition request of type multinode")
+    queue: str = "default"
+
+
+def _job(session: Session, reference: str, operation: Operation) -> Job:
+    """The job, where the caller may do this to it. Raises ClientError."""
+    job = find_job(session, reference, permissions.visible_queues())
+    if job is None:
+        hint = _jobs_of_run(session, reference) or f"job {reference} does not exist; `muster list` shows the jobs"
+        raise ClientError(hint, 404)
+    permissions.check(operation, job)
+    return job
+
+
+def _jobs_of_run(session: Session, reference: str) -> str:
+    """Which jobs made the run of this name, for who names it where a job is meant; empty where no visible job did."""
+    query = select(Job).where(Job.run == reference).order_by(Job.created_at)
+    made = [job for job in session.scalars(query) if permissions.is_visible(job)]
+    if not made:
+        return ""
+    named = ", ".join(f"{job.name} ({short_id(job.id)})" for job in made[-5:])
+    which = "job" if len(made) == 1 else "jobs"
+    return f"{reference} is a run, which {which} {named} made; see: muster show {short_id(made[-1].id)}"
+
+
+@router.get("/capacity")
+def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
+    """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone.
+
+    ``queues``: those whose jobs the caller may see.
+    """
+    controller = controller_of(request)
+    names = controller.engine.names
+    with controller.database.session() as session:
+        if queue is not None:
+            names = queue_engines(session, queue, names[0])
+        queues = queue_names(session)
+    return {
+        "engines": own_queues(controller.engine.names),
+        "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
+        "elastic": controller.engine.is_elastic(names),
+        "store": str(controller.store.path),
+        "queues": queues,
+    }
+
+
+@router.post("/plan")
+def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
+    controller = controller_of(request)
+    wanted, definition = _gang_of(body), body.definition
+    for source in sources_of(wanted):
+        run = permitted_run(controller, source.run, Operation.READ_RUN)
+        if source.key in ("evaluate", "race"):
+            check_evaluation(run, wanted.spec or {}, source.key)
+    with controller.database.session() as session:
+        queue = _queue(session, body.queue)
+        permissions.check(Operation.PLAN, JobsOf(queue.name))
+        found = fit_in_queue(session, controller.engine, queue, wanted.shape, FRESH)
+        if found.allocation is None:
+            raise ClientError(
+                found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
+            )
+        if problem := _problem_of_evaluations(session, controller, queue, wanted):
+            raise ClientError(problem)
+        compute_environment, placements = found.allocation
+        job = Job(
+            id="job",
+            name=definition["jobDefinitionName"],
+            queue=queue.name,
+            kind="multinode",
+            run=wanted.options.run or "run",
+            timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
+            priority=definition.get("schedulingPriority", 0),
+        )
+        attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
+        gang = controller.attempts.gang(session, job, attempt, wanted)  # neither of them is stored
+    planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
+    nodes = [
+        {
+            "index": node.contract.node_index,
+            "rank": node.contract.node_rank,
+            "image": wanted.nodes[node.contract.node_index].container.get("image"),
+            **asdict(node.placement),
+            "address": node.contract.address,
+            "command": list(node.command),
+            "environment": {**node.environment, **node.contract.to_env()},
+        }
+        for node in planned.nodes
+    ]
+    size = sum(len(name) + len(value) for node in nodes for name, value in node["environment"].items())
+    if size > _LARGEST_PLAN:
+        raise ClientError(
+            f"the plan's {len(nodes)} nodes have {size >> 20} MiB of variables, more than {_LARGEST_PLAN >> 20}; "
+            "plan the job with fewer nodes"
+        )
+    name = engine_of(placements[0].host)
+    images = controller.engine.engines[name].images
+    return {
+        "engine": name,
+        "computeEnvironment": compute_environment,
+        "images": images,
+        "nodes": nodes,
+        "document": planned.document,
+    }
+
+
+@router.post("/fit")
+def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
+    """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
+    controller = controller_of(request)
+    wanted = _gang_of(body)
+    with controller.database.session() as session:
+        queue = _queue(session, body.queue)
+        permissions.check(Operation.FIT, JobsOf(queue.name))
+        problem = fit_in_queue(session, controller.engine, queue, wanted.shape, FRESH).problem
+        return {"problem": problem or _problem_of_evaluations(session, controller, queue, wanted)}
+
+
+def _problem_of_evaluations(session: Session, controller: Controller, queue: JobQueue, gang: GangSpec) -> str | None:
+    """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
+    try:
+        wanted = wanted_of(gang.spec)
+        if wanted is None:
+            return None
+        place = place_of(queue.name, None, wanted)
+        spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
+        definition = compile_definition(spec, gang.options.directory)
+        shape = rules.check_nodes(rules.node_properties(definition), "multinode", complete=True).shape
+        problem = fit_in_queue(session, controller.engine, _queue(session, place["queue"]), shape, FRESH).problem
+    except (ClientError, SpecError) as error:
+        problem = str(error)
+    return problem and f"evaluation: {problem}"
+
+
+def _gang_of(body: PlanRequest) -> GangSpec:
+    """What the job of a plan needs. Raises ClientError."""
+    definition = validate("RegisterJobDefinition", body.definition)
+    if definition["type"] != "multinode" or "nodeProperties" not in definition:
+        raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
+    return rules.check_nodes(rules.node_properties(definition), "multinode", complete=True)
+
+
+def _queue(session: Session, name: str) -> JobQueue:
+    """The queue of this name. Raises ClientError naming those that the caller may see."""
+    queue = session.get(JobQueue, name)
+    if queue is None or queue.deleting:
+        there = ", ".join(queue_names(session)[:10])
+        raise ClientError(f"there is no queue {name[:100]!r}; there is {there or 'none'}")
+    return queue
+
+
+def _planned(controller: Controller, gang: Gang) -> Plan[Any]:
+    try:
+        return controller.engine.plan(gang)
+    except EngineError as error:
+        raise ClientError(str(error)) from None
+
+
+@router.get("/jobs/{reference}")
+def job_detail(request: Request, reference: str) -> Any:
+    """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
+    controller = controller_of(request)
+    with controller.database.session() as session:
+        job = _job(session, reference, Operation.READ_JOB)
+        run = controller.store.run(job.run)
+        owner = owner_of(session, run)
+        is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
+        is_replaced = is_of_earlier_run(job, run)
+        is_visible = is_visible and not is_replaced
+        described = runs.results_of(controller, session, run) if is_visible else None
+        with reading(job):
+            attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
+            gang = job.gang
+            detail = {
+                "id": job.id,
+                "name": job.name,
+                "owner": job.owner,
+                "run": job.run,
+                "runIsReplaced": is_replaced,
+                "kind": next((kind for kind in KINDS if (gang.spec or {}).get(kind)), "command"),
+                "status": job.status,
+                "statusReason": controller.reason(job) or job.status_reason,
+                "queue": job.queue,
+                "share": job.share,
+                "createdAt": job.created_at,
+                "startedAt": job.started_at,
+                "stoppedAt": job.stopped_at,
+                "nodes": len(gang.nodes),
+                "attempts": attempts,
+                "attemptsAllowed": job.attempts_allowed,
+                "spec": gang.spec,
+                "results": described,
+                "progress": runs.last_metrics(run) if is_visible else None,
+            }
+    return permissions.shown(detail)
+
+
+@router.get("/jobs/{reference}/logs")
+def job_logs(
+    request: Request,
+    reference: str,
+    node: int | None = None,
+    rank: int | None = None,
+    attempt: int | None = None,
+    follow: bool = False,
+    positions: str = "{}",
+) -> StreamingResponse:
+    """The job's log lines as JSON lines, all nodes merged; with ``follow`` until the job is over.
+
+    ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
+    """
+    controller = controller_of(request)
+    with controller.database.session() as session:
+        job = _job(session, reference, Operation.READ_JOB_LOGS)
+        with reading(job):
+            count = len(job.gang.nodes)
+        if node is not None and not 0 <= node < count:
+            raise ClientError(
+                f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
+            )
+        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, _positions(positions))
+        job_id = job.id
+    lines: AsyncIterator[str] | Iterator[str]
+    lines = _follow(controller, job_id, follower, request.app.state.closing) if follow else _stored(follower)
+    return StreamingResponse(lines, media_type="application/x-ndjson")
+
+
+def _positions(text: str) -> dict[str, int]:
+    """Raises ClientError."""
+    try:
+        given = json.loads(text)
+        if all(isinstance(position, int) and 0 <= position < 2**63 for position in given.values()):
+            return dict(given)
+    except (ValueError, AttributeError, RecursionError):
+        pass
+    raise ClientError('positions: expected a JSON object such as {"1/0": 4096}')
+
+
+@router.post("/jobs/{reference}/checkpoint")
+def save_now(request: Request, reference: str) -> dict[str, str]:
+    """Have a training job save now; answers when the checkpoint is durable."""
+    controller = controller_of(request)
+    job, attempt, nodes = _running(controller, reference, Operation.CHECKPOINT_JOB)
+    return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
+
+
+@router.get("/jobs/{reference}/stacks")
+def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
+    """The Python and native stacks of every rank, node by node."""
+    controller = controller_of(request)
+    job, attempt, nodes = _running(controller, reference, Operation.READ_JOB_STACKS)
+    return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
+
+
+def _running(controller: Controller, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
+    """Id, attempt and nodes of a running job. Raises ClientError."""
+    with controller.database.session() as session:
+        job = _job(session, reference, operation)
+        attempt = job.open_attempt
+        if job.status != Status.RUNNING or attempt is None:
+            raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", CONFLICT)
+        with reading(job):
+            main = job.gang.main
+            nodes = sorted((node.index for node in attempt.nodes), key=lambda index: index != main)
+        return job.id, attempt.number, nodes
+
+
+def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
+    try:
+        return controller.bus.command(job, attempt, node, name, seconds)
+    except BusError as error:
+        raise ClientError(str(error), 503) from None
+
+
+def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
+    attempt = job.attempts[number - 1]
+    run = controller.store.run(job.run)
+    nodes = [
+        {
+            **node.shown(),
+            "progress": controller.bus.progress(job.id, number, node.index),
+            "running": attempt.stopped_at is None and node.exit_code is None,
+            "log": str(run.log(job.id, number, node.index)),
+        }
+        for node in attempt.nodes
+    ]
+    return {
+        "number": number,
+        "epoch": attempt.epoch,
+        "startedAt": attempt.started_at,
+        "stoppedAt": attempt.stopped_at,
+        "ending": attempt.ending,
+        "exitCode": attempt.exit_code,
+        "statusReason": attempt.status_reason,
+        "spent": attempt.spent,
+        "pool": attempt.compute_environment,
+        "gpuSeconds": attempt.gpu_seconds,
+        "cpuSeconds": attempt.cpu_seconds,
+        "wastedGpuSeconds": attempt.wasted_gpu_seconds,
+        "wastedCpuSeconds": attempt.wasted_cpu_seconds,
+        "nodes": nodes,
+    }
+
+
+def _stored(follower: LogFollower) -> Iterator[str]:
+    """All that is there, many lines at a time: each piece costs a hand-over between threads."""
+    try:
+        yield from map(_json_lines, follower.batches())
+    except (OSError, ValueError) as error:
+        yield _trouble(error)
+
+
+def _trouble(error: Exception) -> str:
+    """The last line of a stream that can't go on: of no node and no attempt."""
+    text = f"the log can't be read now: {excerpt(' '.join(str(error).split()), LONGEST_REASON)}"
+    return _json_lines([LogLine(timestamp(time.time()), 0, 0, None, "e", text)])
+
+
+def _json_lines(lines: Sequence[LogLine]) -> str:
+    return "".join([f"{line.to_json()}\n" for line in lines])
+
+
+async def _follow(
+    controller: Controller, job_id: str, follower: LogFollower, closing: threading.Event
+) -> AsyncIterator[str]:
+    """Lines as they come; a thread is taken only for each look, since any number of people may follow."""
+
+    def look() -> tuple[str, bool]:
+        with controller.database.session() as session:
+            job = session.get(Job, job_id)
+            over = job is None or Status(job.status).is_terminal  # asked before the poll: nothing is written afterwards
+        return _json_lines(follower.poll()), over
+
+    spoken = time.monotonic()
+    while not closing.is_set():
+        try:
+            lines, over = await run_in_threadpool(look)
+        except (OSError, ValueError, DatabaseError) as error:
+            yield _trouble(error)
+            return
+        if lines:
+            yield lines
+            spoken = time.monotonic()
+        if over:
+            async for lines in iterate_in_threadpool(_stored(follower)):
+                yield lines
+            return
+        if time.monotonic() - spoken > _HEARTBEAT:
+            yield "\n"
+            spoken = time.monotonic()
+        if not follower.behind:
+            await asyncio.sleep(_POLL)

@@ -1,0 +1,42 @@
+"""The native API of webhooks: list the receivers of messages about ended jobs, and test one. For keys with all queues: the operator's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request
+
+from orchestrator.api import permissions
+from orchestrator.api.checkpoints import CONFLICT
+from orchestrator.api.context import controller_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.control.deliveries import Deliveries
+from shared_store.wording import nearest
+
+router = APIRouter()
+
+
+@router.get("/webhooks")
+def list_webhooks(request: Request) -> list[dict[str, Any]]:
+    """The webhooks of the controller's ``--webhooks`` file, without paths and secrets: how many messages wait, and which were given up."""
+    permissions.check_all_queues(Operation.READ_WEBHOOKS)
+    deliveries: Deliveries | None = request.app.state.deliveries
+    if deliveries is None:
+        return []
+    with controller_of(request).database.session() as session:
+        return deliveries.described(session)
+
+
+@router.post("/webhooks/{name}/test")
+def test_webhook(request: Request, name: str) -> dict[str, Any]:
+    """Send a sample once, signed like any message; ``problem`` is null where the receiver accepted it."""
+    permissions.check(Operation.TEST_WEBHOOK)
+    permissions.check_all_queues(Operation.TEST_WEBHOOK)
+    deliveries: Deliveries | None = request.app.state.deliveries
+    if deliveries is None or not deliveries.webhooks:
+        raise ClientError("this controller has no webhooks; start it with: muster serve --webhooks FILE", CONFLICT)
+    webhook = deliveries.webhooks.get(name)
+    if webhook is None:
+        raise ClientError(f"webhook {name[:100]} does not exist; {nearest(name, list(deliveries.webhooks))}", 404)
+    return deliveries.test(webhook)

@@ -1,0 +1,67 @@
+"""The learning curves of several runs: as a picture, drawn without a display, or as numbers."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from orchestrator.cli.comparison.runs import Group
+from shared_store.files import write_atomic
+
+Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]
+
+
+ENDINGS = (".png", ".svg", ".pdf", ".csv")
+"""Of the files that can be written."""
+
+
+def draw(groups: Sequence[Group], path: Path) -> None:
+    """Write mean return over environment steps, of each group with one standard deviation over its runs.
+
+    A picture, in which each group is a line with a band, or a table of ``group``, ``env_steps``, ``return``, ``std`` and ``runs``.
+
+    Raises ValueError where no run has a finished episode yet, ImportError without matplotlib for a picture, OSError.
+
+    Args:
+        groups: What is drawn.
+        path: With one of :data:`ENDINGS`.
+    """
+    curves = [(group.label, group.curve()) for group in groups]
+    if not any(curve for _, curve in curves):
+        raise ValueError("no episode of these runs has finished yet, there is nothing to draw")
+    content = _table(curves) if path.suffix == ".csv" else _picture(curves, path.suffix[1:])
+    write_atomic(path.absolute(), content)
+
+
+def _table(curves: Curves) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["group", "env_steps", "return", "std", "runs"])
+    writer.writerows([label, *point] for label, curve in curves for point in curve)
+    return text.getvalue().encode()
+
+
+def _picture(curves: Curves, kind: str) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for label, curve in curves:
+        if not curve:
+            continue
+        steps, means, spreads, counts = zip(*curve, strict=True)
+        (line,) = axes.plot(steps, means, label=label, marker="." if len(steps) < 30 else None)
+        if max(counts) > 1:
+            low = [mean - spread for mean, spread in zip(means, spreads, strict=True)]
+            high = [mean + spread for mean, spread in zip(means, spreads, strict=True)]
+            axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(xlabel="environment steps", ylabel="mean return of finished episodes")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind)
+    return buffer.getvalue()

@@ -1,0 +1,61 @@
+"""Queues and compute environments that are there without anybody making them: one of each for every engine.
+
+A job goes to an engine by its queue. The queue ``default`` is that of the first engine, as long as nobody gave it others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy.orm import Session
+
+from orchestrator.engines.installed import ENGINES
+from orchestrator.persistence.models import ComputeEnvironment, JobQueue
+
+ENGINE_TAG = "muster:engine"
+"""Tag of a compute environment: which engine's hosts it has; without it, those of the controller's first."""
+
+
+def ensure_compute_environments(session: Session, engines: Sequence[str]) -> None:
+    """A compute environment for each of ``engines``, and a queue of its name for each but the first, which has ``default``."""
+    for name, queue in own_queues(engines).items():
+        if (environment := session.get(ComputeEnvironment, name)) is None:
+            environment = ComputeEnvironment(name=name, document={}, tags={})
+            session.add(environment)
+        environment.document = {**environment.document, "type": "MANAGED"}
+        if environment.tags.get(ENGINE_TAG) != name:
+            environment.tags = {**environment.tags, ENGINE_TAG: name}
+        if queue != "default" and session.get(JobQueue, queue) is None:
+            session.add(JobQueue(name=queue, compute_environments=[name]))
+    default = session.get(JobQueue, "default")
+    if default is not None and len(default.compute_environments) == 1 and default.compute_environments[0] in ENGINES:
+        default.compute_environments = [engines[0]]
+
+
+def is_built_in(environment: ComputeEnvironment) -> bool:
+    """Whether this is the compute environment that an engine has without anybody creating one."""
+    return environment.name in ENGINES and environment.tags.get(ENGINE_TAG) == environment.name
+
+
+def own_queues(engines: Sequence[str]) -> dict[str, str]:
+    """The queue that is there for each engine: ``default`` for the first."""
+    return {name: name if number else "default" for number, name in enumerate(engines)}
+
+
+def queue_engines(session: Session, queue: str, first: str) -> list[str]:
+    """The engines of a queue's compute environments, in their order; none for a queue that does not exist."""
+    found = session.get(JobQueue, queue)
+    environments = [session.get(ComputeEnvironment, name) for name in (found.compute_environments if found else [])]
+    return list(dict.fromkeys(engine_named_by(each.tags, first) for each in environments if each is not None))
+
+
+def engine_named_by(tags: dict[str, str], first: str) -> str:
+    """The engine of a compute environment with these tags."""
+    return tags.get(ENGINE_TAG, first)
+
+
+def engine_options(session: Session, compute_environment: str, queue: str) -> dict[str, str]:
+    """Options for an engine: ``muster:NAME=VALUE`` tags of a compute environment, and over them those of a queue."""
+    told = (session.get(ComputeEnvironment, compute_environment), session.get(JobQueue, queue))
+    tags = {name: value for each in told if each is not None for name, value in each.tags.items()}
+    return {name.removeprefix("muster:"): value for name, value in tags.items() if name.startswith("muster:")}

@@ -1,0 +1,281 @@
+"""Delivering webhooks: a row for each message, written in the transaction that ends its job, and a thread for each receiver.
+
+A message is delivered at least once: its row goes when the receiver has answered 2xx. It has the same ``webhook-id`` and the same body
+at each try. A receiver that is slow or away keeps neither jobs nor other receivers waiting.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any
+
+import httpx
+from sqlalchemy import ColumnElement, event, func, select, update
+from sqlalchemy.orm import Session
+
+from orchestrator.control.reconciler import Controller
+from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
+from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.models import Job, JobQueue, WebhookDelivery, now
+from orchestrator.persistence.ownership import is_of_earlier_run
+from orchestrator.persistence.session import DatabaseError
+from shared_store import __version__
+from shared_store.checkpoints import list_checkpoints
+from shared_store.evaluations import by_checkpoint, evaluation_name, list_evaluations
+from shared_store.layout import Run
+from shared_store.wording import nearest
+
+TIMEOUT = 10.0
+"""Seconds that one try may take in all: connecting, sending, and the answer's status."""
+_IDLE = 5.0
+"""Seconds between two looks for what is due, where nothing wakes the thread."""
+_SHOWN = ("mean_return", "mean_length", "max_length", "episodes")
+
+log = logging.getLogger("muster.webhooks")
+
+
+class Deliveries:
+    """The threads, one for each webhook; :meth:`note` is called by the database as jobs end."""
+
+    def __init__(
+        self, controller: Controller, webhooks: Sequence[Webhook], link: str, pauses: Sequence[float] = PAUSES
+    ) -> None:
+        """``link``: where this controller listens; ``pauses``: seconds after each failed try."""
+        self.webhooks = {webhook.name: webhook for webhook in webhooks}
+        self._controller, self._database, self._link, self._pauses = controller, controller.database, link, pauses
+        self._backoff = Backoff(log)
+        self._ending = threading.Event()
+        self._wake = {name: threading.Event() for name in self.webhooks}
+        self._timeout = TIMEOUT
+        self._tls = httpx.create_ssl_context() if webhooks else True  # made once: it takes a while
+        self._threads = [
+            threading.Thread(target=self._loop, args=(webhook,), name=f"webhook {webhook.name}", daemon=True)
+            for webhook in webhooks
+        ]
+        if webhooks:
+            self._database.ended = self.note
+
+    def start(self) -> None:
+        """Go on with what an earlier controller has left, but for webhooks that are not in the file any more."""
+        if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
+            with suppress(DatabaseError), self._controller.writing, self._database.session() as session:
+                gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
+                said = "no webhook is called so any more"
+                session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
+                self._name_unknown_queues(session.scalars(select(JobQueue.name)).all())
+        for thread in self._threads:
+            thread.start()
+
+    def _name_unknown_queues(self, known: Sequence[str]) -> None:
+        """Warn of queues that no job can be in; no more than that, since a queue may be created later."""
+        for webhook in self.webhooks.values():
+            for queue in sorted({*(webhook.queues or ())} - {*known}):
+                log.warning(
+                    "webhook %s: there is no queue %s now; %s", webhook.name, queue[:100], nearest(queue, sorted(known))
+                )
+
+    def close(self) -> None:
+        """Deliver no more; what is due waits in the database for the next controller."""
+        self._ending.set()
+        for wake in self._wake.values():
+            wake.set()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout=1)
+
+    def note(self, session: Session, job: Job) -> None:
+        """A job ends with this transaction: add the messages that tell so to it."""
+        for webhook in self.webhooks.values():
+            if webhook.wants(job):
+                made = now()
+                session.add(
+                    WebhookDelivery(
+                        id=f"msg_{uuid.uuid4().hex}", webhook=webhook.name, job=job.id, created_at=made, next_at=made
+                    )
+                )
+                wake = self._wake[webhook.name]
+                event.listen(session, "after_commit", lambda _, wake=wake: wake.set(), once=True)
+
+    def test(self, webhook: Webhook) -> dict[str, Any]:
+        """Send a sample once; its ``webhook-id``, and the ``problem`` where it was not accepted."""
+        identity, timestamp = f"msg_{uuid.uuid4().hex}", _when(now())
+        sample = {"type": "webhook.test", "timestamp": timestamp, "data": {"webhook": webhook.name}}
+        return {"id": identity, "receiver": webhook.receiver, "problem": self._send(webhook, identity, _json(sample))}
+
+    def described(self, session: Session) -> list[dict[str, Any]]:
+        """Each webhook, without its secret: how many messages wait, and the newest that were given up."""
+        query = select(WebhookDelivery.webhook, func.count()).where(WebhookDelivery.next_at.is_not(None))
+        waiting = {name: count for name, count in session.execute(query.group_by(WebhookDelivery.webhook))}
+        return [
+            {
+                "name": webhook.name,
+                "receiver": webhook.receiver,
+                "statuses": webhook.statuses,
+                "queues": webhook.queues,
+                "kinds": webhook.kinds,
+                "waiting": waiting.get(webhook.name, 0),
+                "problem": self._backoff.said(webhook.name),
+                "failed": _failed(session, WebhookDelivery.webhook == webhook.name),
+            }
+            for webhook in self.webhooks.values()
+        ]
+
+    # -- one receiver -----------------------------------------------------------------------------------------------------
+
+    def _loop(self, webhook: Webhook) -> None:
+        wake = self._wake[webhook.name]
+        while not self._ending.is_set():
+            wake.clear()  # before the look: what is committed after it wakes the thread
+            try:
+                pause = _IDLE if self._controller.trouble is not None else self._deliver_next(webhook)
+            except DatabaseError:  # said by the controller
+                pause = _IDLE
+            except Exception as error:
+                self._backoff.failed(("bug", webhook.name), f"webhook {webhook.name}: {type(error).__name__}", error)
+                pause = _IDLE
+            if pause > 0:
+                wake.wait(pause)
+
+    def _deliver_next(self, webhook: Webhook) -> float:
+        """Try the message that is due first; returns the seconds until there may be another."""
+        with self._database.session() as session:
+            of_it = WebhookDelivery.webhook == webhook.name, WebhookDelivery.next_at.is_not(None)
+            row = session.scalars(
+                select(WebhookDelivery).where(*of_it).order_by(WebhookDelivery.next_at).limit(1)
+            ).first()
+            if row is None or row.next_at is None:
+                return _IDLE
+            if (early := (row.next_at - now()) / 1000) > 0:
+                return min(early, _IDLE)
+            body, job = row.body, session.get(Job, row.job)
+        if body is None and job is not None:
+            body = _json(self._message(webhook, job)).decode()
+            with self._controller.writing, self._database.session() as session:
+                session.get_one(WebhookDelivery, row.id).body = body  # before it is sent: each try has the same
+        problem = "its job is forgotten" if body is None else self._send(webhook, row.id, body.encode())
+        self._note_try(webhook, row.id, problem, final=body is None)
+        return 0.0
+
+    def _note_try(self, webhook: Webhook, identity: str, problem: str | None, *, final: bool) -> None:
+        monitoring = self._controller.monitoring
+        with self._controller.writing, self._database.session() as session:
+            row = session.get_one(WebhookDelivery, identity)
+            if problem is None:
+                session.delete(row)
+            else:
+                row.tries, row.problem = row.tries + 1, problem
+                is_over = final or row.tries > len(self._pauses)
+                row.next_at = None if is_over else now() + int(1000 * self._pauses[row.tries - 1])
+        if problem is None:
+            monitoring.webhook_tried(webhook.name, "delivered")
+            if self._backoff.worked(webhook.name):
+                log.warning("webhook %s: messages are accepted again", webhook.name)
+            return
+        self._backoff.failed(webhook.name, f"webhook {webhook.name}: {webhook.receiver} {problem}")
+        monitoring.webhook_tried(webhook.name, "given up" if row.next_at is None else "failed")
+        if row.next_at is None:
+            log.error(
+                "webhook %s: message %s about job %s is given up: %s", webhook.name, identity, row.job, row.problem
+            )
+
+    def _send(self, webhook: Webhook, identity: str, body: bytes) -> str | None:
+        """One try; what was wrong with it, None where the receiver accepted it. Of the answer only the status counts.
+
+        It has an event loop of its own: from there a try can be left at any point, as while a receiver sends a byte a second. Nothing
+        of the answer is read behind its header.
+        """
+        headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(time.time()), body)}
+
+        async def deliver() -> str | None:
+            async with (
+                httpx.AsyncClient(timeout=None, verify=self._tls, follow_redirects=False) as http,
+                http.stream("POST", webhook.url, content=body, headers=headers) as answer,
+            ):
+                return None if answer.is_success else f"answered {answer.status_code}"
+
+        loop = asyncio.new_event_loop()
+        try:
+            return loop.run_until_complete(asyncio.wait_for(deliver(), self._timeout))
+        except TimeoutError:
+            return f"has not answered within {self._timeout:g} s"
+        except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
+            return f"can't be reached ({type(error).__name__})"  # its words may have the URL
+        finally:
+            loop.close()
+
+    def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
+        attempts = self._attempts(job)
+        name = run_of(job)
+        checkpoint, summary = _evaluated(self._controller.store.run(name), job)
+        evaluation = {key: summary[key] for key in _SHOWN} if summary else None
+        data = {
+            "job": job.id,
+            "name": job.name,
+            "kind": kind_of(job),
+            "queue": job.queue,
+            "owner": job.owner,
+            "run": name,
+            "status": job.status,
+            "statusReason": job.status_reason,
+            "stopped": job.stop_reason is not None,
+            "exitCode": attempts[-1] if attempts else None,
+            "attempts": len(attempts),
+            "createdAt": _when(job.created_at),
+            "startedAt": _when(job.started_at),
+            "stoppedAt": _when(job.stopped_at),
+            "checkpoint": checkpoint,
+            "evaluation": evaluation,
+            "link": f"{(webhook.link or self._link).rstrip('/')}/api/jobs/{job.id}",
+        }
+        return {"type": event_of(job.status), "timestamp": _when(job.stopped_at), "data": data}
+
+    def _attempts(self, job: Job) -> list[int | None]:
+        """The exit code of each attempt."""
+        with self._database.session() as session:
+            return [attempt.exit_code for attempt in session.get_one(Job, job.id).attempts]
+
+
+def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None]:
+    """The checkpoint that a message names and its evaluation: of a job that evaluates its own, of others the newest one's."""
+    if kind_of(job) == "train" and is_of_earlier_run(job, run):
+        return None, None
+    with suppress(OSError, ValueError):  # a volume that is away: the message does without
+        if kind_of(job) in ("evaluate", "race"):
+            own = (
+                each for each in list_evaluations(run) if each["name"] == evaluation_name(each["checkpoint"], job.id)
+            )
+            summary = next(own, None)
+            return (summary["checkpoint"], summary) if summary else (None, None)
+        checkpoints = list_checkpoints(run)
+        if checkpoints:
+            return checkpoints[-1].name, by_checkpoint(run).get(checkpoints[-1].name)
+    return None, None
+
+
+def _failed(session: Session, which: ColumnElement[bool], most: int = 20) -> list[dict[str, Any]]:
+    """The newest messages that were given up."""
+    query = select(WebhookDelivery).where(which, WebhookDelivery.next_at.is_(None))
+    rows = session.scalars(query.order_by(WebhookDelivery.created_at.desc()).limit(most))
+    return [
+        {"id": row.id, "job": row.job, "createdAt": row.created_at, "tries": row.tries, "problem": row.problem}
+        for row in rows
+    ]
+
+
+def _json(value: dict[str, Any]) -> bytes:
+    return json.dumps(value, separators=(",", ":")).encode()
+
+
+def _when(milliseconds: int | None) -> str | None:
+    """ISO 8601, in UTC."""
+    if milliseconds is None:
+        return None
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

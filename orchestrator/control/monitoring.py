@@ -1,0 +1,214 @@
+"""What a Prometheus server reads of a controller: counters since it began, and what there is at the moment of a scrape.
+
+Names and units are Prometheus's: base units, ``_total`` for what only grows. Counters begin at 0 with each controller, as Prometheus
+expects. Nothing here looks into the store or waits for an engine: a volume that hangs keeps no scrape waiting.
+"""
+
+from __future__ import annotations
+
+from collections import Counter as Sums
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.registry import Collector
+from sqlalchemy import event, func, select
+from sqlalchemy.orm import Session
+
+from orchestrator.control.snapshot import open_attempts
+from orchestrator.control.usage import held_by
+from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Attempt, Job, JobQueue
+from orchestrator.persistence.session import DatabaseError
+from shared_store import __version__
+
+if TYPE_CHECKING:
+    from orchestrator.control.reconciler import Controller
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_WAITS = (0.1, 0.5, 1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 24 * 3600)
+_PASSES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
+_USED = ("queue", "engine")
+
+
+class Monitoring:
+    """Counters of one controller; its threads write them."""
+
+    def __init__(self) -> None:
+        self.registry = registry = CollectorRegistry()
+        self._waits = Histogram(
+            "muster_queue_wait_seconds",
+            "From the submission of a job to its first attempt.",
+            ["queue"],
+            buckets=_WAITS,
+            registry=registry,
+        )
+        self._passes = Histogram(
+            "muster_scheduling_pass_seconds", "Length of a scheduling pass.", buckets=_PASSES, registry=registry
+        )
+        self._restarts = Counter(
+            "muster_restarts", "Attempts that were begun after a job's first one.", _USED, registry=registry
+        )
+        self._attempts = Counter(
+            "muster_attempts_ended", "Attempts that ended, by how.", [*_USED, "ending"], registry=registry
+        )
+        self._webhooks = Counter(
+            "muster_webhook_tries",
+            "Tries to deliver a message about a job's end, by what came of it.",
+            ["webhook", "result"],
+            registry=registry,
+        )
+        self._seconds = {
+            unit: Counter(
+                f"muster_{unit}_seconds",
+                f"{name} held by attempts that ended, times seconds.",
+                _USED,
+                registry=registry,
+            )
+            for unit, name in (("gpu", "GPUs"), ("cpu", "CPUs"))
+        }
+        self._lost = {
+            unit: Counter(
+                f"muster_{unit}_seconds_lost",
+                f"Those of muster_{unit}_seconds_total after the last checkpoint of an attempt that did not end well.",
+                _USED,
+                registry=registry,
+            )
+            for unit in ("gpu", "cpu")
+        }
+
+    def pass_took(self, seconds: float) -> None:
+        """A scheduling pass was made."""
+        self._passes.observe(seconds)
+
+    def webhook_tried(self, webhook: str, result: str) -> None:
+        """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""
+        self._webhooks.labels(webhook, result).inc()
+
+    def begun(self, session: Session, job: Job, attempt: Attempt, waited: float) -> None:
+        """An attempt begins once the session is committed, ``waited`` seconds after its job could."""
+
+        def note(_: Session) -> None:
+            if number == 1:
+                self._waits.labels(queue).observe(max(0.0, waited))
+            else:
+                self._restarts.labels(queue, engine).inc()
+
+        queue, engine, number = job.queue, _engine(attempt), attempt.number
+        event.listen(session, "after_commit", note, once=True)
+
+    def ended(self, session: Session, job: Job, attempt: Attempt) -> None:
+        """An attempt, whose use was charged, ends once the session is committed."""
+
+        def note(_: Session) -> None:
+            self._attempts.labels(*labels, ending).inc()
+            for counters, amounts in ((self._seconds, used), (self._lost, lost)):
+                for unit, seconds in amounts.items():
+                    counters[unit].labels(*labels).inc(max(0.0, seconds))
+
+        labels, ending = (job.queue, _engine(attempt)), str(attempt.ending or "unknown")
+        used = {"gpu": attempt.gpu_seconds, "cpu": attempt.cpu_seconds}
+        lost = {"gpu": attempt.wasted_gpu_seconds, "cpu": attempt.wasted_cpu_seconds}
+        event.listen(session, "after_commit", note, once=True)
+
+
+def exposition(controller: Controller) -> bytes:
+    """All of it in Prometheus's text format."""
+    now = CollectorRegistry()
+    now.register(_Moment(controller))
+    return generate_latest(controller.monitoring.registry) + generate_latest(now)
+
+
+class _Moment(Collector):
+    """What there is while Prometheus looks."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+
+    def describe(self) -> Iterable[GaugeMetricFamily]:
+        return ()
+
+    def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily]:
+        controller = self._controller
+        yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
+        try:
+            with controller.database.session() as session:
+                found = [*self._jobs(session), *self._attempts(session)]
+            usable = controller.trouble is None
+        except DatabaseError:  # then the scrape says this, and what needs no database
+            found, usable = [], False
+        yield _gauge("muster_database_usable", "1 while the database can be used, else 0.", [], {(): float(usable)})
+        yield from found
+        yield self._volumes()
+        yield from self._hosts()
+
+    def _jobs(self, session: Session) -> Iterator[GaugeMetricFamily]:
+        counts: dict[tuple[str, ...], float] = {
+            (queue, status): 0.0 for queue in session.scalars(select(JobQueue.name)) for status in Status
+        }
+        query = select(Job.queue, Job.status, func.count()).where(Job.kind != "array").group_by(Job.queue, Job.status)
+        for queue, status, count in session.execute(query):
+            counts[queue, status] = float(count)
+        yield _gauge("muster_jobs", "Jobs by state, as long as their history is kept.", ["queue", "status"], counts)
+        since = select(Job.queue, func.min(Job.queued_since)).where(Job.status == Status.RUNNABLE, Job.kind != "array")
+        waits = {
+            (queue,): max(0.0, (self._controller.clock.now() - oldest) / 1000)
+            for queue, oldest in session.execute(since.group_by(Job.queue))
+            if oldest is not None
+        }
+        oldest = "How long the job that has waited longest for room has waited."
+        yield _gauge("muster_queue_longest_wait_seconds", oldest, ["queue"], waits)
+
+    def _attempts(self, session: Session) -> Iterator[GaugeMetricFamily]:
+        held: dict[str, Sums[tuple[str, ...]]] = {"gpus": Sums(), "cpus": Sums()}
+        rates: dict[tuple[str, ...], float] = {}
+        iterations: dict[tuple[str, ...], float] = {}
+        for job, attempt in open_attempts(session, self._controller.work_queue.active()):
+            labels = (job.queue, _engine(attempt))
+            given = held_by(attempt)
+            held["gpus"][labels] += given.gpus
+            held["cpus"][labels] += given.cpus  # type: ignore[assignment]
+            main = job.gang.main
+            told = self._controller.bus.progress(job.id, attempt.number, main) or {}
+            for key, into in (("steps_per_second", rates), ("iteration", iterations)):
+                if isinstance(value := told.get(key), int | float):
+                    into[*labels, job.id, job.name, job.run] = float(value)
+        for unit, amounts in held.items():
+            yield _gauge(
+                f"muster_{unit}_in_use", f"{unit[:-1].upper()}s that running attempts hold.", [*_USED], amounts
+            )
+        of_job = [*_USED, "job", "name", "run"]
+        steps = "Environment steps a second of a running training, all worlds together."
+        yield _gauge("muster_training_steps_per_second", steps, of_job, rates)
+        yield _gauge("muster_training_iteration", "Iterations that a running training has done.", of_job, iterations)
+
+    def _volumes(self) -> GaugeMetricFamily:
+        disk = self._controller.disk
+        short = {(name,): float(disk.shortage(name) is not None) for name in disk.names}
+        said = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
+        return _gauge("muster_volume_short", said, ["volume"], short)
+
+    def _hosts(self) -> Iterator[GaugeMetricFamily]:
+        hosts, gpus, cpus = Sums[tuple[str, ...]](), Sums[tuple[str, ...]](), Sums[tuple[str, ...]]()
+        for host in self._controller.engine.capacity():
+            if not host.away:
+                engine = (engine_of(host.name),)
+                hosts[engine] += 1
+                gpus[engine] += len(host.gpus)
+                cpus[engine] += host.cpus  # type: ignore[assignment]
+        for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
+            what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
+            yield _gauge(f"muster_{name}", what, ["engine"], amounts)
+
+
+def _engine(attempt: Attempt) -> str:
+    return engine_of(attempt.nodes[0].host)
+
+
+def _gauge(name: str, text: str, labels: list[str], values: Mapping[Any, float]) -> GaugeMetricFamily:
+    family = GaugeMetricFamily(name, text, labels=labels)
+    for each, value in sorted(values.items()):
+        family.add_metric(each, value)
+    return family

@@ -1,0 +1,435 @@
+"""The reconcile loop: database × scheduler × engine.
+
+A controller that starts on the database of a dead one goes on from there: what it decides is recorded before it is done.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+
+from sqlalchemy import func, select, update
+from sqlalchemy.orm import Session, selectinload
+
+from orchestrator.control.attempts import Attempts, StoreUnavailable
+from orchestrator.control.bus import Bus
+from orchestrator.control.clock import Clock
+from orchestrator.control.disk import DEFAULT, Disk, MinFree
+from orchestrator.control.monitoring import Monitoring
+from orchestrator.control.peers import Peers
+from orchestrator.control.snapshot import open_attempts, take_snapshot
+from orchestrator.control.usage import forget_before, held_by
+from orchestrator.control.work_queue import WorkQueue
+from orchestrator.domain.job import TERMINAL, WAITING, Ending, Status
+from orchestrator.engines.registry import EngineSet
+from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.group_commit import GroupCommit
+from orchestrator.persistence.models import Job, JobQueue, now
+from orchestrator.persistence.queries import ask_to_end
+from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
+from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
+from orchestrator.scheduling.reasons import WaitReport
+from orchestrator.scheduling.snapshot import Leading
+from shared_store.layout import Store
+
+_SETTLED_AT_ONCE = 200
+"""Jobs a commit, of those that only change their state."""
+_SETTLED_A_TICK = 1000
+"""The same in one pass: a large array that ends must not keep running gangs from being looked at."""
+_GATHERING = 0.02
+"""Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
+_PASS_INTERVAL = 1.0
+"""Seconds between scheduling passes while nothing changes: shares decay and limits run out by themselves."""
+_PASS_SHARE = 0.2
+"""Share of one CPU that passes may take."""
+_WITHOUT_DATABASE = 1.0
+"""Seconds between two looks for a database that can't be used."""
+_SWEEP_INTERVAL = 2.0
+"""Seconds between two looks for queues that are gone and history that may be forgotten."""
+
+log = logging.getLogger("muster.controller")
+
+
+class Controller:
+    """Drives every job of a database to its end."""
+
+    def __init__(
+        self,
+        database: Database,
+        engine: EngineSet,
+        store: Store,
+        bus: Bus,
+        peers: Peers,
+        interval: float = 0.2,
+        retention: float | None = None,
+        clock: Clock | None = None,
+        min_free: MinFree = DEFAULT,
+    ) -> None:
+        """``interval``: seconds between two looks at the engine; ``retention``: seconds for which the history of jobs is kept;
+        ``min_free``: what must be free on the volumes of the store and the database for something new to start.
+        """
+        self.database, self.engine, self.store, self.bus, self.peers = database, engine, store, bus, peers
+        self.interval, self.retention = interval, retention
+        volumes = {"store": store.path, "database": database.volume}
+        self.disk = Disk({name: path for name, path in volumes.items() if path is not None}, min_free)
+        self._short = False
+        self.work_queue = WorkQueue()
+        self.clock = clock or Clock()
+        self.monitoring = Monitoring()
+        self.attempts = Attempts(engine, store, bus, peers, self.clock, self.monitoring, self.wake)
+        self.writing = threading.Lock()
+        """Held by whoever registers, submits or changes: what is checked must still hold when it is written."""
+        self.submissions = GroupCommit(database, self.writing)
+        bus.changed = engine.changed = self.wake
+        database.committed = self._committed
+        database.changed = self._look_again
+        self._report: WaitReport | None = None
+        self._leading: Mapping[str, Leading] = {}
+        self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
+        self._swept = self._kept = 0.0
+        self._wake, self._ending = threading.Event(), threading.Event()
+        self.trouble: str | None = None
+        """Why the database can't be used at present: nothing is launched, and no request is accepted."""
+        self._is_full = False
+        """Whether that is because its volume is full: what ends jobs is tried all the same."""
+        self._backoff = Backoff(log)
+        """What goes wrong, by a part of the pass, or by what was tried of a job and the job's id."""
+        self._thread = threading.Thread(target=self._loop, name="controller", daemon=True)
+        with database.session() as session:
+            self.clock.restore(session)
+            self.work_queue.load(session)
+            for job, attempt in open_attempts(session, self.work_queue.active()):
+                bus.expect(job.id, attempt.number, len(attempt.nodes))  # before the router is there for their nodes
+
+    def start(self) -> None:
+        self.disk.start()
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Something changed: look now instead of at the next interval."""
+        self._wake.set()
+
+    def close(self) -> None:
+        """Leave the loop; running gangs go on, and the next controller on this database finds them."""
+        self._ending.set()
+        self.disk.close()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _loop(self) -> None:
+        while not self._ending.is_set():
+            self._isolated("reconciling", self.tick)
+            if self._wake.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
+                self._ending.wait(_GATHERING)
+            self._wake.clear()
+
+    def tick(self) -> None:
+        """One pass over every job that needs a look; one that can't be handled now does not hold up the others.
+
+        Raises DatabaseError where the database can't be used; the next pass tries again.
+        """
+        self._keep_database()
+        with self.database.session() as session:
+            if self.clock.stepped:
+                self.clock.note_step(session)
+            self.work_queue.take_dependents(session)
+        taken = self.work_queue.take_due(_SETTLED_A_TICK)
+        due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
+        self.work_queue.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
+        if due and len(taken) == _SETTLED_A_TICK:
+            self.wake()  # the rest comes after a look at the gangs that run
+        for start in range(0, len(due), _SETTLED_AT_ONCE):
+            self.work_queue.look_again(self._guarded("settle", due[start : start + _SETTLED_AT_ONCE], self._settle))
+        for job_id in self.work_queue.active():
+            if not self._backoff.waits(("advance", job_id)):
+                self._guarded("advance", [job_id], self._advance)
+        self._isolated("scheduling", self._admit)
+        self._isolated("clearing away", self._sweep)
+
+    def _keep_database(self) -> None:
+        """Raises DatabaseError where it is away, or another controller's; where it is back, what is known of jobs is read anew."""
+        self.database.check()
+        if self.trouble is not None or time.monotonic() - self._kept > _SWEEP_INTERVAL:
+            self.database.keep_lock()
+            self._kept = time.monotonic()
+        if self.trouble is not None:
+            with self.database.session() as session:
+                self.clock.rewrite(session)  # to be read is not enough: its volume may be full
+                self.work_queue.load(session)
+            self.trouble = None
+            log.warning("the database can be used again")
+
+    def _isolated(self, what: str, body: Callable[[], None]) -> None:
+        """Carry out a part of a pass, whose failure must not stop the other parts."""
+        try:
+            body()
+            self._backoff.worked(what)
+        except DatabaseError as error:
+            if self.trouble is None:
+                log.error("%s; until it can be used again no job is started or accepted", error)
+            self.trouble, self._is_full = str(error), isinstance(error, DatabaseFull)
+        except Exception as error:
+            self._backoff.failed(what, f"{what} failed ({_words(error)}); trying again", error)
+
+    def _guarded(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], None]) -> Sequence[str]:
+        """Do something to these jobs in one commit; where that fails, to each by itself. Returns those that it failed for.
+
+        Those are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        Raises DatabaseError.
+        """
+        try:
+            self._carried_out(ids, body)
+        except DatabaseError:
+            raise
+        except Exception as error:
+            if len(ids) > 1:
+                return [failed for job_id in ids for failed in self._guarded(what, [job_id], body)]
+            self._failed(what, ids[0], error)
+            return ids
+        for job_id in ids:
+            self._backoff.worked((what, job_id))
+        return []
+
+    def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
+        with self.database.session() as session:
+            query = select(Job).where(Job.id.in_(ids)).options(selectinload(Job.attempts))
+            jobs = {job.id: job for job in session.scalars(query)}
+            for job_id in ids:
+                if job_id in jobs:
+                    body(session, jobs[job_id])
+
+    def _failed(self, what: str, job_id: str, error: Exception) -> None:
+        """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
+        expected = isinstance(error, StoreUnavailable)
+        reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
+        if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", None if expected else error):
+            with self.database.session() as session:  # by its id alone: its row may be what is damaged
+                told = (
+                    update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason[:1024])
+                )
+                session.execute(told)
+
+    def _advance(self, session: Session, job: Job) -> None:
+        if attempt := job.open_attempt:
+            self.attempts.advance(session, job, attempt)
+
+    def _committed(self, jobs: Sequence[Job]) -> None:
+        """Only what this thread has written is known to be the newest; what a request has changed is read again."""
+        if threading.current_thread() is self._thread:
+            self.work_queue.note(jobs)
+        else:
+            self._look_again([job.id for job in jobs])
+
+    def _look_again(self, ids: Collection[str]) -> None:
+        """Requests have changed these jobs: what failed of them is tried at once."""
+        for job_id in ids:
+            for what in ("settle", "advance", "start"):
+                self._backoff.hurry((what, job_id))
+        self.work_queue.look_again(ids)
+
+    # -- jobs without a gang ------------------------------------------------------------------------------------------
+
+    def _settle(self, session: Session, job: Job) -> None:
+        """A job that has no gang: ended on request, held back by others, an array by its children, or ready to run."""
+        self.work_queue.note([job])
+        if job.is_terminal or job.open_attempt is not None:
+            return
+        if job.queued_since is None:
+            job.queued_since = job.created_at - self.clock.drift
+        if job.kind == "array":
+            self._settle_array(session, job)
+        elif job.stop_reason is not None:
+            job.move(Status.FAILED, job.stop_reason)
+        elif job.status in (Status.SUBMITTED, Status.PENDING):
+            states = {each.on_id: self._state(session, each.on_id) for each in job.dependencies}
+            failed = [on for on, status in states.items() if status == Status.FAILED]
+            pending = [on for on, status in states.items() if status != Status.SUCCEEDED]
+            if failed:
+                job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
+            elif pending:
+                others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
+                job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
+            else:
+                job.move(Status.RUNNABLE, WAITING)
+        elif job.status == Status.RUNNABLE:
+            _ = job.gang  # raises where the row is damaged, which is why the job is looked at
+
+    def _settle_array(self, session: Session, job: Job) -> None:
+        """An array is over when its last child is; one failed child makes it FAILED."""
+        query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
+        counts: dict[str, int] = {status: count for status, count in session.execute(query)}
+        left = sum(count for status, count in counts.items() if not Status(status).is_terminal)
+        if job.status == Status.SUBMITTED:
+            job.move(Status.PENDING, f"an array of {job.array_size}")
+        if left:
+            return
+        failed = counts.get(Status.FAILED, 0)
+        if failed:
+            job.move(Status.FAILED, job.stop_reason or f"{failed} of {job.array_size} array jobs failed")
+        else:
+            job.move(Status.SUCCEEDED, "all array jobs succeeded")
+
+    @staticmethod
+    def _state(session: Session, job_id: str) -> str:
+        job = session.get(Job, job_id)
+        return job.status if job is not None else Status.FAILED
+
+    # -- admission ----------------------------------------------------------------------------------------------------
+
+    def _admit(self) -> None:
+        """A scheduling pass, where something changed or time has passed, and enough space is free."""
+        shortage = self.disk.shortage()
+        if self._short != (shortage is not None):
+            log.warning("%s", shortage or "the volumes have enough free space again")
+            self._short = shortage is not None
+        if shortage is not None:
+            return
+        version, at, took = self._passed
+        pause = took / _PASS_SHARE
+        idle = time.monotonic() - at
+        if idle < pause or (version == self.work_queue.version and idle < _PASS_INTERVAL):
+            return
+        started, version = time.monotonic(), self.work_queue.version
+        waiting = self.work_queue.waiting()
+        if self._backoff:  # seldom: there may be very many of them
+            waiting = [each for each in waiting if not self._backoff.waits(("start", each.job))]
+        if not waiting:
+            self._report, self._passed = None, (version, started, 0.0)
+            return
+        with self.database.session() as session:
+            snapshot = take_snapshot(
+                session,
+                self.clock,
+                self.engine.capacity(),
+                waiting,
+                self.work_queue.active(),
+                self._leading,
+                self.engine.names[0],
+                self.engine.queueing,
+            )
+        decisions = decide(snapshot)
+        self._report, self._leading = decisions.report, decisions.leading
+        took = time.monotonic() - started
+        self._passed = (version, started, took)
+        self.monitoring.pass_took(took)
+        self._carry_out(decisions)
+
+    def _carry_out(self, decisions: Decisions) -> None:
+        """Each decision by itself: one that fails does not stop the others."""
+        for cancel in decisions.cancels:
+            self._guarded("cancel", [cancel.job], partial(self._cancel, cancel))
+        for preempt in decisions.preempts:
+            self._guarded("preempt", [preempt.job], partial(self._preempt, preempt))
+        for start in decisions.starts:
+            self._guarded("start", [start.job], partial(self._start, start))
+
+    @staticmethod
+    def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
+        job.cancelled, job.stop_reason = True, cancel.reason
+
+    @staticmethod
+    def _preempt(preempt: Preempt, session: Session, job: Job) -> None:
+        by, attempt = session.get_one(Job, preempt.by), job.open_attempt
+        if attempt is not None and attempt.ending is None:
+            attempt.ending = Ending.PREEMPTED
+            attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+
+    def _start(self, start: Start, session: Session, job: Job) -> None:
+        # a request may have ended the job since the snapshot was taken
+        if job.status == Status.RUNNABLE and job.stop_reason is None:
+            self.attempts.begin(session, job, start)
+        else:
+            self.work_queue.look_again([job.id])
+
+    # -- what the API asks --------------------------------------------------------------------------------------------
+
+    def check_writable(self, *, adds: bool) -> None:
+        """Whether a request may change the database, to which it ``adds`` something or not.
+
+        Raises DatabaseError while the database can't be used or is another controller's, DatabaseFull where its volume has too
+        little room for what is new.
+        """
+        if (trouble := self.trouble) is not None and (adds or not self._is_full):
+            raise DatabaseError(trouble)
+        if adds and (shortage := self.disk.shortage("database")):
+            raise DatabaseFull(f"{shortage}, and nothing new is accepted")
+
+    def reason(self, job: Job) -> str | None:
+        """Why a job waits just now, or what its user should know while it runs; None where its own reason says all."""
+        shortage = self.disk.shortage()
+        if job.status in (Status.STARTING, Status.RUNNING) and shortage is not None:
+            return f"{job.status_reason}; {shortage}"
+        report = self._report
+        if job.status != Status.RUNNABLE or self.work_queue.since(job.id) is None:
+            return None
+        if shortage is not None or report is None:
+            return shortage
+        try:
+            return report.reason(job.id)
+        except KeyError:
+            return None  # submitted since the last pass
+
+    def front(self, queue: str, count: int) -> tuple[Sequence[str], Mapping[str, int]]:
+        """The first waiting jobs of a queue in the order in which they will start, and since when each waits [ms].
+
+        Of the first one: since when it is the first.
+        """
+        report, leading = self._report, self._leading.get(queue)
+        order = [
+            job for job in (report.order(queue)[:count] if report else []) if self.work_queue.since(job) is not None
+        ]
+        times = {job: since for job in order if (since := self.work_queue.since(job)) is not None}
+        if leading is not None and leading.job in times:
+            times[leading.job] = leading.since + self.clock.drift
+        return order, times
+
+    def utilization(
+        self, session: Session, queue: str
+    ) -> tuple[Mapping[str, float], Mapping[str, Mapping[str, float]]]:
+        """What the gangs of a queue hold just now, by unit (``VCPU``, ``GPU``): in all, and by share."""
+        total: dict[str, float] = defaultdict(float)
+        shares: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+        for job, attempt in open_attempts(session, self.work_queue.active()):
+            if job.queue == queue:
+                held = held_by(attempt)
+                for unit, amount in (("VCPU", held.cpus), ("GPU", held.gpus)):
+                    total[unit] += amount
+                    shares[job.share or ""][unit] += amount
+        return total, shares
+
+    def drain(self, session: Session, queue: JobQueue) -> None:
+        """Ask all jobs of a queue to end."""
+        ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
+
+    def _sweep(self) -> None:
+        """Remove deleted queues that are empty, and history that is older than it is kept."""
+        if time.monotonic() - self._swept < _SWEEP_INTERVAL:
+            return
+        if not self.writing.acquire(blocking=False):
+            return  # somebody writes: gangs must not wait for that
+        try:
+            self._swept = time.monotonic()
+            self._clear_away()
+        finally:
+            self.writing.release()
+
+    def _clear_away(self) -> None:
+        self._backoff.tidy()
+        with self.database.session() as session:
+            for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
+                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
+                if session.scalars(busy).first() is None:
+                    session.delete(queue)
+            if self.retention is not None:
+                # by the clock that is behind: nothing is forgotten too early
+                forget_before(session, min(now(), self.clock.now()) - int(self.retention * 1000))
+
+
+def _words(error: Exception) -> str:
+    """An unexpected error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

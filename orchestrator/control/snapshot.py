@@ -1,0 +1,161 @@
+"""From the database to a scheduling pass's snapshot, and what is known of the queues after the pass."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session, selectinload
+
+from orchestrator.control.clock import Clock
+from orchestrator.control.compute_environments import engine_named_by
+from orchestrator.control.usage import placements_of, usage_at
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement, engine_of
+from orchestrator.domain.native_options import NativeOptions
+from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence import models
+from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy
+from orchestrator.scheduling.fit import Fit, fit
+from orchestrator.scheduling.snapshot import (
+    ComputeEnvironment,
+    FairShare,
+    Leading,
+    Queue,
+    Running,
+    Snapshot,
+    TimeLimit,
+    Waiting,
+)
+
+HOSTS_TAG = "muster:hosts"
+"""Tag that names the hosts of a compute environment, with commas between; all of its engine's without it."""
+DEFAULT_DECAY = 600
+"""``shareDecaySeconds`` where it is not set, or 0 (AWS's API model)."""
+_LOADED_AT_ONCE = 500
+
+
+def take_snapshot(
+    session: Session,
+    clock: Clock,
+    hosts: Sequence[Host],
+    waiting: Sequence[Waiting],
+    active: Sequence[str],
+    leading: Mapping[str, Leading] | None = None,
+    first: str = "local",
+    queueing: Collection[str] = (),
+) -> Snapshot:
+    """Everything that the pass depends on, as it is now.
+
+    Args:
+        session: The session.
+        clock: Tells what time it is.
+        hosts: All that the engines have.
+        waiting: The jobs that wait for room.
+        active: Ids of the jobs that may hold some.
+        leading: What the last pass found at the head of each queue.
+        first: The controller's first engine.
+        queueing: Engines that queue by themselves: what runs there takes nothing away from what is handed to them.
+    """
+    policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
+    queues = {queue.name: read_queue(queue, policies) for queue in session.scalars(select(JobQueue))}
+    ces = {
+        each.name: read_compute_environment(each, first) for each in session.scalars(select(models.ComputeEnvironment))
+    }
+    holding = open_attempts(session, active)
+    counted = [(job, attempt) for job, attempt in holding if engine_of(attempt.nodes[0].host) not in queueing]
+    decays = {name: queue.policy.decay_seconds for name, queue in queues.items() if queue.policy}
+    return Snapshot(
+        now=clock.now(),
+        drift=clock.drift,
+        hosts=hosts,
+        compute_environments=ces,
+        queues=queues,
+        waiting=waiting,
+        running=[_running(job, attempt) for job, attempt in counted],
+        usage=usage_at(session, clock.now(), decays, holding),
+        leading=leading or {},
+    )
+
+
+def open_attempts(session: Session, jobs: Sequence[str]) -> list[tuple[Job, Attempt]]:
+    """The jobs whose gang exists or may exist, with that attempt."""
+    known: dict[str, Job] = {}
+    for start in range(0, len(jobs), _LOADED_AT_ONCE):
+        some = select(Job).where(Job.id.in_(jobs[start : start + _LOADED_AT_ONCE])).options(selectinload(Job.attempts))
+        known |= {job.id: job for job in session.scalars(some)}
+    found = []
+    for job_id in jobs:
+        job = known.get(job_id)
+        # a damaged row has no nodes: what it holds is not known, and the controller says so of the job
+        if job is not None and (attempt := job.open_attempt) is not None and attempt.nodes:
+            found.append((job, attempt))
+    return found
+
+
+def fit_in_queue(session: Session, engine: EngineSet, queue: JobQueue, shape: Shape, patience: float = 0.0) -> Fit:
+    """What the queue would have for a gang if nothing ran; ``patience``: seconds to wait for the engines' newest hosts."""
+    first = engine.names[0]
+    rows = [
+        row for name in queue.compute_environments if (row := session.get(models.ComputeEnvironment, name)) is not None
+    ]
+    ces = {row.name: read_compute_environment(row, first) for row in rows}
+    engines = dict.fromkeys(ce.engine for ce in ces.values() if ce.engine is not None)
+    elastic = [name for name, ce in ces.items() if ce.engine is not None and engine.is_elastic([ce.engine])]
+    return fit(shape, read_queue(queue, {}), ces, engine.capacity(engines, patience), elastic)
+
+
+def read_queue(queue: JobQueue, policies: Mapping[str, SchedulingPolicy]) -> Queue:
+    policy = policies.get(queue.policy) if queue.policy else None
+    limits = tuple(TimeLimit(limit["reason"], limit["maxTimeSeconds"]) for limit in queue.limits)
+    return Queue(
+        queue.name,
+        queue.priority,
+        tuple(queue.compute_environments),
+        _fair_share(policy.fairshare) if policy else None,
+        limits,
+    )
+
+
+def _fair_share(document: Mapping[str, Any]) -> FairShare:
+    weights = {
+        each["shareIdentifier"]: each.get("weightFactor", 1.0) for each in document.get("shareDistribution") or []
+    }
+    decay = document.get("shareDecaySeconds") or DEFAULT_DECAY
+    return FairShare(decay, document.get("computeReservation", 0), weights)
+
+
+def read_compute_environment(row: models.ComputeEnvironment, first: str) -> ComputeEnvironment:
+    """``first``: the engine of one that names none."""
+    named = row.tags.get(HOSTS_TAG)
+    hosts = tuple(name.strip() for name in named.split(",")) if named else None
+    most = (row.document.get("computeResources") or {}).get("maxvCpus")
+    cpus = float(most) if most is not None else None
+    return ComputeEnvironment(row.name, row.state == "ENABLED", hosts, cpus, engine_named_by(row.tags, first))
+
+
+def new_nodes(placements: Sequence[Placement]) -> list[Node]:
+    """An attempt's nodes as they are recorded before they run."""
+    return [
+        Node(index=index, host=each.host, gpus=each.gpus, cpus=each.cpus, memory=each.memory)
+        for index, each in enumerate(placements)
+    ]
+
+
+def _running(job: Job, attempt: Attempt) -> Running:
+    # empty where the row is damaged, which the controller says of the job
+    options = job.gang.options if job.node_properties else NativeOptions()
+    return Running(
+        job=job.id,
+        name=job.name,
+        queue=job.queue,
+        share=job.share,
+        priority=job.priority,
+        compute_environment=attempt.compute_environment or "local",
+        placements=placements_of(attempt),
+        started_at=attempt.running_since,
+        timeout=job.timeout,
+        preemptible=options.preemptible,
+        ending=attempt.ending is not None or job.stop_reason is not None,
+    )

@@ -1,0 +1,132 @@
+"""What attempts have used: GPU-seconds and CPU-seconds, those whose work was lost, and each share's part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sqlalchemy import delete, or_, select
+from sqlalchemy.orm import Session, aliased
+
+from orchestrator.domain.hosts import Placement
+from orchestrator.domain.job import TERMINAL, Ending
+from orchestrator.domain.resources import Resources
+from orchestrator.persistence.models import (
+    Attempt,
+    AutomaticEvaluation,
+    Dependency,
+    Job,
+    Node,
+    ShareUsage,
+    WebhookDelivery,
+)
+from orchestrator.scheduling.order import decayed
+from shared_store.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.layout import Run
+
+
+def held_by(attempt: Attempt) -> Resources:
+    """What the nodes of an attempt were given in all."""
+    return sum((each.resources for each in placements_of(attempt)), Resources())
+
+
+def placements_of(attempt: Attempt) -> tuple[Placement, ...]:
+    """Where the nodes of an attempt are and what they were given, by index."""
+    return tuple(node.placement for node in attempt.nodes)
+
+
+def charge(attempt: Attempt, run: Run, moment: int) -> None:
+    """Fill in what a closed attempt has used until ``moment`` (steady time [ms]), and what of it was lost: all since its last checkpoint."""
+    assert attempt.stopped_at is not None
+    seconds = _held(attempt, moment)
+    held = held_by(attempt)
+    lost = 0.0 if attempt.ending == Ending.SUCCEEDED else min(seconds, _since_checkpoint(attempt, run, seconds))
+    attempt.gpu_seconds, attempt.cpu_seconds = held.gpus * seconds, held.cpus * seconds
+    attempt.wasted_gpu_seconds, attempt.wasted_cpu_seconds = held.gpus * lost, held.cpus * lost
+
+
+def _since_checkpoint(attempt: Attempt, run: Run, otherwise: float) -> float:
+    """Seconds from the last checkpoint that this attempt made to its end; ``otherwise`` where it made none."""
+    assert attempt.stopped_at is not None
+    for checkpoint in reversed(list_checkpoints(run)):
+        if checkpoint.epoch != attempt.epoch:
+            continue
+        try:
+            return max(0.0, attempt.stopped_at / 1000 - float(checkpoint.manifest["created"]))
+        except (DamagedCheckpoint, KeyError, TypeError, ValueError):
+            continue
+    return otherwise
+
+
+def _held(attempt: Attempt, moment: int) -> float:
+    """Seconds for which an attempt has held what it was given, at ``moment`` (steady time [ms])."""
+    return max(0, moment - (attempt.created_at if attempt.held_since is None else attempt.held_since)) / 1000
+
+
+def resource_seconds(attempt: Attempt, moment: int) -> float:
+    """What an attempt has used until ``moment`` (steady time [ms]): GPU-seconds, or CPU-seconds where it has no GPUs."""
+    seconds = _held(attempt, moment)
+    held = held_by(attempt)
+    return seconds * (held.gpus or held.cpus)
+
+
+def add_usage(session: Session, queue: str, share: str, seconds: float, decay: int, moment: int) -> None:
+    """Add resource-seconds that a share has used of a queue until ``moment`` (steady time [ms])."""
+    usage = session.get(ShareUsage, (queue, share))
+    if usage is None:
+        usage = ShareUsage(queue=queue, share=share, seconds=0.0, as_of=moment)
+        session.add(usage)
+    usage.seconds = decayed(usage.seconds, max(0, moment - usage.as_of) / 1000, decay) + seconds
+    usage.as_of = moment
+
+
+def usage_at(
+    session: Session, moment: int, decays: Mapping[str, int], running: Sequence[tuple[Job, Attempt]]
+) -> dict[tuple[str, str], float]:
+    """(queue, share) → resource-seconds decayed to a moment, with what running gangs have used until then.
+
+    Args:
+        session: The session.
+        moment: Steady time [ms].
+        decays: ``shareDecaySeconds`` by queue, of the queues that have a policy.
+        running: Jobs with their open attempts.
+    """
+    found: dict[tuple[str, str], float] = {}
+    if not decays:
+        return found
+    for row in session.scalars(select(ShareUsage).where(ShareUsage.queue.in_(decays))):
+        left = decayed(row.seconds, max(0, moment - row.as_of) / 1000, decays[row.queue])
+        if left > 1e-3:  # forgotten in the end: a share with nothing used is not active
+            found[row.queue, row.share] = left
+    for job, attempt in running:
+        if job.queue in decays:
+            key = (job.queue, job.share or "")
+            found[key] = found.get(key, 0.0) + resource_seconds(attempt, moment)
+    return found
+
+
+def forget_before(session: Session, moment: int, most: int = 500) -> int:
+    """Delete the history of jobs that were over before ``moment`` [ms], at most so many; returns how many were.
+
+    What a job that is not over waits for is kept, and an array with its children until the last of them is over.
+    """
+    open_jobs = select(Job.id).where(Job.status.not_in(TERMINAL))
+    needed = select(Dependency.on_id).where(Dependency.job_id.in_(open_jobs))
+    alone = or_(Job.parent.is_(None), Job.parent.not_in(open_jobs))
+    child = aliased(Job)
+    # after its children, which have their definition from it
+    last = or_(Job.kind != "array", ~select(child.id).where(child.parent == Job.id).exists())
+    query = select(Job.id).where(Job.stopped_at < moment, Job.id.not_in(needed), alone, last)
+    query = query.order_by(Job.stopped_at).limit(most)
+    ids = list(session.scalars(query))
+    session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(ids), WebhookDelivery.next_at.is_(None)))
+    session.execute(
+        delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(ids), AutomaticEvaluation.open.is_(False))
+    )
+    for table, column in (
+        (Node, Node.job_id),
+        (Attempt, Attempt.job_id),
+        (Dependency, Dependency.job_id),
+        (Job, Job.id),
+    ):
+        session.execute(delete(table).where(column.in_(ids)))
+    return len(ids)

@@ -1,0 +1,165 @@
+"""Webhooks: whom the operator of a controller has told when jobs end, and how a message is signed.
+
+They are those of a file that the operator gives at the start, and no others: a URL in a user's YAML would let any user make the
+controller connect to what only the controller can reach. Signatures follow Standard Webhooks (standardwebhooks.com).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import hmac
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Job
+from orchestrator.spec.model import KINDS
+from shared_store.layout import NAME
+from shared_store.wording import explain, path_of
+
+PAUSES = (2, 10, 50, 250, 1250, 6250, 31250)
+"""Seconds after each failed try; the eighth, about eleven hours after the first, is the last one."""
+_PREFIX = "whsec_"
+_SECRET_SIZES = range(24, 65)
+"""Bytes, of Standard Webhooks."""
+
+
+class WebhooksError(Exception):
+    """The file can't be used; one line without any secret: which key, why, and what to do."""
+
+
+def _url(value: str) -> str:
+    try:
+        parts = urlsplit(value)
+        is_one = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        is_one = False
+    if not is_one:
+        raise ValueError("expected a URL such as https://chat.example/hooks/muster")
+    return value
+
+
+def _secret(value: str) -> str:
+    try:
+        size = len(_bytes(value))
+    except (ValueError, binascii.Error):
+        size = 0
+    if not value.startswith(_PREFIX) or size not in _SECRET_SIZES:
+        raise ValueError(
+            "expected whsec_ and 24 to 64 random bytes in base64; make one: echo whsec_$(openssl rand -base64 32)"
+        )
+    return value
+
+
+def _bytes(secret: str) -> bytes:
+    return base64.b64decode(secret.removeprefix(_PREFIX), validate=True)
+
+
+class Webhook(BaseModel):
+    """One receiver."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, hide_input_in_errors=True)
+    name: str = ""
+    url: Annotated[str, AfterValidator(_url)]
+    secret: Annotated[str, AfterValidator(_secret)] = Field(repr=False)
+    statuses: list[Literal["SUCCEEDED", "FAILED"]] = Field(default=["SUCCEEDED", "FAILED"], min_length=1)
+    queues: list[str] | None = None
+    """Names of job queues; None: all."""
+    kinds: list[Literal["train", "evaluate", "race", "export", "record", "render", "command"]] | None = None
+    """Of :data:`orchestrator.spec.model.KINDS`; None: all."""
+    link: Annotated[str, AfterValidator(_url)] | None = None
+    """Where the receiver's people reach this controller; None: where it listens."""
+
+    @property
+    def receiver(self) -> str:
+        """Scheme and host: the rest of a URL is often a secret."""
+        parts = urlsplit(self.url)
+        return f"{parts.scheme}://{parts.hostname}" + (f":{parts.port}" if parts.port else "")
+
+    def wants(self, job: Job) -> bool:
+        """Whether it is told of the end of this job; of an array as a whole, not of its children."""
+        if job.parent is not None or job.status not in self.statuses:
+            return False
+        if self.queues is not None and job.queue not in self.queues:
+            return False
+        return self.kinds is None or kind_of(job) in self.kinds
+
+    def headers(self, identity: str, timestamp: int, body: bytes) -> dict[str, str]:
+        """The headers of a message: ``identity`` is the same at each try, ``timestamp`` is the Unix time of this one [s]."""
+        signed = f"{identity}.{timestamp}.".encode() + body
+        digest = hmac.new(_bytes(self.secret), signed, hashlib.sha256).digest()
+        return {
+            "content-type": "application/json",
+            "webhook-id": identity,
+            "webhook-timestamp": str(timestamp),
+            "webhook-signature": f"v1,{base64.b64encode(digest).decode()}",
+        }
+
+
+def kind_of(job: Job) -> str:
+    """What a job does, of :data:`orchestrator.spec.model.KINDS`; ``command`` where its spec does not say, or its row is damaged."""
+    spec = _spec(job)
+    return next((kind for kind in KINDS if spec.get(kind)), "command")
+
+
+def run_of(job: Job) -> str:
+    """The run that a job trains, or of which it evaluates, races, exports, records or renders a checkpoint."""
+    section = _spec(job).get(kind_of(job))
+    named = section.get("run") if isinstance(section, dict) else None
+    return named if isinstance(named, str) and NAME.fullmatch(named) else job.run
+
+
+def _spec(job: Job) -> Mapping[str, Any]:
+    try:
+        return job.gang.spec or {}
+    except (ValueError, KeyError, TypeError, AttributeError):  # its row is damaged
+        return {}
+
+
+def read_webhooks(source: str | None) -> Sequence[Webhook]:
+    """The webhooks of a JSON file, ``{"NAME": {"url": …, "secret": "whsec_…"}}``; none without a file. Raises WebhooksError."""
+    if source is None:
+        return ()
+    path = Path(source).expanduser()
+    try:
+        if path.stat().st_mode & 0o077:
+            raise WebhooksError(f"{path}: others can read these secrets; chmod 600 {path}")
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        problem = error.strerror if isinstance(error, OSError) else "not JSON"
+        raise WebhooksError(f"{path}: webhooks can't be read ({problem})") from None
+    if not isinstance(found, dict) or not found:
+        raise WebhooksError(f'{path}: expected a JSON object, {{"NAME": {{"url": "https://…", "secret": "whsec_…"}}}}')
+    for name in found:
+        if not NAME.fullmatch(name) or "name" in (found[name] if isinstance(found[name], dict) else {}):
+            raise WebhooksError(f"{path}: {name[:60]!r} is no name of a webhook: letters, digits, '.', '_' and '-'")
+    try:
+        read = TypeAdapter(dict[str, Webhook]).validate_python(found)
+    except ValidationError as error:
+        first: Any = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in path_of(first))
+        words = f"unknown key; valid here: {', '.join(_KEYS)}" if first["type"] == "extra_forbidden" else _told(first)
+        raise WebhooksError(f"{path}: {where}: {words}") from None
+    return [webhook.model_copy(update={"name": name}) for name, webhook in read.items()]
+
+
+_KEYS = [name for name in Webhook.model_fields if name != "name"]
+
+
+def _told(problem: Any) -> str:
+    """What is wrong with a value; of a secret or a URL, which may have one, without the value."""
+    if problem["type"] == "value_error":
+        return str(problem["ctx"]["error"])
+    return "expected a text" if problem["type"] == "string_type" else explain(problem)
+
+
+def event_of(status: str) -> str:
+    """The ``type`` of the message about a job that ended so."""
+    return "job.succeeded" if status == Status.SUCCEEDED else "job.failed"

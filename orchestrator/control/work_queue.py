@@ -1,0 +1,121 @@
+"""The controller's memory of the jobs that are not over: who waits for room, whose gang runs, who is to be looked at.
+
+It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Sequence
+from itertools import islice
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.job import TERMINAL, Status
+from orchestrator.persistence.models import Dependency, Job
+from orchestrator.scheduling.snapshot import Waiting
+
+_LOADED_AT_ONCE = 1000
+
+
+class WorkQueue:
+    """Jobs by what the controller has to do with them. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: dict[str, Waiting] = {}
+        self._active: dict[str, None] = {}
+        self._due: dict[str, None] = {}
+        self._ended: dict[str, None] = {}
+        self._shapes: dict[Shape, Shape] = {}
+        self.version = 0
+        """Grows whenever something changes that a scheduling pass depends on."""
+
+    def load(self, session: Session) -> None:
+        """Read all jobs that are not over, in place of what was known. Those that depend on a job that has ended are looked at too."""
+        with self._lock:
+            self._waiting, self._active = {}, {}
+            self.version += 1
+        query = select(Job).where(Job.status.not_in(TERMINAL)).order_by(Job.created_at, Job.id)
+        for jobs in session.scalars(query).partitions(_LOADED_AT_ONCE):
+            self.note(jobs)
+            self.look_again(job.id for job in jobs if job.status == Status.PENDING)
+            session.expunge_all()
+
+    def note(self, jobs: Iterable[Job]) -> None:
+        """These jobs are in the database as they are here: for the one thread that changes their states."""
+        with self._lock:
+            for job in jobs:
+                self._note(job)
+
+    def _note(self, job: Job) -> None:
+        before = (job.id in self._waiting, job.id in self._active)
+        # not out of _due: whoever asked for another look may know of a change that came after this one was read
+        for group in (self._waiting, self._active):
+            group.pop(job.id, None)
+        if job.is_terminal:
+            self._ended[job.id] = None
+            if job.parent is not None:
+                self._due[job.parent] = None
+        elif job.status in (Status.STARTING, Status.RUNNING):
+            self._active[job.id] = None
+        elif job.status == Status.RUNNABLE and job.stop_reason is None:
+            try:
+                self._waiting[job.id] = self._entry(job)
+            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+                self._due[job.id] = None
+        elif job.stop_reason is not None or job.status == Status.SUBMITTED:
+            self._due[job.id] = None
+        # a PENDING job is looked at when one that it waits for, or a child of it, has ended
+        if before != (job.id in self._waiting, job.id in self._active):
+            self.version += 1
+
+    def take_due(self, most: int | None = None) -> Sequence[str]:
+        """The jobs to be looked at once, oldest note first, at most so many; each is returned once."""
+        with self._lock:
+            due = list(islice(self._due, most))
+            for job in due:
+                del self._due[job]
+        return due
+
+    def look_again(self, jobs: Iterable[str]) -> None:
+        """Hand these out at the next :meth:`take_due`."""
+        with self._lock:
+            self._due.update(dict.fromkeys(jobs))
+
+    def take_dependents(self, session: Session) -> None:
+        """Have those looked at that wait for jobs which ended since the last call."""
+        with self._lock:
+            ended, self._ended = list(self._ended), {}
+        try:
+            for start in range(0, len(ended), _LOADED_AT_ONCE):
+                some = ended[start : start + _LOADED_AT_ONCE]
+                self.look_again(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
+        except BaseException:
+            with self._lock:
+                self._ended.update(dict.fromkeys(ended))
+            raise
+
+    def active(self) -> Sequence[str]:
+        """The jobs whose gang starts, runs or is being stopped."""
+        with self._lock:
+            return list(self._active)
+
+    def waiting(self) -> Sequence[Waiting]:
+        """The jobs that wait for room."""
+        with self._lock:
+            return list(self._waiting.values())
+
+    def since(self, job: str) -> int | None:
+        """Since when a job waits for room [ms]; None where it does not."""
+        entry = self._waiting.get(job)
+        return entry.since if entry else None
+
+    def _entry(self, job: Job) -> Waiting:
+        shape = job.gang.shape
+        shape = self._shapes.setdefault(shape, shape)
+        since = job.runnable_at or job.created_at
+        created = job.created_at if job.queued_since is None else job.queued_since
+        return Waiting(job.id, job.name, job.queue, shape, job.priority, job.share, created, since, job.timeout)

@@ -1,0 +1,1 @@
+"""Pure values: jobs and how they end, gangs, hosts, errors."""

@@ -1,0 +1,147 @@
+"""Jobs and attempts: the states of AWS Batch, their legal transitions, and the verdict on a gang's end. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from shared_store.outcomes import EX_TEMPFAIL, first_cause
+
+WAITING = "waiting for the scheduler"
+"""Reason of a RUNNABLE job that no scheduling pass has considered yet."""
+
+
+class Status(StrEnum):
+    """State of a job (AWS Batch user guide, "Job states")."""
+
+    SUBMITTED = "SUBMITTED"
+    PENDING = "PENDING"
+    RUNNABLE = "RUNNABLE"
+    STARTING = "STARTING"
+    RUNNING = "RUNNING"
+    SUCCEEDED = "SUCCEEDED"
+    FAILED = "FAILED"
+
+    @property
+    def is_terminal(self) -> bool:
+        return self in TERMINAL
+
+
+TERMINAL = (Status.SUCCEEDED, Status.FAILED)
+"""States of a job that has ended."""
+
+TRANSITIONS = {
+    Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
+    Status.PENDING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
+    Status.RUNNABLE: {Status.STARTING, Status.FAILED},
+    Status.STARTING: {Status.RUNNING, Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
+    Status.RUNNING: {Status.RUNNABLE, Status.SUCCEEDED, Status.FAILED},
+    Status.SUCCEEDED: set[Status](),
+    Status.FAILED: set[Status](),
+}
+"""A failed attempt with tries left goes back to RUNNABLE, as on AWS; an array is PENDING until its children have ended."""
+
+
+def check_transition(before: Status, after: Status) -> None:
+    """Raises ValueError for a transition that AWS Batch does not have."""
+    if after != before and after not in TRANSITIONS[before]:
+        raise ValueError(f"a job can't go from {before} to {after}")
+
+
+class Ending(StrEnum):
+    """Why an attempt is over."""
+
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    """A failure that a retry may mend."""
+    FATAL = "fatal"
+    """A failure after which the job is not tried again."""
+    PREEMPTED = "preempted"
+    """Stopped in favour of another job: started again without spending an attempt, unless it was done (exit 0)."""
+    REQUEUE = "requeue"
+    """Checkpointed and left on request (exit 75): started again without spending an attempt."""
+    STOPPED = "stopped"
+    """Requested by a user or through the API."""
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True)
+class NodeEnd:
+    """How one node ended; ``ended`` is the Unix time [s] of its first error, or of its end."""
+
+    exit_code: int
+    reason: str
+    ended: float
+    error: str | None = None
+    """Message of the node's first error."""
+    lost: bool = False
+    """The end was not observed: the node vanished, presumably with its host."""
+    asked: bool = False
+    """The node was told to end: the cause lies elsewhere."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(
+            self, "reason", excerpt(self.reason, LONGEST_REASON)
+        )  # engines pass on text of other programs
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The attempt's verdict, from the ends observed so far."""
+
+    ending: Ending
+    reason: str
+    exit_code: int | None = None
+    certain: bool = True
+    """False while every node that has ended was told to end: the cause may be observed later."""
+
+
+AWS_EXITED = "Essential container in task exited"
+"""AWS Batch's reason for an attempt whose main container ended, successfully or not; clients match it."""
+
+
+def judge_as_aws(main: int, ends: Sequence[NodeEnd | None], host: str) -> Verdict | None:
+    """The same for a job of the Batch API: the main node's end ends the job and decides, in AWS's own words.
+
+    Args:
+        main: Index of the main node.
+        ends: By node index; None for a node that runs or has not started.
+        host: Name of the main node's host.
+    """
+    head = ends[main]
+    if head is None:
+        return None
+    if head.lost:
+        return Verdict(Ending.FAILED, f"Host EC2 (instance {host}) terminated.", None)
+    return Verdict(Ending.SUCCEEDED if head.exit_code == 0 else Ending.FAILED, AWS_EXITED, head.exit_code)
+
+
+def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | None:
+    """Whether the attempt is over, from how its nodes ended; None while it goes on.
+
+    The main node's end ends the job and decides (AWS Batch). What a child's failure means is ``policy``: ``ignore`` nothing
+    (what AWS does), ``restart`` a new attempt, ``fail`` the end of the job.
+
+    Args:
+        policy: ``restart``, ``fail`` or ``ignore``.
+        main: Index of the main node.
+        ends: By node index; None for a node that runs or has not started.
+    """
+    failures = [(index, end) for index, end in enumerate(ends) if end and end.exit_code not in (0, EX_TEMPFAIL)]
+    head, is_unseen = ends[main], None in ends
+    if head is not None and head.exit_code == 0:
+        return Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
+    if head is not None and head.exit_code == EX_TEMPFAIL:
+        return Verdict(Ending.REQUEUE, head.reason, EX_TEMPFAIL)
+    if head is not None and (policy == "ignore" or len(failures) == 1):
+        certain = policy == "ignore" or not (head.asked and is_unseen)
+        return Verdict(Ending.FAILED, f"main node: {head.reason}", head.exit_code, certain)
+    if not failures or policy == "ignore":
+        return None
+    # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
+    index, first = failures[first_cause([(end.asked, end.ended) for _, end in failures])]
+    ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
+    reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
+    return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen))

@@ -1,0 +1,53 @@
+"""Options that go beyond AWS Batch; native jobs carry them in ``MUSTER_*`` variables of their definition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from shared_store.log_files import LIMIT
+
+
+class MalformedOptions(ValueError):
+    """A ``MUSTER_*`` variable that the controller reads has a value that ``muster submit`` would not write."""
+
+
+@dataclass(frozen=True)
+class NativeOptions:
+    """A job's options, from its main node's variables; the defaults follow AWS."""
+
+    is_native: bool = False
+    """Whether the job came from a job YAML and gets Muster's defaults; otherwise it behaves as on AWS."""
+    on_child_failure: str = "ignore"
+    """``restart``, ``fail`` or ``ignore``."""
+    preemptible: bool = False
+    """Whether the job may be preempted by another."""
+    run: str = ""
+    """Name of the run that it continues or creates; empty: a run of its own."""
+    directory: str = ""
+    """Directory from which it was submitted; empty if unknown."""
+    worlds: int | None = None
+    """Of each rank, of a training that goes on with what its run has; None where that is not said."""
+    stall_timeout: float | None = None
+    """Seconds without an iteration after which a rank counts as stuck."""
+    log_limit: int = LIMIT
+    """Bytes kept of each node's log."""
+
+    @classmethod
+    def read(cls, environment: Mapping[str, str]) -> NativeOptions:
+        """The options that a node's variables say. Raises MalformedOptions."""
+        given = {name[7:]: value for name, value in environment.items() if name.startswith("MUSTER_")}
+        worlds = given.get("WORLDS", "")
+        try:
+            return cls(
+                is_native=bool(given.get("ON_CHILD_FAILURE")),
+                on_child_failure=given.get("ON_CHILD_FAILURE", "ignore"),
+                preemptible=given.get("PREEMPTIBLE") == "1",
+                run=given.get("RUN", ""),
+                directory=given.get("DIRECTORY", ""),
+                worlds=int(worlds) if worlds.isdecimal() and len(worlds) < 10 else None,
+                stall_timeout=float(given["STALL_TIMEOUT"]) if "STALL_TIMEOUT" in given else None,
+                log_limit=int(given.get("LOG_LIMIT") or LIMIT),
+            )
+        except ValueError as error:
+            raise MalformedOptions(f"a MUSTER_* variable is malformed: {error}") from None

@@ -1,0 +1,356 @@
+"""The engine protocol: the interface to the systems that start processes on machines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from orchestrator.domain.hosts import Host, Placement
+from shared_store.contract import NodeContract
+from shared_store.log_files import LIMIT
+from shared_store.wording import nearest
+
+
+class EngineError(Exception):
+    """The engine can't do what was asked; the message is the reason that the job is given."""
+
+
+class NotYet(EngineError):
+    """A launch has to wait, for the reason in the message. It will be tried again."""
+
+    def __init__(self, message: str, *, unknown: bool = False) -> None:
+        """``unknown``: something of the gang may run already, which can't be seen just now."""
+        super().__init__(message)
+        self.unknown = unknown
+
+
+class Transient(NotYet):
+    """The operating system or a volume failed in a way that may pass: no descriptors, processes or space, a volume that is away."""
+
+
+class EngineFault(Transient):
+    """An engine raised an unexpected exception: a bug, whose traceback belongs in the log."""
+
+
+@dataclass(frozen=True)
+class Gang:
+    """All nodes of one attempt, as the controller hands them to an engine."""
+
+    job: str
+    attempt: int
+    epoch: int
+    job_epoch: int
+    run: str
+    store: str
+    queue: str
+    compute_environment: str
+    """Name of the compute environment."""
+    main: int
+    commands: Sequence[Sequence[str]]
+    environments: Sequence[Mapping[str, str]]
+    placements: Sequence[Placement]
+    """Commands, user environments and placements by node index."""
+    grace: float
+    """Seconds between SIGTERM and SIGKILL."""
+    directory: str | None
+    """Working directory of the commands."""
+    stall_timeout: float | None = None
+    """Seconds without an iteration after which a rank counts as stuck."""
+    log_limit: int = LIMIT
+    """Bytes of each node's log that are kept."""
+    is_gang: bool = True
+    """False for a single-node job, whose environment has no node variables on AWS."""
+    array: tuple[int, int] | None = None
+    """Index and size, of an array's child."""
+    isolated: bool = False
+    """Its nodes start as containers would, also where they are plain processes: it came through the Batch API."""
+    containers: Sequence[Mapping[str, Any]] = ()
+    """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
+    bus: str | None = None
+    bus_token: str | None = None
+    """Where the controller's bus router listens, and the attempt's credential for it."""
+    title: str = ""
+    """The job's name."""
+    timeout: int | None = None
+    """Of the attempt [s]."""
+    priority: int = 0
+    """The job's, inside its queue."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Tags ``muster:<option>`` of its compute environment, and over them those of its queue: options for engines that have queues of their
+    own."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.job}/{self.attempt}/{self.epoch}"
+
+
+@dataclass(frozen=True)
+class NodePlan:
+    """One node as it will be started."""
+
+    contract: NodeContract
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    placement: Placement
+
+
+Request = TypeVar("Request")
+
+
+@dataclass(frozen=True)
+class Plan(Generic[Request]):
+    """What a launch will do; printable."""
+
+    gang: Gang
+    nodes: Sequence[NodePlan]
+    request: Request
+    """What the launch sends, in the engine's own type: processes with their environments, containers, a script, a request to AWS. A launch
+    adds only what can't be known before: a free port or network, the contents of an image."""
+    document: str = ""
+    """The request as another scheduler will be given it, to be read: an sbatch script, a request in JSON; without credentials."""
+
+
+def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan]:
+    """The plan of each node of ``gang``, where node ``i`` has ``addresses[i]`` and all meet at the main node's ``port``."""
+    plans = []
+    for index, placement in enumerate(gang.placements):
+        contract = NodeContract(
+            job=gang.job,
+            attempt=gang.attempt,
+            node_index=index,
+            node_count=len(gang.placements),
+            main_index=gang.main,
+            master_address=addresses[gang.main],
+            master_port=port,
+            run=gang.run,
+            store=gang.store,
+            epoch=gang.epoch,
+            job_epoch=gang.job_epoch,
+            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
+            grace=gang.grace,
+            queue=gang.queue,
+            compute_environment=gang.compute_environment,
+            is_gang=gang.is_gang,
+            array=gang.array,
+            isolation=_isolation(gang, index),
+            cpus=placement.cpus,
+            stall_timeout=gang.stall_timeout,
+            log_limit=gang.log_limit,
+            address=addresses[index],
+            bus=gang.bus,
+            bus_token=gang.bus_token,
+        )
+        plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
+    return plans
+
+
+def _isolation(gang: Gang, index: int) -> str:
+    if not gang.isolated:
+        return ""
+    image = gang.containers[index].get("image") if gang.containers else None
+    return "muster" if image in (None, "", "muster") else "image"
+
+
+@dataclass(frozen=True)
+class Handle:
+    """Identifies a launched gang, also for a controller that did not launch it."""
+
+    engine: str
+    """Name of its engine."""
+    gang: str
+    """Its name, ``<job>/<attempt>/<epoch>``."""
+    nodes: int
+    """How many nodes it has."""
+    facts: Mapping[str, Any] = field(hash=False)
+    """Further facts by which the engine finds it: JSON, never changed."""
+
+    def text(self) -> str:
+        """As the database keeps it."""
+        return json.dumps({"engine": self.engine, "gang": self.gang, "nodes": self.nodes, "facts": self.facts})
+
+
+@lru_cache(maxsize=4096)  # every pass of the controller asks for those of all gangs that run
+def read_handle(text: str) -> Handle:
+    """The handle that the database keeps as ``text``, also one of Muster 0.1. Raises ValueError for anything else."""
+    try:
+        if text.startswith("{"):
+            told = json.loads(text)
+            return Handle(str(told["engine"]), str(told["gang"]), int(told["nodes"]), dict(told["facts"]))
+        engine, nodes, rest = text.split(
+            " ", 2
+        )  # until then: the engine, the number of nodes, and JSON of the engine's own
+        facts = json.loads(rest)
+        gang = facts.pop("gang" if "gang" in facts else "ray")
+        return Handle(engine, str(gang), int(nodes), facts)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"the handle of a gang is damaged ({error}): {text[:200]!r}") from error
+
+
+class NodePhase(StrEnum):
+    """How far a node is. Until it has ended it counts as running: what it holds is held."""
+
+    QUEUED = "queued"
+    """The engine has the gang and waits for room."""
+    STARTING = "starting"
+    """It has a place, and does not run the command yet."""
+    RUNNING = "running"
+    UNREACHABLE = "unreachable"
+    """The engine can't tell now."""
+    ENDED = "ended"
+    """No process of it is left, as far as the engine knows."""
+
+
+class Cause(StrEnum):
+    """What ended a node, as its engine saw it."""
+
+    EXIT = "exit"
+    """It left by itself, with its exit code."""
+    SIGNAL = "signal"
+    """A signal ended its supervisor."""
+    OUT_OF_MEMORY = "out of memory"
+    HOST_LOST = "host lost"
+    """It vanished and its end was not observed: presumably its host is lost."""
+    PREEMPTED = "preempted"
+    """The engine took its place away for other work."""
+    STOPPED = "stopped"
+    """It was stopped, in the engine or through it."""
+
+
+@dataclass(frozen=True)
+class NodeStatus:
+    """What the engine knows of one node. Raises ValueError where the fields contradict each other."""
+
+    phase: NodePhase
+    address: str = ""
+    words: str = ""
+    """For people; nothing is decided by them. Why it does not run yet or can't be seen (then they are never empty); of one that has
+    ended, what its supervisor said where it could not say it in the store, or what the engine says of its end."""
+    cause: Cause | None = None
+    """What ended it; None while it runs, or where the engine can't say."""
+    exit_code: int | None = None
+    """128 + n for signal n; None while it runs, or if the end was not observed."""
+    gpus: tuple[str, ...] = ()
+    """Ids of those that it has, from an engine that hands them out itself and tells."""
+    stale: str = ""
+    """Why this is an older status, from an engine that keeps the last one while its scheduler does not answer."""
+
+    def __post_init__(self) -> None:
+        if self.phase in _EXPLAINED and not self.words:
+            raise ValueError(f"a node that is {self.phase} says why")
+        if self.phase is not NodePhase.ENDED and (self.cause is not None or self.exit_code is not None):
+            raise ValueError(f"a node that is {self.phase} has no cause and no exit code")
+
+    @property
+    def running(self) -> bool:
+        """Whether it counts as running: it has not been seen to end."""
+        return self.phase is not NodePhase.ENDED
+
+
+_EXPLAINED = (NodePhase.QUEUED, NodePhase.STARTING, NodePhase.UNREACHABLE)
+
+
+GangStatus = Sequence[NodeStatus]
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of an engine, set by the tag ``muster:<name>`` of a compute environment or a queue."""
+
+    name: str
+    help: str
+    """What it means, in a few words."""
+    kind: type[str] | type[int] = str
+    values: Sequence[str] = ()
+    """Those that it may have; empty for any of its kind."""
+
+    def check(self, value: str) -> None:
+        """Raises ValueError, in one line, where it can't have this value."""
+        if not value.strip():
+            raise ValueError(f"tag muster:{self.name} is empty; it is {self.help}")
+        if self.values and value not in self.values:
+            raise ValueError(f"tag muster:{self.name} is {value!r}; {nearest(value, self.values)}")
+        if self.kind is int and not (value.removeprefix("-").isascii() and value.removeprefix("-").isdigit()):
+            raise ValueError(f"tag muster:{self.name} is {value!r}, not a whole number; it is {self.help}")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an engine is made with."""
+
+    home: Path
+    """``$MUSTER_HOME``."""
+    cpus: float | None = None
+    """CPU cores of this machine to hand out, where the engine runs nodes on it; all by default."""
+    gpus: Sequence[str] | None = None
+    """Ids of its GPUs to hand out; all by default."""
+
+
+@dataclass(frozen=True)
+class EngineType:
+    """The object behind an entry point of the group ``muster.engines``: a factory of the engine, and its options."""
+
+    make: Callable[[Setting], Engine]
+    """Imports what the engine needs only when it is called. Raises EngineError, in one line with what to do: it is not installed, or it
+    does not answer."""
+    options: Sequence[Option] = ()
+
+
+class Engine(Protocol):
+    """Starts gangs, tells how they are, ends them. Every method may be called again after a controller restart.
+
+    Threads: the controller gives each engine a thread of its own (:mod:`orchestrator.engines.runner`). :meth:`capacity`, :meth:`launch`
+    and :meth:`observe` are called on that thread alone, one at a time, so a call that takes long delays this engine's gangs only.
+    :meth:`stop` is called on another thread for each gang, at the same time as everything else, other stops included. :meth:`plan` is
+    called on any thread. What these share with the engine's thread must be guarded by a lock, or replaced as a whole and never
+    changed in place.
+
+    Errors: EngineError is final for a launch, NotYet and Transient are tried again. An OSError from the operating system or the
+    store may escape: the runner decides by its number which of the two it is. It must never be taken for the end of a process.
+    """
+
+    name: str
+    queues: bool
+    """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
+    elastic: bool
+    """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
+    images: bool
+    """Nodes are containers of the job's image; else commands run in the nodes' own environment."""
+    address: str | None
+    """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
+
+    def capacity(self) -> Sequence[Host]:
+        """Every host with all that it has, free or not. Their names begin with the engine's and a slash."""
+        ...
+
+    def plan(self, gang: Gang) -> Plan[Any]:
+        """What :meth:`launch` would do. Pure, and quick. Raises EngineError where the engine can't do what the gang asks for."""
+        ...
+
+    def launch(self, plan: Plan[Any]) -> Handle:
+        """Send the plan's request: start the gang, the main node first; returns its handle.
+
+        Idempotent by (job, attempt, epoch): nodes that run already are found, not started twice. A launch that raises has ended
+        what it had started, unless it raises NotYet with ``unknown``.
+
+        Raises:
+            NotYet: It has to wait, or failed in a way that may pass.
+            EngineError: It is refused for good.
+        """
+        ...
+
+    def observe(self, handle: Handle) -> GangStatus:
+        """The gang's nodes by index."""
+        ...
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left. Raises EngineError."""
+        ...
+
+    def close(self) -> None:
+        """Release what the engine holds in this process; gangs go on. Called once, also where the engine was never used."""
+        ...

@@ -1,0 +1,418 @@
+"""The AWS Batch engine: a gang is a multi-node parallel job of AWS's, in the account that ``muster aws up`` made ready.
+
+AWS queues, finds instances and starts containers; retries, epochs and the judgement of an end stay here: each attempt is a job of
+its own on AWS, never retried there. Whether the controller's store is the nodes' volume (a workstation that mounts it) or not
+(a laptop) is all the same to a job: on a laptop its log and its outcomes come over CloudWatch Logs (:mod:`.aws_logs`), while
+checkpoints stay on the volume.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import boto3
+from botocore.config import Config
+from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
+from botocore.parsers import ResponseParserError
+
+from orchestrator.domain.hosts import Host
+from orchestrator.engines.api import (
+    Cause,
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+    node_plans,
+)
+from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
+from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
+from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
+from orchestrator.engines.toolkit.endings import ended
+from shared_store.files import DamagedFile
+from shared_store.layout import Store
+from shared_store.log_files import LIMIT
+from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
+from shared_store.wording import counted
+
+_OVER = ("SUCCEEDED", "FAILED")
+_PORT = 29500
+_GRACE = 25.0
+"""Grace time [s] of a supervisor: AWS kills containers after 30, and it has to record what did not leave in time before that."""
+_CAPACITY_AGE = 60.0
+"""Seconds for which AWS's answer about its size is kept."""
+_STRAGGLE = 180.0
+"""Seconds after a job's end within which AWS says of every node that it ended, too."""
+_BLAME = 60.0
+"""Seconds that a failed main node waits for its children's ends: AWS ends them now, and one may have been the cause."""
+_FIXED = 6.0
+"""Seconds that an outcome on a shared volume may take to be seen."""
+_REMEMBERED = 256
+"""Gangs whose end is kept: the controller asks once more after it, and after a restart it asks anew."""
+_MEMORY = 32 * 1024
+"""MiB a vCPU at most, of all of EC2's instance types."""
+_TRANSIENT = (
+    *("TooManyRequestsException", "ThrottlingException", "RequestLimitExceeded", "ServerException"),
+    *("ExpiredToken", "ExpiredTokenException"),  # a person logs in again
+)
+_AWAY = 15.0
+"""Seconds for which an AWS that did not answer is left alone."""
+
+
+@dataclass
+class _Watched:
+    """What is known of a gang between two looks."""
+
+    next: float = 0.0
+    """When AWS is asked again (monotonic [s])."""
+    status: GangStatus | None = None
+    over_since: float | None = None
+    """When AWS first said that the job is over (monotonic [s])."""
+    main_stopped: int | None = None
+    """When the main node stopped, as AWS says (Unix time [ms]): AWS ends the others then."""
+    ended: dict[int, float] = field(default_factory=dict)
+    """By node: when it was first seen to have ended (monotonic [s])."""
+    logs: GangLogs | None = None
+    stopped: bool = False
+    """It was stopped: nothing of it runs, and nothing copies its logs."""
+
+    @property
+    def straggled(self) -> bool:
+        """Whether the job is over for so long that none of its nodes can run."""
+        return self.over_since is not None and time.monotonic() - self.over_since > _STRAGGLE
+
+
+class AwsBatchEngine:
+    """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
+
+    name = "aws-batch"
+    queues = True
+    elastic = True
+    images = True
+    address: str | None = None  # nodes on AWS do not reach this machine
+
+    def __init__(self, home: Path) -> None:
+        """Raises EngineError: there is no configuration, AWS does not answer, or it does not know the credentials or the queue."""
+        self.config = load_config(home)
+        try:
+            session = boto3.Session(region_name=self.config.region, profile_name=self.config.profile)
+            if session.get_credentials() is None:
+                raise NoCredentialsError
+            url = self.config.endpoint_url
+            # a SubmitJob whose answer was lost must not be sent again unseen: AWS has no key to make it harmless
+            once = Config(connect_timeout=5, read_timeout=30, retries={"total_max_attempts": 1})
+            # the controller's own loop asks: an AWS that is away must not hold up everything else for long
+            twice = Config(connect_timeout=5, read_timeout=30, retries={"mode": "standard", "total_max_attempts": 2})
+            self._batch = session.client("batch", endpoint_url=url, config=twice)
+            self._submitting = session.client("batch", endpoint_url=url, config=once)
+            self._logs = session.client("logs", endpoint_url=url, config=twice)
+        except (BotoCoreError, NoRegionError) as error:
+            raise EngineError(f"AWS: {error}; see `aws configure`") from None
+        self._hosts: dict[str, tuple[float, Host]] = {}
+        self._gangs: dict[str, _Watched] = {}
+        self._lock = threading.Lock()
+        self._check_queue()
+
+    def capacity(self) -> Sequence[Host]:
+        """One host: what the queue's compute environments may grow to.
+
+        AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
+        is taken as their number, and what does not exist waits there with AWS's own reason.
+        """
+        queue = self.config.job_queue
+        asked, host = self._hosts.get(queue, (0.0, self._host(self.config.max_vcpus)))
+        if not asked or time.monotonic() - asked > _CAPACITY_AGE:
+            try:
+                host = self._host(self._max_vcpus(queue))
+            except (ClientError, BotoCoreError, ResponseParserError):
+                pass  # as before
+            self._hosts[queue] = (time.monotonic(), host)
+        return [host]
+
+    def plan(self, gang: Gang) -> Plan[Requests]:
+        """The requests; nodes' addresses are AWS's to give."""
+        gang = dataclasses.replace(gang, grace=min(gang.grace, _GRACE))
+        nodes = node_plans(gang, ["given by AWS"] * len(gang.placements), _PORT)
+        requests = requests_for(gang, nodes, self.config.with_options(gang.options))
+        return Plan(gang, nodes, requests, requests.document())
+
+    def launch(self, plan: Plan[Requests]) -> Handle:
+        gang, requests = plan.gang, plan.request
+        queue = str(requests.submission["jobQueue"])
+        try:
+            job = self._find(queue, str(requests.submission["jobName"])) or self._submit(requests)
+        except ClientError as error:
+            if _is_transient(error):
+                raise NotYet(f"AWS Batch: {_words(error)}; trying again") from None
+            raise EngineError(f"AWS Batch: {_words(error)}") from None
+        except (BotoCoreError, ResponseParserError) as error:
+            raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
+        facts = {
+            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main", "log_limit")},
+            "aws": job,
+            "queue": queue,
+            "supervised": list(requests.supervised),
+        }
+        return Handle(self.name, gang.name, len(plan.nodes), facts)
+
+    def observe(self, handle: Handle) -> GangStatus:
+        with self._lock:
+            watched = self._gangs.setdefault(handle.gang, _Watched())
+        over = watched.status is not None and not any(node.running for node in watched.status)
+        if watched.status is None or (not over and time.monotonic() >= watched.next):
+            return self._look_again(handle, watched)
+        return watched.status
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        """AWS's own grace is 30 s, whatever ``grace`` says. Waits for as long as AWS says that something of it runs."""
+        with self._lock:
+            watched = self._gangs.setdefault(handle.gang, _Watched())
+        asked = False
+        while True:
+            try:
+                if not asked:
+                    self._batch.terminate_job(jobId=handle.facts["aws"], reason="ended by Muster")
+                    asked = True
+            except (ClientError, BotoCoreError, ResponseParserError) as error:
+                if isinstance(error, ClientError) and not _is_transient(error):
+                    if any(node.running for node in self._look_again(handle, watched)):
+                        time.sleep(self.config.poll)
+                        raise EngineError(
+                            f"AWS Batch does not end job {handle.facts['aws']}: {_words(error)}"
+                        ) from None
+                    break  # AWS has forgotten the job
+            if not any(node.running for node in self._look_again(handle, watched)):
+                break
+            time.sleep(self.config.poll)
+        if watched.logs is not None:
+            watched.logs.finish()
+        with self._lock:
+            watched.stopped = True
+            over = [name for name, each in self._gangs.items() if each.stopped]
+            for name in over[: max(0, len(over) - _REMEMBERED)]:
+                del self._gangs[name]
+
+    def close(self) -> None:
+        """Jobs on AWS go on."""
+        for client in (self._batch, self._submitting, self._logs):
+            client.close()
+
+    def _check_queue(self) -> None:
+        """Later AWS may be away for a while, and a gang waits for it; what is wrong from the start would wait for ever."""
+        queue, where = self.config.job_queue, self.config.endpoint_url or self.config.region
+        try:
+            found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
+        except ClientError as error:
+            raise EngineError(f"AWS Batch ({where}) refuses: {_words(error)}; see `aws configure`") from None
+        except (BotoCoreError, ResponseParserError) as error:
+            raise EngineError(
+                f"AWS Batch ({where}) does not answer: {error}; see region and endpoint_url in aws.json"
+            ) from None
+        if not found:
+            raise EngineError(
+                f"AWS Batch ({where}) has no job queue {queue}; see `muster aws status`, or make it with `muster aws up`"
+            )
+
+    # -- starting -----------------------------------------------------------------------------------------------------
+
+    def _find(self, queue: str, name: str) -> str | None:
+        """The job of that name: a controller may have been killed after it submitted it."""
+        filters = [{"name": "JOB_NAME", "values": [name]}]
+        for page in self._batch.get_paginator("list_jobs").paginate(jobQueue=queue, filters=filters):
+            for job in page["jobSummaryList"]:
+                return str(job["jobId"])
+        return None
+
+    def _submit(self, requests: Requests) -> str:
+        request = {**requests.submission, "jobDefinition": self._definition(requests)}
+        return str(self._submitting.submit_job(**request)["jobId"])
+
+    def _definition(self, requests: Requests) -> str:
+        """The ARN of an active definition that says just that; a new revision where there is none."""
+        name = requests.definition["jobDefinitionName"]
+        pages = self._batch.get_paginator("describe_job_definitions")
+        for page in pages.paginate(jobDefinitionName=name, status="ACTIVE"):
+            for each in page["jobDefinitions"]:
+                if (each.get("tags") or {}).get(DIGEST) == requests.digest:
+                    return str(each["jobDefinitionArn"])
+        return str(self._batch.register_job_definition(**requests.definition)["jobDefinitionArn"])
+
+    # -- watching -----------------------------------------------------------------------------------------------------
+
+    def _look_again(self, handle: Handle, watched: _Watched) -> GangStatus:
+        """Ask AWS; where it does not answer nothing has changed."""
+        try:
+            watched.status, pause = self._look(handle, watched), self.config.poll
+        except (ClientError, BotoCoreError, ResponseParserError) as error:
+            said = _words(error) if isinstance(error, ClientError) else str(error)
+            waits = NodeStatus(NodePhase.UNREACHABLE, words=f"AWS Batch does not answer: {said}")
+            watched.status, pause = watched.status or [waits] * handle.nodes, _AWAY
+        watched.next = time.monotonic() + pause
+        return watched.status
+
+    def _look(self, handle: Handle, watched: _Watched) -> GangStatus:
+        """What AWS says of every node."""
+        count, main = handle.nodes, handle.facts["main"]
+        parent, nodes = self._describe(handle)
+        if parent is None:
+            return [NodeStatus(NodePhase.ENDED, words=f"AWS Batch has no job {handle.facts['aws']} any more")] * count
+        if parent["status"] in _OVER and watched.over_since is None:
+            watched.over_since = time.monotonic()
+        watched.main_stopped = (nodes.get(main) or {}).get("stoppedAt")
+        status = [self._node(handle, watched, index, nodes.get(index) or parent, parent) for index in range(count)]
+        failed = not status[main].running and status[main].exit_code not in (0, EX_TEMPFAIL)
+        if failed and any(node.running for node in status) and time.monotonic() - watched.ended[main] < _BLAME:
+            status[main] = NodeStatus(NodePhase.RUNNING, status[main].address)
+        return status
+
+    def _describe(self, handle: Handle) -> tuple[dict[str, Any] | None, dict[int, dict[str, Any]]]:
+        """The job, and its nodes by index: those that AWS tells of."""
+        ids = [handle.facts["aws"], *(f"{handle.facts['aws']}#{index}" for index in range(handle.nodes))]
+        found: dict[str, dict[str, Any]] = {}
+        for start in range(0, len(ids), 100):
+            for job in self._batch.describe_jobs(jobs=ids[start : start + 100])["jobs"]:
+                found[job["jobId"]] = job
+        nodes = {index: found[name] for index, name in enumerate(ids[1:]) if name in found}
+        return found.get(ids[0]), nodes
+
+    def _node(
+        self,
+        handle: Handle,
+        watched: _Watched,
+        index: int,
+        detail: Mapping[str, Any],
+        parent: Mapping[str, Any],
+    ) -> NodeStatus:
+        status, container = detail["status"], detail.get("container") or {}
+        address = next((each.get("privateIpv4Address", "") for each in container.get("networkInterfaces") or []), "")
+        over = status in _OVER or watched.straggled
+        log = self._follow(handle, watched, index, container.get("logStreamName"), over)
+        if not over:
+            if status == "RUNNING":
+                return NodeStatus(NodePhase.RUNNING, address)
+            return _waits(status, address, _waiting(handle, index, status, detail, parent))
+        watched.ended.setdefault(index, time.monotonic())
+        code = container.get("exitCode")
+        code = 0 if code is None and status == "SUCCEEDED" else code
+        reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
+        stopped = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
+        asked = bool(watched.main_stopped) and detail.get("stoppedAt", 0) > (watched.main_stopped or 0)
+        seen = Outcome(
+            index, handle.facts["epoch"], code or 0, None, str(reason) or _exited(code), None, stopped, stopped, asked
+        )
+        if code is not None and not self._settled(handle, watched, log, seen):
+            return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
+        return _ended(address, code, str(reason))
+
+    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, seen: Outcome) -> bool:
+        """Whether the store has the node's outcome; it is written here where nobody else did."""
+        run = Store(handle.facts["store"]).run(handle.facts["run"])
+        if read_outcome(run, handle.facts["job"], handle.facts["attempt"], seen.node) is not None:
+            return True
+        since = time.monotonic() - watched.ended[seen.node]
+        if not (log.whole if log is not None else since > _FIXED):
+            return False
+        if run.path.exists():
+            with contextlib.suppress(DamagedFile):  # a link in its place: what AWS says of the node counts then
+                write_outcome(run, handle.facts["job"], handle.facts["attempt"], (log.outcome if log else None) or seen)
+        return True
+
+    def _follow(self, handle: Handle, watched: _Watched, index: int, stream: str | None, over: bool) -> NodeLog | None:
+        """The copy of a node's log; None where the supervisor writes it to the store that is here, too."""
+        with self._lock:  # a gang that is being stopped is looked at by two threads
+            logs = watched.logs = watched.logs or self._copies(handle)
+        node = logs.saw(index, stream, over)
+        return node if node.copied else None
+
+    def _copies(self, handle: Handle) -> GangLogs:
+        """The copies of a gang's logs, begun."""
+        run, shared = Store(handle.facts["store"]).run(handle.facts["run"]), self._is_shared(handle.facts["store"])
+        nodes = [
+            NodeLog(
+                run.log(handle.facts["job"], handle.facts["attempt"], index),
+                supervised,
+                copied=not (supervised and shared),
+                limit=handle.facts.get("log_limit", LIMIT),
+            )
+            for index, supervised in enumerate(handle.facts["supervised"])
+        ]
+        logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
+        logs.start(handle.gang)
+        return logs
+
+    def _is_shared(self, store: str) -> bool:
+        if self.config.store_is_shared is not None:
+            return self.config.store_is_shared
+        return is_mounted_from(Path(store).resolve(), self.config.file_system, Path("/proc/self/mountinfo").read_text())
+
+    # -- capacity -----------------------------------------------------------------------------------------------------
+
+    def _host(self, vcpus: int) -> Host:
+        name = self.config.job_queue.rpartition("/")[2]
+        gpus = tuple(str(number) for number in range(vcpus // 4))
+        return Host(f"{self.name}/{name}", float(vcpus), gpus, vcpus * _MEMORY)
+
+    def _max_vcpus(self, queue: str) -> int:
+        found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
+        order = [each["computeEnvironment"] for each in found[0]["computeEnvironmentOrder"]] if found else []
+        described = self._batch.describe_compute_environments(computeEnvironments=order) if order else {}
+        sizes = [
+            int((each.get("computeResources") or {}).get("maxvCpus", 0))
+            for each in described.get("computeEnvironments", [])
+        ]
+        return max([*sizes, 0]) or self.config.max_vcpus  # a gang is in one of them
+
+
+def _waiting(handle: Handle, index: int, status: str, detail: Mapping[str, Any], parent: Mapping[str, Any]) -> str:
+    """Why a node has not been started, in words a person can act on."""
+    said = detail.get("statusReason") or parent.get("statusReason") or ""
+    if said and status != "STARTING":
+        return f"AWS Batch: {said}"
+    count, queue = handle.nodes, str(handle.facts["queue"]).rpartition("/")[2]
+    if status == "STARTING":
+        return f"AWS Batch starts node {index}: its instance pulls the image"
+    if parent["status"] == "RUNNING":
+        return f"AWS Batch starts node {index} now that the main node runs"
+    return (
+        f"AWS Batch gets {counted(count, 'instance')} for queue {queue} ({status}); "
+        "if that lasts, see `muster aws status` for limits and the account's quota of vCPUs"
+    )
+
+
+def _waits(status: str, address: str, why: str) -> NodeStatus:
+    """A node that AWS has not started; ``status``: SUBMITTED, PENDING, RUNNABLE or STARTING."""
+    return NodeStatus(NodePhase.STARTING if status == "STARTING" else NodePhase.QUEUED, address, why)
+
+
+def _ended(address: str, code: int | None, reason: str) -> NodeStatus:
+    """A node that has ended, by its exit code and AWS's reason: of memory and lost hosts AWS tells in words alone."""
+    if reason.startswith("OutOfMemoryError"):
+        return NodeStatus(NodePhase.ENDED, address, reason, Cause.OUT_OF_MEMORY, code)
+    if code is None and reason and not reason.startswith("Host EC2"):
+        return NodeStatus(NodePhase.ENDED, address, reason)  # it never started, or AWS does not say
+    return ended(address, code, reason)
+
+
+def _exited(code: int | None) -> str:
+    return f"container exited with code {code}" if code else "done"
+
+
+def _is_transient(error: ClientError) -> bool:
+    answer = error.response
+    status = int(answer.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
+    return answer.get("Error", {}).get("Code") in _TRANSIENT or status >= 500 or status == 429
+
+
+def _words(error: ClientError) -> str:
+    told = error.response.get("Error", {})
+    return f"{told.get('Message') or told.get('Code') or error}"

@@ -1,0 +1,196 @@
+"""A gang as AWS Batch's requests: a multi-node job definition, and a job of it. Pure."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from typing import Any
+
+from orchestrator.engines.api import EngineError, Gang, NodePlan
+from orchestrator.engines.aws_batch.config import AwsConfig
+from shared_store import __version__
+from shared_store.contract import sealed_in_image
+
+DIGEST, GANG = "muster:digest", "muster:gang"
+"""Tags: of a definition, of what it says; of a job, the attempt that it is."""
+_MOST_RANGES = 5
+_TIMEOUT_SLACK = 600
+"""Seconds after the controller's own timeout at which AWS ends an attempt whose controller is away."""
+_NODE_FIELDS = ("node_index", "node_count", "main_index", "master_address", "address", "bus", "bus_token")
+
+
+@dataclass(frozen=True)
+class Requests:
+    """What is sent for one gang."""
+
+    definition: Mapping[str, Any]
+    """RegisterJobDefinition; the same for every attempt of a job of one size."""
+    submission: Mapping[str, Any]
+    """SubmitJob, without ``jobDefinition``."""
+    supervised: tuple[bool, ...]
+    """By node index: whether it runs under Muster's supervisor."""
+
+    @property
+    def digest(self) -> str:
+        return str(self.definition["tags"][DIGEST])
+
+    def document(self) -> str:
+        """Both as JSON, to be read."""
+        name = self.definition["jobDefinitionName"]
+        shown = {
+            "RegisterJobDefinition": self.definition,
+            "SubmitJob": {**self.submission, "jobDefinition": f"{name}:<its revision>"},
+        }
+        return json.dumps(shown, indent=2)
+
+
+def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Requests:
+    """The requests of a gang. Raises EngineError where AWS can't run it.
+
+    An image with Muster in it (``muster``, the stack's own, or whatever a job from YAML names) runs its command under the
+    supervisor; any other one, of a job that came through the Batch API, runs it as it is.
+    """
+    plain = [not _has_muster(gang, index, config) for index in range(len(nodes))]
+    ranges, overrides = [], []
+    for _, group in groupby(range(len(nodes)), key=lambda index: json.dumps(_like(gang, nodes[index]), default=str)):
+        indices = list(group)
+        first = nodes[indices[0]]
+        target = f"{indices[0]}:{indices[-1]}"
+        container = _container(gang, first, config, plain[indices[0]])
+        ranges.append({"targetNodes": target, "container": container})
+        if not plain[indices[0]]:
+            told = {"name": "MUSTER_NODE", "value": _node(gang, first, config)}
+            overrides.append({"targetNodes": target, "containerOverrides": {"environment": [told]}})
+    if len(ranges) > _MOST_RANGES:
+        raise EngineError(f"the nodes are of {len(ranges)} kinds; AWS Batch takes at most {_MOST_RANGES} in one job")
+    definition: dict[str, Any] = {
+        "jobDefinitionName": _name("muster-" + (gang.title or gang.job), 128),
+        "type": "multinode",
+        "nodeProperties": {"numNodes": len(nodes), "mainNode": gang.main, "nodeRangeProperties": ranges},
+        "retryStrategy": {"attempts": 1},
+        "propagateTags": True,
+    }
+    digest = hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()[:32]
+    definition["tags"] = {DIGEST: digest}
+    submission: dict[str, Any] = {
+        "jobName": job_name(gang),
+        "jobQueue": config.job_queue,
+        "tags": {GANG: gang.name, "muster:run": gang.run},
+    }
+    if overrides:
+        submission["nodeOverrides"] = {"nodePropertyOverrides": overrides}
+    if gang.timeout:
+        submission["timeout"] = {"attemptDurationSeconds": gang.timeout + _TIMEOUT_SLACK}
+    if config.share:
+        submission["shareIdentifier"] = config.share
+        submission["schedulingPriorityOverride"] = gang.priority
+    return Requests(definition, submission, tuple(not each for each in plain))
+
+
+def job_name(gang: Gang) -> str:
+    """One name for each attempt: by it a job is found again whose submission nobody could note."""
+    tail = f"-{gang.job}-{gang.attempt}-{gang.epoch}"
+    return _name((gang.title or "muster")[:50] + tail, 128)
+
+
+def _name(text: str, most: int) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "_", text).lstrip("_-")[:most]
+
+
+def _has_muster(gang: Gang, index: int, config: AwsConfig) -> bool:
+    image = _image(gang, index)
+    native = "MUSTER_ON_CHILD_FAILURE" in gang.environments[index]
+    return native or image in ("", "muster") or _repository(image) == _repository(config.image)
+
+
+def _repository(image: str) -> str:
+    """An image's name without its tag or digest."""
+    name = image.partition("@")[0]
+    return name.rpartition(":")[0] if ":" in name.rpartition("/")[2] else name
+
+
+def _image(gang: Gang, index: int) -> str:
+    return str(gang.containers[index].get("image") or "") if gang.containers else ""
+
+
+def _like(gang: Gang, node: NodePlan) -> tuple[Any, ...]:
+    """What nodes of one range have in common."""
+    index = node.contract.node_index
+    container = dict(gang.containers[index]) if gang.containers else {}
+    placement = node.placement
+    return node.command, dict(node.environment), container, placement.cpus, len(placement.gpus), placement.memory
+
+
+def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> dict[str, Any]:
+    """``containerProperties`` of a node: the job's own, with what Muster needs."""
+    index = node.contract.node_index
+    given = dict(gang.containers[index]) if gang.containers else {}
+    placement = node.placement
+    resources = [
+        {"type": "VCPU", "value": str(max(1, math.ceil(placement.cpus)))},
+        {"type": "MEMORY", "value": str(placement.memory)},
+    ]
+    if placement.gpus:
+        resources.append({"type": "GPU", "value": str(len(placement.gpus))})
+    image = _image(gang, index)
+    container: dict[str, Any] = {
+        **{
+            key: value for key, value in given.items() if key not in ("vcpus", "memory") and value not in ([], {}, None)
+        },
+        "image": config.image if image in ("", "muster") else image,
+        "resourceRequirements": resources,
+        "command": list(node.command) if plain else ["python", "-P", "-m", "worker.aws_node", "--", *node.command],
+        "environment": _pairs(node.environment if plain else _supervised(node.environment, config)),
+    }
+    linux = {"sharedMemorySize": max(64, placement.memory // 2), **(given.get("linuxParameters") or {})}
+    if config.efa:
+        device = {"hostPath": "/dev/infiniband/uverbs0", "containerPath": "/dev/infiniband/uverbs0"}
+        linux["devices"] = [*(linux.get("devices") or []), {**device, "permissions": ["READ", "WRITE", "MKNOD"]}]
+        unlimited = {"name": "memlock", "softLimit": -1, "hardLimit": -1}
+        container["ulimits"] = [*(given.get("ulimits") or []), unlimited]
+    container["linuxParameters"] = linux
+    container.setdefault("logConfiguration", {"logDriver": "awslogs", "options": {"awslogs-group": config.log_group}})
+    if config.job_role:
+        container.setdefault("jobRoleArn", config.job_role)
+    if config.instance_type:
+        container.setdefault("instanceType", config.instance_type)
+    if config.file_system and not plain:
+        volume, mount = _volume(config)
+        container["volumes"] = [*(given.get("volumes") or []), volume]
+        container["mountPoints"] = [*(given.get("mountPoints") or []), mount]
+    return container
+
+
+def _volume(config: AwsConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+    efs: dict[str, Any] = {"fileSystemId": config.file_system, "transitEncryption": "ENABLED"}
+    if config.access_point:
+        efs["authorizationConfig"] = {"accessPointId": config.access_point, "iam": "ENABLED"}
+    else:
+        efs["rootDirectory"] = "/"
+    mount = {"sourceVolume": "muster-store", "containerPath": config.store, "readOnly": False}
+    return {"name": "muster-store", "efsVolumeConfiguration": efs}, mount
+
+
+def _supervised(environment: Mapping[str, str], config: AwsConfig) -> dict[str, str]:
+    """Muster's own variables travel as one: on whatever plays AWS they must not be taken for its own. The rest is the ranks' alone."""
+    own = {name: value for name, value in environment.items() if name.startswith("MUSTER_")}
+    rest = {name: value for name, value in environment.items() if name not in own}
+    kernels = {"WARP_CACHE_PATH": f"{config.store}/kernels"}  # compiled once a kind of GPU, not once an instance
+    return {**sealed_in_image(kernels | rest, {}), "MUSTER_ENVIRONMENT": json.dumps(own, separators=(",", ":"))}
+
+
+def _node(gang: Gang, node: NodePlan, config: AwsConfig) -> str:
+    """``MUSTER_NODE``: of the contract all that a node can't know by itself, and the run's description."""
+    contract = {key: value for key, value in asdict(node.contract).items() if key not in _NODE_FIELDS}
+    contract["store"] = config.store
+    description = {"run": gang.run, "job": gang.job, "version": __version__, "name": gang.title}
+    return json.dumps({"contract": contract, "description": description}, separators=(",", ":"))
+
+
+def _pairs(environment: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"name": name, "value": value} for name, value in environment.items()]

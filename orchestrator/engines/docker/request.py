@@ -1,0 +1,90 @@
+"""What Docker is asked for, for one node of a gang: all but what only Docker knows, which is what the image has in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from docker.types import Mount
+
+from orchestrator.engines.api import Gang, NodePlan
+from orchestrator.engines.docker.options import limits, linux
+from orchestrator.engines.toolkit.mounts import mounts_of
+from shared_store.contract import BUS_VARIABLES, NodeContract, sealed_in_image
+
+STORE, KERNELS = "/muster/store", "/muster/kernels"
+"""Where a container of an image with Muster finds the store and the cache of compiled kernels."""
+GANG, NODE, PLAIN = "muster.gang", "muster.node", "muster.plain"
+"""Labels of containers and networks: whose they are, and whether they run without a supervisor."""
+
+
+@dataclass(frozen=True)
+class ContainerRequest:
+    """One node's container."""
+
+    image: str
+    name: str
+    hostname: str
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    """The job's own."""
+    contract: NodeContract
+    mounts: Sequence[Mount]
+    """The job's own."""
+    options: Mapping[str, Any]
+    """Limits, devices and the like."""
+    store: str
+    """Directory of the shared volume on this machine."""
+
+    def at(self, address: str, main: str) -> ContainerRequest:
+        """The same on another network: the node's address, and the main node's."""
+        return replace(self, contract=replace(self.contract, address=address, master_address=main))
+
+    def arguments(self, entrypoint: Sequence[str], kernels: Path | None) -> dict[str, Any]:
+        """Of Docker's ``create``, less the network. Raises OSError where the store can't be seen.
+
+        Args:
+            entrypoint: The image's own.
+            kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
+        """
+        told = self.contract.to_env()
+        node = str(self.contract.node_index)
+        arguments: dict[str, Any] = {
+            "name": self.name,
+            "hostname": self.hostname,
+            "labels": {GANG: self.contract.gang, NODE: node, PLAIN: "1" if kernels is None else ""},
+            **self.options,
+        }
+        if kernels is None:
+            environment = {**self.environment, **told}
+            environment = {name: value for name, value in environment.items() if name not in BUS_VARIABLES}
+            mounts, entry, command = [*self.mounts], list(entrypoint) or None, list(self.command)
+        else:
+            job = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **self.environment}
+            environment = {"HOME": "/tmp", **sealed_in_image(job, told)}
+            mounts = [*self.mounts, Mount(STORE, self.store, "bind"), Mount(KERNELS, str(kernels), "bind")]
+            # whoever owns the store writes it; that is seldom the user that the image names
+            owner = Path(self.store).stat()
+            arguments.setdefault("user", f"{owner.st_uid}:{owner.st_gid}")
+            entry = ["python", "-P", "-m", "worker.supervisor", "--"]
+            command = [*entrypoint, *self.command]
+        return {**arguments, "command": command, "entrypoint": entry, "environment": environment, "mounts": mounts}
+
+
+def container_request(gang: Gang, node: NodePlan, cores: float) -> ContainerRequest:
+    """The request for one node of ``gang``; ``cores``: of the machine."""
+    index = node.contract.node_index
+    container = gang.containers[index]
+    return ContainerRequest(
+        image=str(container.get("image") or ""),
+        name=f"muster-{gang.name.replace('/', '-')}-{index}",
+        hostname=f"node-{index}",
+        command=tuple(node.command),
+        environment=node.environment,
+        contract=node.contract,
+        mounts=[Mount(m.target, m.source, "bind", read_only=m.read_only) for m in mounts_of(container, gang.store)],
+        options={**limits(container, node, cores), **linux(container)},
+        store=gang.store,
+    )

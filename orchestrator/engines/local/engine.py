@@ -1,0 +1,318 @@
+"""The local engine: nodes are process groups on this machine, each with its own loopback address and its share of it.
+
+Each supervisor has a shim as its parent (:mod:`shared_store.shim`), and a control group where these can be made. Both outlive the
+controller. A restarted controller finds the shims again by pid and start time, what a node leaves behind by its control group and by
+the gang's name in its environment.
+"""
+
+from __future__ import annotations
+
+import grp
+import hashlib
+import logging
+import os
+import pwd
+import re
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from orchestrator.domain.hosts import HERE, Host
+from orchestrator.engines.api import (
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodePlan,
+    NodeStatus,
+    Plan,
+    Transient,
+    node_plans,
+)
+from orchestrator.engines.local.gangs import parent_of
+from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.environment import inherited
+from orchestrator.engines.toolkit.gpus import visible_gpus
+from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
+from orchestrator.engines.toolkit.waiting import wait_until
+from shared_store.cgroups import own_group, remove_abandoned_groups
+from shared_store.contract import sealed
+from shared_store.layout import Store
+from shared_store.nodes import NodeProcesses, end_nodes
+from shared_store.outcomes import read_outcome
+from shared_store.ports import first_port, free_port
+from shared_store.processes import find_process, marked, unkillable
+from shared_store.shim import STUCK, group_of, shimmed
+
+log = logging.getLogger("muster.engines")
+
+_ID = re.compile(r"[0-9]{1,10}")
+"""A user or a group by its number."""
+_UNSEEN = (FileNotFoundError, ProcessLookupError, PermissionError)
+"""What reading ``/proc/<pid>`` raises for a process that is gone or another user's; any other error says nothing about it."""
+_REMEMBERED = 256
+"""Gangs whose nodes' ends are known after they were stopped: the controller asks once more when all has ended."""
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """One node's process as it is started."""
+
+    command: Sequence[str]
+    """Its shim, what gives it its mounts, its supervisor and the job's command."""
+    environment: Mapping[str, str]
+    """All of it. ``MASTER_PORT`` is the first that the gang would meet at: where that is taken, a launch takes the next free one."""
+    group: str
+    """Its control group; empty where none can be made."""
+    directory: str | None
+
+
+class LocalEngine:
+    """One machine as an engine."""
+
+    name = "local"
+    queues = False
+    elastic = False
+    images = False
+    address: str | None = None
+
+    def __init__(self, home: Path, cpus: float | None = None, gpus: Sequence[str] | None = None) -> None:
+        """Args:
+        home: ``$MUSTER_HOME``: the kernel cache and what supervisors say before they reach the store go below it.
+        cpus: CPU cores to hand out; those of the machine by default. More than it has is allowed (they are shared).
+        gpus: Ids of the GPUs to hand out; those that the driver lists by default.
+        """
+        self.home = home
+        self._host = Host(
+            "localhost",
+            cpus or float(os.cpu_count() or 1),
+            tuple(gpus if gpus is not None else visible_gpus()),
+            _memory(),
+            machine=HERE,
+        )
+        self._children: dict[int, subprocess.Popen[bytes]] = {}
+        self._groups = own_group()
+        """Directory in which control groups of nodes are made; empty where they can't be."""
+        remove_abandoned_groups(self._groups)
+        self._ended: dict[str, GangStatus] = {}
+        self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
+
+    def capacity(self) -> Sequence[Host]:
+        return [self._host]
+
+    def plan(self, gang: Gang) -> Plan[Sequence[NodeProcess]]:
+        addresses = [_address(gang, index) for index in range(len(gang.placements))]
+        nodes = node_plans(gang, addresses, first_port(gang.name))
+        for index, container in enumerate(gang.containers):
+            if user := container.get("user"):
+                nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=_user(user)))
+        return Plan(gang, nodes, [self._process(gang, node) for node in nodes])
+
+    def launch(self, plan: Plan[Sequence[NodeProcess]]) -> Handle:
+        gang = plan.gang
+        if gang.directory and not Path(gang.directory).is_dir():
+            raise EngineError(f"working directory {gang.directory} is not on this machine")
+        found = _shims(gang.name)
+        # a node that is started late must meet the others where they are
+        port = next((shim.port for shim in found.values()), 0) or _port(gang.name)
+        run = Store(gang.store).run(gang.run)
+        nodes: dict[int, dict[str, object]] = {}
+        before = set(self._children)
+        try:
+            for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
+                if index in found:
+                    pid, group = found[index].pid, found[index].group
+                elif read_outcome(run, gang.job, gang.attempt, index) is not None:
+                    pid, group = 0, ""
+                else:
+                    group = plan.request[index].group
+                    pid = self._start(plan.request[index], port, self._said(gang.name, index))
+                process, address = find_process(pid), plan.nodes[index].contract.address
+                start = process.start if process else ""
+                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group}
+        except BaseException as error:  # never half a gang
+            # by its pid: for a moment after it was started a process has no environment yet by which it would be found
+            for pid in self._children.keys() - before:
+                child = self._children.pop(pid)
+                child.kill()
+                child.wait()
+            try:
+                end_nodes([_processes(node) for node in nodes.values()], [f"MUSTER_GANG={gang.name}"])
+                self._forget(gang.name, list(nodes.values()))
+            except OSError as trouble:  # /proc can't be read now: the next try finds what may be left
+                said = f"can't start the gang now ({error}), nor look for what is left of it ({trouble}); trying again"
+                raise Transient(said, unknown=True) from error
+            raise
+        return Handle(self.name, gang.name, len(nodes), {"nodes": [nodes[index] for index in range(len(nodes))]})
+
+    def observe(self, handle: Handle) -> GangStatus:
+        if handle.gang in self._ended:
+            return self._ended[handle.gang]
+        return [self._observe_node(handle.gang, index, node) for index, node in enumerate(handle.facts["nodes"])]
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        """Raises EngineError where something of the gang can't be killed: it holds its place until it is gone."""
+        gang, nodes = handle.gang, [_processes(node) for node in handle.facts["nodes"]]
+        for node in nodes:
+            if shim := node.shim:
+                _signal(shim.pid, signal.SIGTERM)
+        wait_until(lambda: not any((shim := node.shim) and shim.name != STUCK for node in nodes), grace, 0.02)
+        # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
+        if left := end_nodes(nodes, [f"MUSTER_GANG={gang}"]):
+            raise EngineError(f"{unkillable(left)}; its CPUs and GPUs are not given to other jobs until it is gone")
+        self._ended[gang] = self.observe(handle)
+        while len(self._ended) > _REMEMBERED:
+            self._ended.pop(next(iter(self._ended)), None)
+        self._forget(gang, handle.facts["nodes"])
+
+    def close(self) -> None:
+        """Supervisors go on."""
+
+    def _forget(self, gang: str, nodes: Sequence[Mapping[str, object]]) -> None:
+        """Nothing of the gang is left: remove what was kept of its supervisors."""
+        for index, node in enumerate(nodes):
+            self._children.pop(int(str(node["pid"])), None)
+            said = self._said(gang, index)
+            try:
+                if len(lines := said.read_text(errors="replace").strip().splitlines()) > 1:
+                    log.error("gang %s, node %d: its supervisor said:\n%s", gang, index, "\n".join(lines[-50:]))
+                said.unlink()
+            except OSError:
+                pass  # it was never started, or this was done before
+
+    def _group(self, gang: str, index: int) -> str:
+        return f"{self._groups}/muster-{gang.replace('/', '-')}-{index}" if self._groups else ""
+
+    def _process(self, gang: Gang, node: NodePlan) -> NodeProcess:
+        own = inherited(["SLURM_JWT"])
+        environment = {
+            **own,
+            "PATH": f"{Path(sys.executable).parent}:{own.get('PATH', '/usr/bin:/bin')}",
+            "WARP_CACHE_PATH": own.get("WARP_CACHE_PATH", str(self.home / "kernels")),
+            "CUDA_VISIBLE_DEVICES": ",".join(node.placement.gpus),
+            **sealed(node.environment, node.contract.to_env()),
+        }
+        # -P: a folder called "worker" in the job's directory must not hide ours
+        command = [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command]
+        index = node.contract.node_index
+        container = gang.containers[index] if gang.containers else {}
+        group = self._group(gang.name, index)
+        whole = shimmed(with_mounts(command, mounts_of(container, gang.store)), group, files=self._files)
+        return NodeProcess(whole, environment, group, gang.directory)
+
+    def _start(self, node: NodeProcess, port: int, said: Path) -> int:
+        """``port``: where the gang meets. ``said``: what the supervisor says before it reaches the store."""
+        said.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with open(said, "ab") as stderr:
+            process = subprocess.Popen(
+                list(node.command),
+                env={**node.environment, "MASTER_PORT": str(port)},
+                cwd=node.directory,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                start_new_session=True,
+            )
+        self._children[process.pid] = process
+        return process.pid
+
+    def _observe_node(self, gang: str, index: int, node: dict[str, object]) -> NodeStatus:
+        pid, address = int(str(node["pid"])), str(node["address"])
+        child = self._children.get(pid)
+        code = child.poll() if child else None
+        shim = _processes(node).shim if code is None else None
+        if shim is not None and shim.name != STUCK:
+            return NodeStatus(NodePhase.RUNNING, address)
+        try:
+            words = self._said(gang, index).read_text(errors="replace").strip().rpartition("\n")[2]
+        except FileNotFoundError:  # it said nothing, or another thread has just stopped the gang
+            words = ""
+        return ended(address, None if code is None else code if code >= 0 else 128 - code, words)
+
+    def _said(self, gang: str, index: int) -> Path:
+        return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.err"
+
+
+def _user(given: str) -> str:
+    """``UID:GID`` of ``user`` in a job definition. Raises EngineError where it is not there, or can't be taken on."""
+    if os.geteuid() != 0:
+        raise EngineError(
+            f"user {given}: only a controller that runs as root can run a job as another user; leave user out"
+        )
+    name, _, group = given.partition(":")
+    try:
+        user = pwd.getpwuid(int(name)) if _ID.fullmatch(name) else pwd.getpwnam(name)
+        uid, gid = user.pw_uid, user.pw_gid
+    except KeyError:
+        if not _ID.fullmatch(name):
+            raise EngineError(f"user {given}: there is no user {name!r} on this machine; give a number") from None
+        uid = gid = int(name)
+    try:
+        gid = int(group) if _ID.fullmatch(group) else grp.getgrnam(group).gr_gid if group else gid
+    except KeyError:
+        raise EngineError(f"user {given}: there is no group {group!r} on this machine; give a number") from None
+    return f"{uid}:{gid}"
+
+
+def _address(gang: Gang, index: int) -> str:
+    """A loopback address of the node's own in 127.64.0.0/10, so that two gangs can use the same ports: 254 nodes to each /24."""
+    digest = hashlib.sha256(gang.name.encode()).digest()
+    return f"127.{64 + digest[0] % 63}.{(digest[1] + index // 254) % 256}.{index % 254 + 1}"
+
+
+def _port(gang: str) -> int:
+    """Where the nodes of a gang meet. Raises Transient where no port is free."""
+    try:
+        return free_port(gang)
+    except OSError as error:
+        raise Transient(str(error)) from None
+
+
+@dataclass(frozen=True)
+class _Shim:
+    """What is known of a node that runs."""
+
+    pid: int
+    port: int
+    """The gang's master port."""
+    group: str
+
+
+def _shims(gang: str) -> dict[int, _Shim]:
+    """The shims of the gang's nodes that run, by node index."""
+    found: dict[int, tuple[int, _Shim]] = {}
+    for process in marked([f"MUSTER_GANG={gang}"]):
+        try:
+            group = group_of(Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0"))
+            raw = Path(f"/proc/{process.pid}/environ").read_bytes()
+        except _UNSEEN:
+            continue
+        if group is not None:
+            environment = dict(item.split(b"=", 1) for item in raw.split(b"\0") if b"=" in item)
+            index = int(environment.get(b"AWS_BATCH_JOB_NODE_INDEX", b"0"))  # a single-node job has none
+            found[process.pid] = index, _Shim(process.pid, int(environment[b"MASTER_PORT"]), group)
+    # between its fork and its exec a supervisor has the command line of its shim
+    return {index: shim for pid, (index, shim) in found.items() if parent_of(pid) not in found}
+
+
+def _processes(node: Mapping[str, object]) -> NodeProcesses:
+    """Of a node in a handle; handles of older versions have no group."""
+    return NodeProcesses(int(str(node["pid"])), str(node["start"]), str(node.get("group") or ""))
+
+
+def _signal(pid: int, number: int) -> None:
+    try:
+        os.kill(pid, number)
+    except (ProcessLookupError, PermissionError):
+        pass
+
+
+def _memory() -> int:
+    """Memory of the machine in MiB."""
+    return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)

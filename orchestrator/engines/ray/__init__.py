@@ -1,0 +1,14 @@
+"""The Ray engine."""
+
+from __future__ import annotations
+
+from orchestrator.engines.api import Engine, EngineType, Setting
+
+
+def _make(setting: Setting) -> Engine:
+    from orchestrator.engines.ray.engine import RayEngine
+
+    return RayEngine(setting.home)
+
+
+ENGINE = EngineType(_make)

@@ -1,0 +1,237 @@
+"""The driver of a job on a Ray cluster: a process of its own that holds the placement group and one actor a node.
+
+``python -m orchestrator.engines.ray.driver FOLDER JOIN FD``. It outlives the controller, takes commands from the folder's pipe
+and tells in state files how the nodes are (:mod:`orchestrator.engines.ray.folder`). When a gang is over it keeps the placement group
+for a while: the job's next attempt finds its place, its GPUs and a driver that knows the cluster. Ray is imported here and nowhere else
+but in the watch, so that nothing that it does to a process that loses its cluster is done to the controller.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from orchestrator.engines.ray import node as ray_node
+from orchestrator.engines.ray.bundles import STRATEGY, bundle_of, selector_of
+from orchestrator.engines.ray.folder import NEW, Folder
+from orchestrator.engines.ray.gang import Gang
+
+_LINGER = 15.0
+"""Seconds for which the place of a gang that is over is kept for the job's next attempt."""
+_JOINING = 90.0
+"""Seconds that joining the cluster may take: ``ray.init`` itself would try for ever."""
+
+
+class Driver:
+    """Gangs of one job, one after the other, and the placement group that they share."""
+
+    def __init__(self, folder: Folder, join: str, commands: int) -> None:
+        self.folder, self.join, self.commands = folder, join, commands
+        self.gang: Gang | None = None
+        self.group: Any = None
+        self.key: Any = None
+        """What the placement group was made for."""
+        self.idle_since = time.monotonic()
+        self._partial = b""
+        self._draining: set[str] = set()
+        self._told_to_leave = False
+        self._next_look = 0.0
+
+    def run(self) -> None:
+        """Until the job has been over for a while."""
+        while not self._obey():
+            self.folder.alive.touch()
+            gang = self.gang
+            if gang is None or gang.phase == "stopped":
+                if time.monotonic() - self.idle_since > _LINGER:
+                    return
+                self._read(0.2)
+                continue
+            self._step(gang)
+            gang.tell()
+            if gang.is_over and gang.phase != "stopping":
+                if time.monotonic() - self.idle_since > 4 * _LINGER:  # nobody asks: the controller is gone for long
+                    gang.clear()
+                    gang.tell()
+            else:
+                self.idle_since = time.monotonic()
+
+    def _step(self, gang: Gang) -> None:
+        if gang.phase == "joining":
+            self._place(gang)
+        elif gang.phase == "placing":
+            self._await_place(gang)
+        elif gang.phase == "starting":
+            gang.listen(0.1)
+            if not gang.is_over and all("facts" in node for node in gang.nodes):
+                addresses = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes()}
+                gang.start([addresses[node["ray_node"]] for node in gang.nodes])
+        else:
+            gang.listen(0.1)
+            leaving = [node["ray_node"] for node in gang.nodes if node["ray_node"] in self._draining]
+            if leaving and gang.phase == "running" and not self._told_to_leave:
+                self._told_to_leave = True
+                gang.leave()
+            if gang.phase == "stopping" and (not gang.is_stopping or time.monotonic() > gang.deadline):
+                gang.clear()
+                self.idle_since = time.monotonic()
+
+    def _place(self, gang: Gang) -> None:
+        """Keep the placement group of the attempt before where it fits, else ask for another."""
+        bundles = [bundle_of(node) for node in gang.plan["nodes"]]
+        pins = [node["pin"] for node in gang.plan["nodes"]]
+        key = (bundles, pins)
+        if self.group is not None and (key != self.key or not self.group.wait(0.5)):
+            ray.util.remove_placement_group(self.group)
+            self.group = None
+        if self.group is None:
+            selectors = [selector_of(node) for node in gang.plan["nodes"]]
+            # names have to be unique, and a dead driver's group stays until Ray has noticed its death
+            name = f"muster {gang.name} {uuid.uuid4().hex[:8]}"
+            self.group = ray.util.placement_group(
+                bundles, strategy=STRATEGY, name=name, bundle_label_selector=selectors
+            )
+            self.key = key
+        gang.phase, gang.why, self._told_to_leave = "placing", "waits for its placement group", False
+
+    def _await_place(self, gang: Gang) -> None:
+        if self.group.wait(0.1):
+            where = ray.util.placement_group_table(self.group)["bundles_to_node_id"]
+            for index, node in enumerate(gang.nodes):
+                node["ray_node"] = where[index]
+            gang.place(self.group)
+        elif time.monotonic() > self._next_look:
+            self._next_look = time.monotonic() + 1.0
+            there = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+            if gone := [node for node in gang.plan["nodes"] if node["pin"] and node["pin"] not in there]:
+                for node in gone:  # any other machine that has room will do
+                    node["pin"] = None
+                self._place(gang)
+            gang.why = _why_waiting(gang.plan["nodes"])
+
+    def _obey(self) -> bool:
+        """Carry out the commands that have come; True where the driver should leave."""
+        self._read(0.0)
+        while b"\n" in self._partial:
+            line, _, self._partial = self._partial.partition(b"\n")
+            try:
+                command = json.loads(line)
+            except ValueError:
+                continue
+            idle = self.gang is None or self.gang.phase == "stopped"
+            if command["do"] == "leave" and idle:
+                return True
+            if command["do"] == "run" and idle:
+                self.take(command["gang"])
+            elif command["do"] == "stop" and self.gang is not None and command["gang"] == self.gang.name:
+                self._stop(self.gang, command["grace"])
+        return False
+
+    def _stop(self, gang: Gang, grace: float) -> None:
+        if gang.phase == "placing":  # it asks for machines that nobody wants any more
+            ray.util.remove_placement_group(self.group)
+            self.group = None
+        if gang.phase not in ("stopping", "stopped"):
+            gang.stop(grace)
+
+    def take(self, name: str) -> None:
+        """Begin with the gang of that name, unless it was here already."""
+        if self.folder.state(name).exists():
+            return
+        try:
+            self.gang = Gang(json.loads(self.folder.plan(name).read_bytes()), self.folder)
+        except OSError:
+            return  # it was stopped meanwhile
+        self.gang.tell()
+
+    def _read(self, seconds: float) -> None:
+        if select.select([self.commands], [], [], seconds)[0]:
+            try:
+                self._partial += os.read(self.commands, 65536)
+            except BlockingIOError:
+                pass
+
+    def watch(self) -> None:
+        """In a thread, since it waits where the head is away: which nodes are told to leave."""
+        while True:
+            with contextlib.suppress(ray.exceptions.RaySystemError):
+                self._draining = set(ray._private.state.state.get_draining_nodes())
+            time.sleep(1.0)
+
+
+def _why_waiting(nodes: list[Mapping[str, Any]]) -> str:
+    """What a placement group that pends waits for."""
+    free = ray._private.state.available_resources_per_node()
+    full, new = [], []
+    for node in nodes:
+        wanted = bundle_of(node)
+        if node["pin"] not in free:
+            new.append(node)
+        elif any(free[node["pin"]].get(name, 0.0) < amount for name, amount in wanted.items()):
+            full.append(node["host"])
+    if full:
+        return f"waits for room on {', '.join(full)}: other work of the Ray cluster holds it"
+    if new:
+        gpus = f", {new[0]['gpus']} GPUs" if new[0]["gpus"] else ""
+        shape = f"{new[0]['cpus']:g} CPUs{gpus}, {new[0]['memory']} MiB"
+        if gone := [node["host"] for node in new if not node["host"].startswith(NEW)]:
+            return f"waits for {', '.join(gone)} to come back to the Ray cluster, or for another node with {shape}"
+        return f"waits for {len(new)} more node{'s' if len(new) > 1 else ''} with {shape}: Ray's autoscaler was asked"
+    return "waits for its placement group"
+
+
+def main(argv: list[str]) -> int:
+    """Join the cluster through this machine's Ray node, then drive."""
+    folder, join, commands = Folder(Path(argv[0])), argv[1], int(argv[2])
+    os.set_inheritable(commands, False)
+    driver = Driver(folder, join, commands)
+    driver._obey()
+    gang = driver.gang
+    if gang is None:
+        return 0
+
+    def give_up() -> None:
+        gang.fail(f"the Ray cluster at {os.environ['RAY_ADDRESS']} let nobody join for {_JOINING:.0f} s")
+        gang.tell()
+        os._exit(1)
+
+    patience = threading.Timer(_JOINING, give_up)
+    patience.daemon = True
+    patience.start()
+    try:
+        ray.cloudpickle.register_pickle_by_value(ray_node)
+        ray.init(
+            address=os.environ["RAY_ADDRESS"],
+            namespace="muster",
+            log_to_driver=False,
+            logging_level="error",
+            _node_ip_address=join,
+        )
+    except Exception as error:
+        gang.fail(f"can't join the Ray cluster at {os.environ['RAY_ADDRESS']}: {str(error).strip().splitlines()[0]}")
+        gang.tell()
+        return 1
+    patience.cancel()
+    threading.Thread(target=driver.watch, name="watch", daemon=True).start()
+    driver.run()
+    # leaving, it must not wait for a head that is away; what it holds goes with it
+    escape = threading.Timer(10.0, os._exit, (0,))
+    escape.daemon = True
+    escape.start()
+    ray.shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

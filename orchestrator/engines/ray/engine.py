@@ -1,0 +1,326 @@
+"""The Ray engine: nodes are actors' children on the machines of a Ray cluster.
+
+Ray places the gang (a ``STRICT_SPREAD`` placement group), starts an actor on each machine, tells of machines that die or will leave,
+and asks its autoscaler for more. All of that is done by two kinds of processes that import Ray: a watch that reads the cluster's
+tables, and for each job a driver, which outlives the controller and is found again by the pipe in its folder
+(:mod:`orchestrator.engines.ray.folder`). This module does not import Ray, which aborts a process that loses its cluster.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from orchestrator.domain.hosts import Host
+from orchestrator.engines.api import (
+    Cause,
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodePlan,
+    NodeStatus,
+    NotYet,
+    Plan,
+    node_plans,
+)
+from orchestrator.engines.ray.bundles import in_words
+from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
+from orchestrator.engines.ray.folder import LEASE, NEW, Folder
+from orchestrator.engines.ray.request import GangRequest, NodeRequest
+from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
+from shared_store.files import read_json, write_json
+from shared_store.ports import first_port
+
+DEFAULT_ADDRESS = "127.0.0.1:6379"
+_SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
+"""Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
+_KEPT = 7 * 86400.0
+"""Seconds for which a job's folder is kept when it is over."""
+
+
+class RayEngine:
+    """One Ray cluster."""
+
+    name = "ray"
+    queues = False
+    elastic = True
+    images = False
+
+    def __init__(self, home: Path, address: str | None = None) -> None:
+        """Args:
+        home: ``$MUSTER_HOME``; the jobs' folders go below it.
+        address: ``host:port`` of the cluster's head; that of ``RAY_ADDRESS`` by default.
+
+        Raises:
+            EngineError: Ray is not installed, the cluster does not answer, wants another token or has other versions, or this
+                machine is no node of it.
+        """
+        self.home = home
+        self.head = address or os.environ.get("RAY_ADDRESS") or DEFAULT_ADDRESS
+        if not re.fullmatch(r"[^/:]+:[0-9]+|\[[0-9a-f:]+\]:[0-9]+", self.head):
+            raise EngineError(
+                f"RAY_ADDRESS is {self.head!r}; the host:port of the cluster's head is needed, as 10.0.0.1:6379"
+            )
+        self._grows = grows_to(os.environ.get("MUSTER_RAY_GROWS_TO", ""))
+        self._environment = ray_environment(self.head)
+        self._watch = Watch(self.head, self._environment)
+        seen = self._watch.first()
+        if "error" in seen:
+            raise EngineError(str(seen["error"]))
+        if not seen["join"]:
+            self._watch.close()
+            raise EngineError(_not_a_node(self.head))
+        self.address = address_towards(self.head)
+        self._drivers: dict[str, subprocess.Popen[bytes]] = {}
+        self._next_let_go = 0.0
+        self._suspects: dict[str, float] = {}
+        """Until when (monotonic [s]), by node id."""
+        self._lock = threading.Lock()
+        self._grown: dict[str, Sequence[str]] = {}
+        """Hosts of the gangs for which machines were to be added; guarded by the lock, since stops forget gangs."""
+        self._clear_away()
+
+    # -- the cluster --------------------------------------------------------------------------------------------------
+
+    def capacity(self) -> Sequence[Host]:
+        """The machines that have CPUs, and those that the autoscaler could add (``ray/+1``, …).
+
+        One that was added for a gang is called what the gang's placement calls it until that is over.
+        """
+        machines = self._machines()
+        hosts = [Host(name, m["cpus"], _ids(m["gpus"]), m["memory"], single=True) for name, m in machines.items()]
+        for shape in [*self._grows, *self._watch.seen.get("grows", [])]:
+            like = [m for m in machines.values() if (m["cpus"], m["gpus"]) == (shape["cpus"], shape["gpus"])]
+            names = (f"{NEW}{number}" for number in range(1, 10_000))
+            taken = {host.name for host in hosts}
+            free = (name for name in names if name not in taken)
+            for _ in range(shape["most"] - len(like)):
+                hosts.append(Host(next(free), shape["cpus"], _ids(shape["gpus"]), shape["memory"], single=True))
+        return hosts
+
+    def _machines(self) -> dict[str, dict[str, Any]]:
+        """The cluster's machines that have CPUs, by host name."""
+        now = time.monotonic()
+        nodes = [
+            node
+            for node in self._watch.seen.get("nodes", [])
+            if node["cpus"] > 0 and self._suspects.get(node["id"], 0.0) < now
+        ]
+        names = [node["name"] for node in nodes]
+        taken = self._taken()
+        found = {}
+        for node in nodes:
+            twin = names.count(node["name"]) > 1
+            found[taken.get(node["id"]) or f"ray/{node['name']}{'-' + node['id'][:6] if twin else ''}"] = node
+        return found
+
+    def _taken(self) -> dict[str, str]:
+        """Names under which gangs hold machines that were added for them, by node id."""
+        names = {}
+        with self._lock:
+            grown = list(self._grown.items())
+        for gang, hosts in grown:
+            state = read_json(Folder.of(self.home, _job(gang)).state(gang)) or {}
+            for host, node in zip(hosts, state.get("nodes", ()), strict=False):
+                if host.startswith(NEW) and node["ray_node"]:
+                    names[node["ray_node"]] = host
+        return names
+
+    # -- gangs --------------------------------------------------------------------------------------------------------
+
+    def plan(self, gang: Gang) -> Plan[GangRequest]:
+        """With the placement group. Addresses of machines that are not there yet are empty; the port is chosen on the main node's."""
+        machines = self._machines()
+        addresses = [machines[p.host]["address"] if p.host in machines else "" for p in gang.placements]
+        nodes = node_plans(gang, addresses, first_port(gang.name))
+        request = GangRequest(gang.name, gang.main, gang.directory, [_request(gang, node, machines) for node in nodes])
+        return Plan(gang, nodes, request, in_words(request.told()))
+
+    def launch(self, plan: Plan[GangRequest]) -> Handle:
+        gang = plan.gang
+        folder = Folder.of(self.home, gang.job)
+        hosts = [placement.host for placement in gang.placements]
+        if not folder.state(gang.name).exists():
+            if problem := self._watch.problem():
+                raise NotYet(f"{problem}; waiting for it")
+            if not self._watch.seen["join"]:
+                raise NotYet(f"{_not_a_node(self.head)}; waiting for it")
+            folder.make()
+            write_json(folder.plan(gang.name), plan.request.told())
+            folder.plan(gang.name).chmod(0o600)
+            self._let_go(gang.job)
+            self._drive(folder, gang.name)
+        handle = Handle(self.name, gang.name, len(hosts), {"hosts": hosts})
+        self._note(handle)
+        return handle
+
+    def observe(self, handle: Handle) -> GangStatus:
+        gang, count = handle.gang, handle.nodes
+        folder = Folder.of(self.home, _job(gang))
+        state = read_json(folder.state(gang))
+        if state is None or state["phase"] != "stopped":
+            self._note(handle)
+        if state is None:
+            if folder.plan(gang).exists():
+                driver = self._drivers.get(_job(gang))
+                if driver is not None and driver.poll():  # one that left with 0 did so before it was asked
+                    said = folder.said.read_text(errors="replace").strip().rpartition("\n")[2]
+                    return [ended("", 1, f"its driver can't run: {said}")] * count
+                self._drive(folder, gang)
+                return [NodeStatus(NodePhase.STARTING, words="its driver is starting")] * count
+            return [ended("", None)] * count
+        driven = folder.is_driven() or state["phase"] == "stopped"
+        if not driven:  # its last words may have come in between
+            state = read_json(folder.state(gang)) or state
+        if state["phase"] == "placing" and time.monotonic() > self._next_let_go:
+            self._next_let_go = time.monotonic() + 1.0
+            self._let_go(_job(gang))
+        status = []
+        for node in state["nodes"]:
+            status.append(_status(node, state, driven))
+            if driven and state["phase"] == "running" and not node["running"] and node["code"] is None:
+                until = time.monotonic() + (_SUSPECT_IF_SILENT if node.get("silent") else _SUSPECT)
+                self._suspects.setdefault(node["ray_node"], until)
+        return status
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        gang = handle.gang
+        folder = Folder.of(self.home, _job(gang))
+        asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE
+        while (state := read_json(folder.state(gang))) is None or state["phase"] != "stopped":
+            if state is None and not folder.plan(gang).exists():
+                break
+            if state is not None and state["phase"] == "stopping" and state["why"]:
+                raise EngineError(f"{state['why']}; its CPUs and GPUs are not given to other jobs until it is gone")
+            now = time.monotonic()
+            if now > patience and state is not None:  # frozen; its actors have missed it for long enough
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(state["driver"], signal.SIGKILL)
+            if now - asked > 2.0:
+                asked = now
+                if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
+                    self._outwait(folder, gang)
+            time.sleep(0.02)
+        with self._lock:
+            self._grown.pop(gang, None)
+
+    def close(self) -> None:
+        """End the watch; drivers go on."""
+        self._watch.close()
+
+    @staticmethod
+    def _outwait(folder: Folder, gang: str) -> None:
+        """The driver died. Ray ends the actors of a dead driver, and an actor that hears of none for a while ends itself."""
+        folder.plan(gang).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # there is no sign of life of one that never joined the cluster
+            age = time.time() - folder.alive.stat().st_mtime
+            time.sleep(min(max(0.0, LEASE + 1.0 - age), LEASE + 1.0))
+        if state := read_json(folder.state(gang)):
+            nodes = [{**node, "running": False} for node in state["nodes"]]
+            write_json(folder.state(gang), {**state, "nodes": nodes, "phase": "stopped"})
+
+    def _note(self, handle: Handle) -> None:
+        hosts = handle.facts["hosts"]
+        if any(host.startswith(NEW) for host in hosts):
+            with self._lock:
+                self._grown[handle.gang] = hosts
+
+    def _drive(self, folder: Folder, gang: str) -> None:
+        """Have the job's driver take the gang up; start one where there is none."""
+        if folder.send({"do": "run", "gang": gang}):
+            return
+        folder.alive.unlink(missing_ok=True)
+        commands = folder.read_end()
+        job = _job(gang)
+        command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.driver", str(folder.path)]
+        try:
+            with open(folder.said, "ab") as said:
+                self._drivers[job] = subprocess.Popen(
+                    [*command, str(self._watch.seen.get("join")), str(commands)],
+                    env={**self._environment, "MUSTER_JOB_ID": job, "MUSTER_STORE": str(self.home)},
+                    pass_fds=(commands,),
+                    cwd=folder.path,  # Ray has workers look for modules where their driver was started
+                    stdin=subprocess.DEVNULL,
+                    stdout=said,
+                    stderr=said,
+                    start_new_session=True,
+                )
+            folder.send({"do": "run", "gang": gang})
+        finally:
+            os.close(commands)
+
+    def _let_go(self, job: str) -> None:
+        """Drivers of other jobs that only keep a place for an attempt to come are told to leave; those that left are reaped."""
+        for other, process in list(self._drivers.items()):
+            if process.poll() is not None:
+                del self._drivers[other]
+        for path in (self.home / "ray").glob("*"):
+            if path.name != job:
+                Folder(path).send({"do": "leave"})
+
+    def _clear_away(self) -> None:
+        """Remove the folders of jobs that have long been over."""
+        for path in (self.home / "ray").glob("*"):
+            if time.time() - path.stat().st_mtime > _KEPT and not Folder(path).is_driven():
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any]]) -> NodeRequest:
+    """What the driver is told of a node; ``machines``: those of the cluster, by host name. Raises EngineError."""
+    index, placement = node.contract.node_index, node.placement
+    container = gang.containers[index] if gang.containers else {}
+    return NodeRequest(
+        contract=node.contract,
+        command=list(node.command),
+        environment=dict(node.environment),
+        prefix=with_mounts([], mounts_of(container, gang.store), RayEngine.name),
+        cpus=placement.cpus,
+        gpus=len(placement.gpus),
+        memory=placement.memory,
+        host=placement.host,
+        # a machine that left since is not waited for: any other that has room will do
+        pin=machines[placement.host]["id"] if placement.host in machines else None,
+    )
+
+
+def _status(node: Mapping[str, Any], state: Mapping[str, Any], driven: bool) -> NodeStatus:
+    """How a node is, by what its driver says; ``driven``: the driver is there, or had nothing more to do."""
+    gpus = tuple(filter(None, node.get("gpus", "").split(",")))
+    if not (node["running"] and driven):
+        over = ended(node["address"], node["code"], node["detail"], gpus)
+        # a driver of an older version says no cause
+        return dataclasses.replace(over, cause=Cause(node["cause"])) if node.get("cause") else over
+    if node["started"] or not state["why"]:
+        return NodeStatus(NodePhase.RUNNING, node["address"], gpus=gpus)
+    phase = NodePhase.QUEUED if state["phase"] == "placing" else NodePhase.STARTING
+    return NodeStatus(phase, node["address"], state["why"], gpus=gpus)
+
+
+def _not_a_node(head: str) -> str:
+    return (
+        f"this machine is no node of the Ray cluster at {head}, and drivers run on one: "
+        f"`ray start --address={head} --num-cpus=0` makes it one"
+    )
+
+
+def _ids(count: int) -> tuple[str, ...]:
+    """Ray says which GPUs a node gets; until then they have numbers."""
+    return tuple(str(number) for number in range(count))
+
+
+def _job(gang: str) -> str:
+    return gang.partition("/")[0]

@@ -1,0 +1,168 @@
+"""Several engines as one, for the controller. A host's name and a gang's handle name their engine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+
+from orchestrator.domain.hosts import Host, engine_of
+from orchestrator.engines.api import (
+    Engine,
+    EngineError,
+    Gang,
+    GangStatus,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+    read_handle,
+)
+from orchestrator.engines.runner import Runner
+from orchestrator.engines.secrets import Secrets, SecretsError
+
+FRESH = 2.0
+"""Seconds that a request waits for the engines' newest hosts."""
+
+_GIVEN = ("local", "docker")
+"""Engines that hand the controller's secrets to their nodes."""
+_PASSED_ON = ("aws-batch",)
+"""Engines that are sent the job's ``secrets`` as they are: AWS has its own."""
+
+
+class NotServed(NotYet):
+    """This controller was started without the engine, on which something of the gang may run."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, unknown=True)
+
+
+class EngineSet:
+    """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
+
+    def __init__(self, engines: Sequence[Engine]) -> None:
+        """Takes the engines over: :meth:`close` closes them."""
+        self.secrets = Secrets()
+        """The source of the jobs' secrets; none at first."""
+        self.changed: Callable[[], None] = lambda: None
+        """Called (on an engine's thread) when an engine has something new to tell."""
+        self.engines: Mapping[str, Engine] = {engine.name: engine for engine in engines}
+        self._runners = {engine.name: Runner(engine, lambda: self.changed()) for engine in engines}
+
+    def close(self) -> None:
+        """Close every engine; gangs go on."""
+        with ExitStack() as stack:  # one that can't be closed does not keep the others open
+            for runner in self._runners.values():
+                stack.callback(runner.close)
+
+    @property
+    def names(self) -> Sequence[str]:
+        return list(self.engines)
+
+    @property
+    def queueing(self) -> frozenset[str]:
+        """Those that queue by themselves."""
+        return frozenset(name for name, engine in self.engines.items() if engine.queues)
+
+    def is_elastic(self, names: Iterable[str]) -> bool:
+        """Whether one of these engines may have more hosts later."""
+        return any(self.engines[name].elastic for name in names if name in self.engines)
+
+    @property
+    def addresses(self) -> Sequence[str]:
+        """Of this machine as the engines' nodes see it, beside loopback."""
+        return sorted({engine.address for engine in self.engines.values() if engine.address})
+
+    def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Sequence[Host]:
+        """The hosts of all engines, or of these, as each told them last.
+
+        ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
+        """
+        deadline = time.monotonic() + patience
+        hosts: list[Host] = []
+        for name in self.engines if names is None else names:
+            if runner := self._runners.get(name):
+                hosts += runner.capacity(max(0.0, deadline - time.monotonic()))
+        return hosts
+
+    def plan(self, gang: Gang) -> Plan[Any]:
+        """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
+        runner = self._runner(engine_of(gang.placements[0].host))
+        engine = runner.engine
+        named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
+        if named and not engine.images and gang.options.get("images") == "refuse":
+            raise EngineError(
+                f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
+                f"{gang.compute_environment} refuses other images (tag muster:images)"
+            )
+        if any(container.get("secrets") for container in gang.containers) and engine.name not in (*_GIVEN, *_PASSED_ON):
+            raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
+        if engine.images:  # its containers are what others have to imitate
+            gang = replace(gang, isolated=False)
+        elif engine.name != "local" and (user := next((c["user"] for c in gang.containers if c.get("user")), None)):
+            raise EngineError(
+                f"user {user}: the {engine.name} engine runs jobs as the user of its nodes; leave user out"
+            )
+        if gang.bus and engine.address:
+            gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
+        return runner.plan(gang)
+
+    def with_secrets(self, gang: Gang) -> Gang:
+        """The gang with the values of the job's secrets in its nodes' environments: to be launched, not to be shown.
+
+        Raises EngineError.
+        """
+        if not any(container.get("secrets") for container in gang.containers):
+            return gang
+        if engine_of(gang.placements[0].host) not in _GIVEN:
+            return gang
+        try:
+            given = [self.secrets.of(container, gang.queue) for container in gang.containers]
+        except SecretsError as error:
+            raise EngineError(str(error)) from None
+        environments = [{**told, **more} for told, more in zip(gang.environments, given, strict=True)]
+        return replace(gang, environments=environments)
+
+    def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
+        """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
+        if any(name not in _PASSED_ON for name in names):
+            self.secrets.check(containers, queue)
+
+    def launch(self, gang: str, hosts: Sequence[str], plan: Callable[[], Plan[Any]]) -> str:
+        """The handle of a gang, as text, once it is started; does not wait. Raises NotYet until then, and EngineError.
+
+        Args:
+            gang: Its name.
+            hosts: Where its nodes are placed.
+            plan: Makes its plan, where it has not been handed to the engine yet.
+        """
+        return self._runner(engine_of(hosts[0])).launch(gang, plan).text()
+
+    def observe(self, handle: str) -> GangStatus | None:
+        """The newest picture of a gang; None before the first. Does not wait, and raises nothing.
+
+        Of a gang whose engine is not served, or can't look now, nothing new is known: it counts as running.
+        """
+        found = read_handle(handle)
+        try:
+            return self._runner(found.engine).observe(found)
+        except NotServed as error:
+            return [NodeStatus(NodePhase.UNREACHABLE, words=str(error))] * found.nodes
+
+    def stop(self, handle: str, grace: float) -> GangStatus:
+        """Stop the gang, which may take long; returns how its nodes ended. Raises EngineError."""
+        found = read_handle(handle)
+        return self._runner(found.engine).stop(found, grace)
+
+    def forget(self, host: str, gang: str, handle: str | None) -> None:
+        """The gang, one of whose nodes was placed on ``host``, is over; ``handle``: None where it was never launched."""
+        if runner := self._runners.get(engine_of(host)):
+            runner.forget(gang, read_handle(handle) if handle else None)
+
+    def _runner(self, name: str) -> Runner:
+        try:
+            return self._runners[name]
+        except KeyError:
+            raise NotServed(f"engine {name} is not served now; start muster serve with --engine {name}") from None

@@ -1,0 +1,295 @@
+"""The Slurm engine: a gang is one Slurm job with one task a node; queueing, shares, limits and preemption are Slurm's.
+
+Every start of a gang is a submission of its own (``--no-requeue``). ``scontrol requeue`` and ``RequeueExit`` would start the same script
+again, with the epoch of an attempt that is over: the fenced nodes would leave at once. So a gang that was preempted or came to its
+time limit leaves with 75, and the controller submits a new attempt with a new epoch; ``SLURM_RESTART_COUNT`` stays unset.
+
+One ``srun`` step with ``--kill-on-bad-exit=0``: to Slurm, 75 is a bad exit, and a child's death means nothing with ``on_child_failure:
+ignore``. Who judges is the controller, as on every engine, from the outcomes in the store; of a node that left none, from what
+``srun`` says of its task in the job's output. Then it stops the gang, as a whole.
+
+A child of a job array is a single-node job here, which the controller starts: dependencies, retries and states are AWS's, which
+Slurm's arrays do not have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, wait
+from pathlib import Path
+from typing import Any
+
+from orchestrator.domain.hosts import Host
+from orchestrator.engines.api import (
+    Cause,
+    EngineError,
+    Gang,
+    GangStatus,
+    Handle,
+    NodePhase,
+    NodeStatus,
+    NotYet,
+    Plan,
+    node_plans,
+)
+from orchestrator.engines.slurm.commands import Hosts, Jobs, SlurmJob, Unreachable, address_of_this_machine, call
+from orchestrator.engines.slurm.script import Submission, shown, submission_for
+from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
+from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
+from shared_store.layout import Run, Store
+from shared_store.outcomes import Outcome, read_outcome
+
+_FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
+"""What sbatch says where it would take the job later."""
+_LOOK = 0.3
+"""Seconds between two looks at a job that is being stopped."""
+_AGAIN = 2.0
+"""Seconds after which a job that is still there is cancelled: it may have had no step yet, or Slurm can't reach a node."""
+_KILLING = 60.0
+"""Seconds after which a job that was killed and is still there is reported; Slurm's KillWait is 30 s by default."""
+_PATIENCE = 5.0
+"""Seconds for which a launch waits for sbatch, which tries for longer where slurmctld is away: other jobs wait meanwhile."""
+_FORGOTTEN = "0"
+"""Number of a job that Slurm does not know any more."""
+_SAID = re.compile(r"^srun: error: \S+: tasks? ([\d,-]+): (?:Exited with exit code (\d+)|(.+))$", re.MULTILINE)
+_STARVED = "Out Of Memory"
+_SIGNALS = {"Killed": 137, "Terminated": 143, "Segmentation fault": 139, "Aborted": 134, _STARVED: 137}
+_SCRIPT = re.compile(r"^(?:muster: node|slurmstepd\S*: error|srun: error|/\S+: line \d+): .*$", re.MULTILINE)
+"""What the script itself says where it can't start the nodes."""
+_MEETING = re.compile(r"^muster: meeting (\{.*\})$", re.MULTILINE)
+
+
+class SlurmEngine:
+    """A Slurm cluster, by the commands of this machine."""
+
+    name = "slurm"
+    queues = True
+    elastic = True
+    images = False
+
+    def __init__(self) -> None:
+        """Raises EngineError where Slurm is not installed here, or slurmctld does not answer."""
+        self._hosts = Hosts()
+        self.address = address_of_this_machine()
+        self._jobs = Jobs()
+        self._submitted: dict[str, float] = {}
+        self._submitting = threading.Lock()
+        self._pending: dict[str, Future[str]] = {}
+        """Submissions that are not answered, by gang."""
+
+    def capacity(self) -> Sequence[Host]:
+        return self._hosts.get()
+
+    def plan(self, gang: Gang) -> Plan[Submission]:
+        """With the whole script; the nodes' addresses are known when Slurm has placed them."""
+        request = submission_for(gang)
+        nodes = node_plans(gang, [""] * len(gang.placements), 0)
+        return Plan(gang, nodes, request, shown(request.script, gang.bus_token))
+
+    def launch(self, plan: Plan[Submission]) -> Handle:
+        gang = plan.gang
+        facts = {
+            "job": gang.job,
+            "attempt": gang.attempt,
+            "run": gang.run,
+            "store": gang.store,
+            "main": gang.main,
+            "output": plan.request.output,
+        }
+        patience = 0.0 if self._pending else _PATIENCE
+        if gang.name not in self._pending:
+            if trouble := self._jobs.away():
+                raise NotYet(f"Slurm: {trouble}", unknown=True)
+            self._begin(gang.name, facts, plan.request)
+        pending = self._pending[gang.name]
+        if not wait([pending], patience).done:
+            raise NotYet(
+                "Slurm: the gang is being handed to slurmctld; if this lasts, see `scontrol ping`", unknown=True
+            )
+        del self._pending[gang.name]
+        try:
+            return Handle(self.name, gang.name, len(plan.nodes), {**facts, "slurm": pending.result()})
+        except Unreachable as error:
+            raise NotYet(f"Slurm: {error}", unknown=True) from error
+
+    def observe(self, handle: Handle) -> GangStatus:
+        facts, count = handle.facts, handle.nodes
+        try:
+            job = self._job(handle)
+        except Unreachable as error:
+            said = f"Slurm: {error}"
+            return [NodeStatus(NodePhase.UNREACHABLE, words=said, stale=said)] * count
+        trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
+        if job is not None and job.state in QUEUED:
+            return [_queued(job, trouble)] * count
+        run = Store(facts["store"]).run(facts["run"])
+        ends = _outcomes(run, facts, count)
+        output = _said(facts)
+        nodes = [_node(facts, job, output, index, ends.get(index)) for index in range(count)]
+        return [dataclasses.replace(node, stale=trouble) if node.running else node for node in nodes]
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        number, deadline, asked, killed = handle.facts["slurm"], time.monotonic() + grace, False, 0.0
+        give_up = deadline + _KILLING
+        while True:
+            try:
+                job = self._job(handle, _LOOK)
+                if job is None or job.state in OVER:
+                    self._submitted.pop(number, None)
+                    return
+                now = time.monotonic()
+                if now > give_up and killed:
+                    raise EngineError(
+                        f"Slurm: job {number} is {job.state} on {job.hosts} since it was killed {_KILLING:.0f} s ago: something of it "
+                        f"can't be killed (`scontrol show job {number}`, and ps on that host, say what)"
+                    )
+                if job.state in QUEUED:
+                    _cancel(number)
+                elif not asked and grace > 0:
+                    # to the script alone, which tells the nodes: it knows whether they have been started yet
+                    _cancel("--batch", "--signal=USR1", number)
+                    asked = True
+                elif now >= deadline and not killed:
+                    # the step at once; to end the job, Slurm asks once more and waits for KillWait
+                    _cancel("--signal=KILL", f"{number}.0")
+                    killed = now
+                elif now >= deadline and now - killed > _AGAIN:
+                    _cancel(number)
+                    killed = now
+            except Unreachable:
+                pass  # a cluster that does not answer can't say that the job is over
+            time.sleep(_LOOK)
+
+    def close(self) -> None:
+        """Slurm's jobs go on."""
+
+    # -- jobs ---------------------------------------------------------------------------------------------------------
+
+    def _begin(self, gang: str, facts: Mapping[str, Any], request: Submission) -> None:
+        """Submit the gang in the background."""
+        pending: Future[str] = Future()
+
+        def submit() -> None:
+            try:
+                with self._submitting:  # one look and one submission at a time
+                    number = self._find(gang, facts) or self._submit(request)
+                    self._submitted[number] = time.monotonic()
+                pending.set_result(number)
+            except BaseException as error:
+                pending.set_exception(error)
+
+        threading.Thread(target=submit, name="sbatch", daemon=True).start()
+        self._pending[gang] = pending
+
+    def _find(self, gang: str, facts: Mapping[str, Any]) -> str | None:
+        """The number of a gang that was submitted before: its controller died, or sbatch's answer was lost. Raises EngineError."""
+        for job in self._jobs.fresh().values():
+            if job.comment == gang:
+                return job.number
+        run = Store(facts["store"]).run(facts["run"])
+        if run.outcome(facts["job"], facts["attempt"], facts["main"]).exists():
+            return _FORGOTTEN  # it ran and ended long ago: not a second time
+        return None
+
+    @staticmethod
+    def _submit(request: Submission) -> str:
+        Path(request.output).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            return call("sbatch", "--parsable", text=request.script).strip().partition(";")[0]
+        except Unreachable:
+            raise
+        except EngineError as error:
+            if _FULL.search(str(error)):
+                raise NotYet(f"Slurm takes no more jobs now: {error}") from error
+            where = f" for partition {request.partition}" if request.partition else ""
+            raise EngineError(
+                f"Slurm refuses the job{where}: {error}; `muster submit --dry-run` shows what it is asked for"
+            ) from error
+
+    def _job(self, handle: Handle, age: float = 1.0) -> SlurmJob | None:
+        """None where Slurm has forgotten it. Raises Unreachable."""
+        number = handle.facts["slurm"]
+        job = self._jobs.get(number, self._submitted.get(number, 0.0), age)
+        return job if job is not None and job.comment == handle.gang else None
+
+
+def _cancel(*arguments: str) -> None:
+    try:
+        call("scancel", *arguments)
+    except Unreachable:
+        raise
+    except EngineError:
+        pass  # it ended meanwhile
+
+
+def _said(facts: Mapping[str, Any]) -> str:
+    """The job's output so far. Raises OSError where it can't be read now."""
+    try:
+        return Path(facts["output"]).read_text(errors="replace")
+    except FileNotFoundError:
+        return ""
+
+
+def _outcomes(run: Run, facts: Mapping[str, Any], nodes: int) -> dict[int, Outcome]:
+    """By node index; one look at the folder, however many nodes there are."""
+    try:
+        names = set(os.listdir(run.outcome(facts["job"], facts["attempt"], 0).parent))
+    except FileNotFoundError:
+        return {}
+    found = {}
+    for index in range(nodes):
+        if run.outcome(facts["job"], facts["attempt"], index).name in names:
+            outcome = read_outcome(run, facts["job"], facts["attempt"], index)
+            if outcome is not None:
+                found[index] = outcome
+    return found
+
+
+def _queued(job: SlurmJob, trouble: str) -> NodeStatus:
+    """A node of a job that Slurm has not started; ``trouble``: why there is no newer picture."""
+    phase = NodePhase.STARTING if job.state == "CONFIGURING" else NodePhase.QUEUED
+    return NodeStatus(phase, words=waiting(job), stale=trouble)
+
+
+def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int, outcome: Outcome | None) -> NodeStatus:
+    """How one node is, by its outcome, else by what srun says of its task, else by its job."""
+    task = 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
+    meeting = _MEETING.search(said)
+    address = json.loads(meeting[1])["addresses"][task] if meeting else ""
+    if outcome is not None:
+        return ended(address, outcome.exit_code)
+    # what the node's own processes said before they could say it in the store
+    own = re.findall(rf"^\s*{'0*' + str(task)}: (muster.*)$", said, re.MULTILINE)
+    for tasks, code, how in _SAID.findall(said):
+        if _among(task, tasks):
+            status = int(code) if code else _SIGNALS.get(how.removesuffix(" (core dumped)"), 137)
+            if how == _STARVED:
+                return NodeStatus(NodePhase.ENDED, address, OUT_OF_MEMORY, Cause.OUT_OF_MEMORY, status)
+            return ended(address, status, own[-1] if own else "")
+    if job is not None and job.state not in OVER:
+        if meeting:
+            return NodeStatus(NodePhase.RUNNING, address)
+        return NodeStatus(NodePhase.STARTING, address, f"Slurm: starts on {job.hosts} (job {job.number})")
+    if not own and (not meeting or (job is not None and job.state == "FAILED")):
+        own = _SCRIPT.findall(said)
+    if own:
+        return ended(address, 2, own[-1])
+    if job is None:
+        return NodeStatus(NodePhase.ENDED, address, "Slurm has forgotten the job, and the node left no outcome")
+    cause, exit_code, words = ending(job, facts["output"])
+    return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code)
+
+
+def _among(task: int, tasks: str) -> bool:
+    """Whether srun's ``0-2,5`` names the task."""
+    for part in tasks.split(","):
+        first, _, last = part.partition("-")
+        if int(first) <= task <= int(last or first):
+            return True
+    return False

@@ -1,0 +1,90 @@
+"""An engine of which a test decides everything: how its nodes are, when it hangs, what fails."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from orchestrator.domain.hosts import Host
+from orchestrator.engines.api import Cause, Gang, GangStatus, Handle, NodePhase, NodeStatus, Plan, node_plans
+from orchestrator.engines.toolkit.endings import ended
+
+
+@dataclass
+class FakeCluster:
+    """What runs on the machines of fake engines: it outlives each of them."""
+
+    gangs: dict[str, list[NodeStatus]] = field(default_factory=dict)
+    """How the nodes of each gang are, by its name; a test may put other statuses there."""
+    launched: list[Plan[Gang]] = field(default_factory=list)
+    """Plans of the gangs that were started, in their order."""
+
+    def end(self, gang: str, index: int, exit_code: int | None, words: str = "") -> None:
+        """Have a node end; without an exit code its host is lost."""
+        self.gangs[gang][index] = ended(self.gangs[gang][index].address, exit_code, words)
+
+
+class FakeEngine:
+    """An engine that starts nothing. A node runs from its launch on until a test, or a stop, ends it."""
+
+    name = "fake"
+    queues = False
+    elastic = False
+    images = False
+    address: str | None = None
+
+    def __init__(self, cluster: FakeCluster | None = None, hosts: Sequence[Host] | None = None) -> None:
+        """Args:
+        cluster: What its gangs run on; one of its own by default.
+        hosts: What it has; one of 8 cores and 8 GiB by default.
+        """
+        self.cluster = cluster or FakeCluster()
+        self.hosts = hosts if hosts is not None else [Host(f"{self.name}/host", 8.0, (), 8192)]
+        self.error: Exception | None = None
+        """Raised by every call, until it is None again."""
+        self.answers = threading.Event()
+        """While it is clear, calls on the engine's thread hang."""
+        self.answers.set()
+        self.threads: set[str] = set()
+        """Names of the threads on which it was called for its hosts, launches and looks."""
+        self.closed = 0
+        """How often it was closed."""
+
+    def capacity(self) -> Sequence[Host]:
+        self._called()
+        return self.hosts
+
+    def plan(self, gang: Gang) -> Plan[Gang]:
+        return Plan(gang, node_plans(gang, [f"10.0.0.{index + 1}" for index in range(len(gang.commands))], 29500), gang)
+
+    def launch(self, plan: Plan[Gang]) -> Handle:
+        self._called()
+        name = plan.request.name
+        if name not in self.cluster.gangs:
+            self.cluster.launched.append(plan)
+            nodes = [NodeStatus(NodePhase.RUNNING, node.contract.address or "") for node in plan.nodes]
+            self.cluster.gangs[name] = nodes
+        return Handle(self.name, name, len(plan.nodes), {})
+
+    def observe(self, handle: Handle) -> GangStatus:
+        self._called()
+        unknown = [ended("", None)] * handle.nodes
+        return list(self.cluster.gangs.get(handle.gang, unknown))
+
+    def stop(self, handle: Handle, grace: float) -> None:
+        if self.error is not None:
+            raise self.error
+        for index, node in enumerate(self.cluster.gangs.get(handle.gang, [])):
+            if node.running:
+                over = NodeStatus(NodePhase.ENDED, node.address, cause=Cause.STOPPED, exit_code=143)
+                self.cluster.gangs[handle.gang][index] = over
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def _called(self) -> None:
+        self.threads.add(threading.current_thread().name)
+        self.answers.wait()
+        if self.error is not None:
+            raise self.error

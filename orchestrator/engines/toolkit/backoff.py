@@ -1,0 +1,76 @@
+"""Retries at growing intervals; each failure is logged once instead of at every try."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+
+@dataclass
+class _Trouble:
+    said: str
+    pause: float
+    next: float
+
+
+class Backoff:
+    """What fails at present, by subject (a job, an engine, …). Any thread may call."""
+
+    def __init__(self, log: logging.Logger, first: float = 1.0, most: float = 60.0) -> None:
+        """``first``, ``most``: the shortest and the longest pause between two tries [s]; each failure doubles it."""
+        self._log, self._first, self._most = log, first, most
+        self._troubles: dict[Hashable, _Trouble] = {}
+        self._lock = threading.Lock()
+
+    def __bool__(self) -> bool:
+        """Whether anything fails at present."""
+        return bool(self._troubles)
+
+    def failed(self, subject: Hashable, said: str, error: BaseException | None = None) -> bool:
+        """Note a failure; returns whether it differs from the subject's last one, and only then logs it.
+
+        Args:
+            subject: What failed.
+            said: One line, the same for the same failure.
+            error: Where given, its traceback is logged too: a bug.
+        """
+        with self._lock:
+            before = self._troubles.get(subject)
+            pause = self._first if before is None else min(2 * before.pause, self._most)
+            self._troubles[subject] = _Trouble(said, pause, time.monotonic() + pause)
+        if before is not None and before.said == said:
+            return False
+        self._log.error("%s", said, exc_info=error)
+        return True
+
+    def waits(self, subject: Hashable) -> bool:
+        """Whether the pause after the last failure is not over."""
+        trouble = self._troubles.get(subject)
+        return trouble is not None and time.monotonic() < trouble.next
+
+    def said(self, subject: Hashable) -> str | None:
+        """The last failure; None where the subject works."""
+        trouble = self._troubles.get(subject)
+        return trouble.said if trouble else None
+
+    def hurry(self, subject: Hashable) -> None:
+        """Something has changed: the next try need not wait."""
+        with self._lock:
+            if trouble := self._troubles.get(subject):
+                trouble.next = 0.0
+
+    def worked(self, subject: Hashable) -> bool:
+        """The subject works; returns whether it had failed before."""
+        if subject not in self._troubles:  # the usual case, without the lock
+            return False
+        with self._lock:
+            return self._troubles.pop(subject, None) is not None
+
+    def tidy(self, idle: float = 600.0) -> None:
+        """Forget what was not tried for ``idle`` seconds after its pause, such as the start of a job that ended otherwise."""
+        before = time.monotonic() - idle
+        with self._lock:
+            self._troubles = {subject: each for subject, each in self._troubles.items() if each.next >= before}

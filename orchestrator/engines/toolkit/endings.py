@@ -1,0 +1,14 @@
+"""The status of a node that has ended, from an exit code and last words."""
+
+from __future__ import annotations
+
+from orchestrator.engines.api import Cause, NodePhase, NodeStatus
+
+OUT_OF_MEMORY = "OutOfMemoryError: Container killed due to memory usage"
+"""AWS's reason for a container that exceeded its memory limit."""
+
+
+def ended(address: str, exit_code: int | None, words: str = "", gpus: tuple[str, ...] = ()) -> NodeStatus:
+    """A node that has ended: unobserved (None), by a signal (128 + n), or by itself."""
+    cause = Cause.HOST_LOST if exit_code is None else Cause.SIGNAL if exit_code > 128 else Cause.EXIT
+    return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code, gpus)

@@ -1,0 +1,410 @@
+"""The tables of the database: definitions, queues, compute environments, policies, jobs, attempts, runs.
+
+Times are Unix milliseconds, as in the Batch API. A change here needs a migration (``orchestrator/persistence/migrations``); a test compares.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Generic, TypeVar
+
+from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship, validates
+
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.hosts import Placement
+from orchestrator.domain.job import Status, check_transition
+from orchestrator.persistence.columns import Names, storable
+from orchestrator.persistence.gangs import gangs
+
+
+def now() -> int:
+    """Unix time [ms], the unit of every time in the database and in the Batch API."""
+    return int(time.time() * 1000)
+
+
+_T = TypeVar("_T")
+_JSON_OR_NULL = JSON(none_as_null=True)
+
+
+class Base(DeclarativeBase):
+    type_annotation_map = {
+        dict[str, Any]: JSON,
+        dict[str, str]: JSON,
+        list[dict[str, Any]]: JSON,
+        list[str]: JSON,
+        int: BigInteger,
+    }
+
+
+class JobDefinition(Base):
+    """A registered job definition; a revision is never changed, only deregistered."""
+
+    __tablename__ = "job_definitions"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    revision: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    document: Mapped[dict[str, Any]]
+    """The request as registered."""
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Whose key registered it."""
+    status: Mapped[str] = mapped_column(default="ACTIVE")
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class JobQueue(Base):
+    """A job queue."""
+
+    __tablename__ = "job_queues"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    state: Mapped[str] = mapped_column(default="ENABLED")
+    """``ENABLED``; ``DISABLED`` takes no new job and finishes those that it has."""
+    priority: Mapped[int] = mapped_column(default=1)
+    """The highest is served first."""
+    compute_environments: Mapped[list[str]] = mapped_column("environments")
+    """Their names, in the order in which they are tried; ``environments`` in SQL."""
+    policy: Mapped[str | None] = mapped_column(default=None)
+    """Name of its scheduling policy; None: first in, first out."""
+    limits: Mapped[list[dict[str, Any]]] = mapped_column(default=list)
+    """``jobStateTimeLimitActions``."""
+    deleting: Mapped[bool] = mapped_column(default=False)
+    """Deleted by a person; gone once its last job is over."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class ComputeEnvironment(Base):
+    """Hosts of an engine, by a name."""
+
+    __tablename__ = "compute_environments"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    state: Mapped[str] = mapped_column(default="ENABLED")
+    document: Mapped[dict[str, Any]]
+    """The request that created it, with later updates applied."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class SchedulingPolicy(Base):
+    """How a queue's capacity is shared."""
+
+    __tablename__ = "scheduling_policies"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    fairshare: Mapped[dict[str, Any]]
+    """``fairsharePolicy`` of the request."""
+    tags: Mapped[dict[str, str]] = mapped_column(default=dict)
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class _OfArray(Generic[_T]):
+    """A value shared by the children of an array: stored once, with the array."""
+
+    def __init__(self, own: str) -> None:
+        """``own``: the column that holds it; NULL in a child."""
+        self._own = own
+
+    def __get__(self, job: Job | None, owner: type[Job]) -> _T:
+        if job is None:
+            return self  # type: ignore[return-value]  # how SQLAlchemy looks at a class
+        holder = job if job.array is None else job.array
+        value: _T = getattr(holder, self._own)
+        return value
+
+    def __set__(self, job: Job, value: _T) -> None:
+        setattr(job, self._own, value)
+
+
+class Job(Base):
+    """A submitted job: a multi-node job, a single-node one, an array of such, or one child of an array."""
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        UniqueConstraint("idempotency_key", name="uq_jobs_idempotency_key"),
+        Index("ix_jobs_queue_status", "queue", "status", "created_at", "id"),
+        Index("ix_jobs_queue_created", "queue", "created_at", "id"),
+    )
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """A UUID; of an array's child ``<parent>:<index>``."""
+    name: Mapped[str] = mapped_column(index=True)
+    queue: Mapped[str]
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Who submitted it: the name of a key, of a user, or MUSTER_TOKEN."""
+    definition: Mapped[str]
+    """ARN with revision."""
+    kind: Mapped[str] = mapped_column(default="multinode")
+    """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
+    request: Mapped[dict[str, Any]]
+    """SubmitJob as it came; empty for an array's child."""
+    own_node_properties: Mapped[dict[str, Any] | None] = mapped_column("node_properties", _JSON_OR_NULL)
+    node_properties = _OfArray[dict[str, Any]]("own_node_properties")
+    """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
+    run: Mapped[str] = mapped_column(index=True)
+    status: Mapped[str] = mapped_column(index=True, default=Status.SUBMITTED)
+    status_reason: Mapped[str | None] = mapped_column(default=None)
+    created_at: Mapped[int] = mapped_column(default=now, index=True)
+    runnable_at: Mapped[int | None] = mapped_column(default=None)
+    """Since when it waits for resources."""
+    queued_since: Mapped[int | None] = mapped_column(default=None)
+    """When it was created, in steady time [ms] (:mod:`orchestrator.control.clock`): by this jobs are ordered."""
+    started_at: Mapped[int | None] = mapped_column(default=None)
+    stopped_at: Mapped[int | None] = mapped_column(default=None, index=True)
+    attempts_allowed: Mapped[int] = mapped_column(default=1)
+    own_evaluate_on_exit: Mapped[list[dict[str, Any]] | None] = mapped_column(
+        "evaluate_on_exit", _JSON_OR_NULL, default=list
+    )
+    evaluate_on_exit = _OfArray[list[dict[str, Any]]]("own_evaluate_on_exit")
+    timeout: Mapped[int | None] = mapped_column(default=None)
+    """Seconds of each attempt."""
+    stop_reason: Mapped[str | None] = mapped_column(default=None)
+    """Set once the job was asked to end."""
+    cancelled: Mapped[bool] = mapped_column(default=False)
+    """Ended by CancelJob, or by the queue; else, with a stop reason, by TerminateJob."""
+    first_epoch: Mapped[int | None] = mapped_column(default=None)
+    share: Mapped[str | None] = mapped_column(default=None)
+    priority: Mapped[int] = mapped_column(default=0)
+    """Within its share; greater is served first."""
+    own_parameters: Mapped[dict[str, str] | None] = mapped_column("parameters", _JSON_OR_NULL, default=dict)
+    parameters = _OfArray[dict[str, str]]("own_parameters")
+    own_tags: Mapped[dict[str, str] | None] = mapped_column("tags", _JSON_OR_NULL, default=dict)
+    tags = _OfArray[dict[str, str]]("own_tags")
+    parent: Mapped[str | None] = mapped_column(default=None, index=True)
+    array_index: Mapped[int | None] = mapped_column(default=None)
+    array_size: Mapped[int | None] = mapped_column(default=None)
+    """Of the array that it is, or belongs to."""
+    idempotency_key: Mapped[str | None] = mapped_column(default=None)
+    attempts: Mapped[list[Attempt]] = relationship(
+        back_populates="job", order_by="Attempt.number", cascade="all, delete-orphan"
+    )
+    dependencies: Mapped[list[Dependency]] = relationship(
+        foreign_keys="Dependency.job_id", order_by="Dependency.on_id", cascade="all, delete-orphan"
+    )
+
+    array: Mapped[Job | None] = relationship(
+        primaryjoin="foreign(Job.parent) == remote(Job.id)", viewonly=True, lazy="selectin", join_depth=1
+    )
+    """The array that it is a child of."""
+
+    @validates("status_reason", "stop_reason")
+    def _bounded(self, _key: str, reason: str | None) -> str | None:
+        return None if reason is None else excerpt(reason, LONGEST_REASON)
+
+    @property
+    def gang(self) -> GangSpec:
+        """Its commands and resources, from its definition; read once for all children of an array. Raises ValueError if the definition is
+        damaged."""
+        return gangs.of((self.array or self).id, self.node_properties)
+
+    @property
+    def open_attempt(self) -> Attempt | None:
+        """The attempt whose gang exists or may exist."""
+        return next((attempt for attempt in self.attempts if attempt.stopped_at is None), None)
+
+    @property
+    def is_terminal(self) -> bool:
+        return Status(self.status).is_terminal
+
+    def move(self, status: Status, reason: str | None = None) -> None:
+        """Change the state; the reason stands until it is replaced. Raises ValueError for an illegal transition."""
+        check_transition(Status(self.status), status)
+        self.status = status
+        if status == Status.RUNNABLE:
+            self.runnable_at = now()
+        if status.is_terminal:
+            self.stopped_at = max(now(), self.started_at or 0)  # the clock may have been put back
+        if reason is not None:
+            self.status_reason = reason
+
+
+class RunRecord(Base):
+    """The owner of a run. The run itself is in the store."""
+
+    __tablename__ = "runs"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    owner: Mapped[str | None] = mapped_column(default=None)
+    """Who submitted the job that created it; None where that is not known."""
+    queue: Mapped[str]
+    """Of that job: keys of this queue may read and continue the run."""
+    created_at: Mapped[int] = mapped_column(default=now)
+
+
+class AutomaticEvaluation(Base):
+    """Progress of a training's automatic evaluations (:mod:`orchestrator.api.native.automatic`)."""
+
+    __tablename__ = "automatic_evaluations"
+    run: Mapped[str] = mapped_column(primary_key=True)
+    training: Mapped[str]
+    """Id of the job that trains, or trained last."""
+    seen: Mapped[str]
+    """Name of its newest checkpoint that was counted; empty before the first."""
+    waiting: Mapped[int]
+    """Checkpoints that were counted since the last evaluation was submitted."""
+    passed: Mapped[int]
+    """Checkpoints that were due and are not evaluated, since a newer one was."""
+    checkpoint: Mapped[str | None] = mapped_column(default=None)
+    job: Mapped[str | None] = mapped_column(default=None)
+    """The last evaluation that was submitted: of which checkpoint, and the id of its job."""
+    open: Mapped[bool] = mapped_column(default=False, index=True)
+    """Whether that job waits or runs, so that retention keeps its checkpoint."""
+    problem: Mapped[str | None] = mapped_column(default=None)
+    """Why the evaluation that was due last could not be submitted."""
+
+    @validates("problem")
+    def _bounded(self, _key: str, reason: str | None) -> str | None:
+        return None if reason is None else excerpt(reason, LONGEST_REASON)
+
+
+class WebhookDelivery(Base):
+    """A message about a job that ended, until its receiver has accepted it (:mod:`orchestrator.control.deliveries`)."""
+
+    __tablename__ = "webhook_deliveries"
+    __table_args__ = (Index("ix_webhook_deliveries_due", "webhook", "next_at"),)
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """Its ``webhook-id``."""
+    webhook: Mapped[str]
+    """Name of the webhook; its URL and its secret are not here."""
+    job: Mapped[str] = mapped_column(index=True)
+    created_at: Mapped[int] = mapped_column(default=now)
+    next_at: Mapped[int | None]
+    """When it is tried next; None where it was given up."""
+    tries: Mapped[int] = mapped_column(default=0)
+    body: Mapped[str | None] = mapped_column(default=None)
+    """What is sent, from the first try on."""
+    problem: Mapped[str | None] = mapped_column(default=None)
+    """Error of the last try."""
+
+
+class Dependency(Base):
+    """One job waits for the success of another."""
+
+    __tablename__ = "dependencies"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    on_id: Mapped[str] = mapped_column(String, primary_key=True, index=True)
+    """Id of the job on which it depends; kept when that job is deleted."""
+    kind: Mapped[str | None] = mapped_column(default=None)
+    """``N_TO_N`` or ``SEQUENTIAL`` as it was asked for; None: plain."""
+
+
+class Attempt(Base):
+    """One launch of a job's gang."""
+
+    __tablename__ = "attempts"
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    epoch: Mapped[int]
+    compute_environment: Mapped[str | None] = mapped_column("pool", default=None)
+    """Its name; ``pool`` in SQL."""
+    handle: Mapped[str | None] = mapped_column(default=None)
+    """The engine's name for the gang; None until it was launched."""
+    ending: Mapped[str | None] = mapped_column(default=None)
+    """An :class:`orchestrator.domain.job.Ending`, from the moment that the end was decided."""
+    spent: Mapped[bool] = mapped_column(default=True)
+    """Whether it counts against the job's attempts."""
+    created_at: Mapped[int] = mapped_column(default=now)
+    started_at: Mapped[int | None] = mapped_column(default=None)
+    stopped_at: Mapped[int | None] = mapped_column(default=None)
+    held_since: Mapped[int | None] = mapped_column(default=None)
+    running_since: Mapped[int | None] = mapped_column(default=None)
+    """``created_at`` and ``started_at`` in steady time [ms] (:mod:`orchestrator.control.clock`)."""
+    status_reason: Mapped[str | None] = mapped_column(default=None)
+    exit_code: Mapped[int | None] = mapped_column(default=None)
+    gpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    """GPUs times seconds held; set with ``cpu_seconds`` when the attempt is closed."""
+    cpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    wasted_gpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    """GPU-seconds since the last checkpoint, for an attempt that failed: their work was lost."""
+    wasted_cpu_seconds: Mapped[float] = mapped_column(default=0.0)
+    nodes: Mapped[list[Node]] = relationship(order_by="Node.index", cascade="all, delete-orphan", lazy="selectin")
+    """By index; none where the row was damaged."""
+    job: Mapped[Job] = relationship(back_populates="attempts")
+
+    @validates("status_reason")
+    def _bounded(self, _key: str, reason: str | None) -> str | None:
+        return None if reason is None else excerpt(reason, LONGEST_REASON)
+
+    def node(self, index: int) -> Node | None:
+        """Its node of this index; None if it has none, because it was started with fewer nodes."""
+        if index < len(self.nodes) and self.nodes[index].index == index:  # nearly always: they are in this order
+            return self.nodes[index]
+        return next((node for node in self.nodes if node.index == index), None)
+
+
+class Node(Base):
+    """One node of an attempt: its host, its resources, and its end."""
+
+    __tablename__ = "nodes"
+    __table_args__ = (ForeignKeyConstraint(["job_id", "attempt"], ["attempts.job_id", "attempts.number"]),)
+    job_id: Mapped[str] = mapped_column(primary_key=True)
+    attempt: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    """Its number."""
+    index: Mapped[int] = mapped_column("node_index", primary_key=True, autoincrement=False)
+    host: Mapped[str]
+    gpus: Mapped[tuple[str, ...]] = mapped_column(Names, default=())
+    """Ids of those that the scheduler gave it."""
+    cpus: Mapped[float] = mapped_column(default=0.0)
+    memory: Mapped[int] = mapped_column(default=0)
+    """MiB."""
+    address: Mapped[str | None] = mapped_column(default=None)
+    """None before the engine was first asked; empty where it does not know."""
+    devices: Mapped[tuple[str, ...] | None] = mapped_column(Names, default=None)
+    """Ids of the GPUs that it has, from an engine that hands them out itself and tells."""
+    exit_code: Mapped[int | None] = mapped_column(default=None)
+    """None until it has ended."""
+    reason: Mapped[str | None] = mapped_column(default=None)
+    error: Mapped[str | None] = mapped_column(default=None)
+    """Message of its first error."""
+    stopped_at: Mapped[int | None] = mapped_column(default=None)
+    status_reason: Mapped[str | None] = mapped_column(default=None)
+    """AWS's status reason for a node that ended by itself."""
+    met: Mapped[bool] = mapped_column(default=False)
+    """Whether it has connected to the bus: then the next controller must report it missing, too, if it does not return."""
+
+    @validates("reason", "error", "status_reason")
+    def _storable(self, _key: str, text: str | None) -> str | None:
+        return None if text is None else storable(text)
+
+    @property
+    def placement(self) -> Placement:
+        return Placement(self.host, self.gpus, self.cpus, self.memory)
+
+    def shown(self) -> dict[str, Any]:
+        """Its part of the API's answer, as far as known."""
+        given = {"index": self.index, "host": self.host, "gpus": list(self.gpus), "cpus": self.cpus}
+        ended = {"exitCode": self.exit_code, "reason": self.reason, "error": self.error}
+        known = {
+            "address": self.address,
+            "stoppedAt": self.stopped_at,
+            "statusReason": self.status_reason,
+            "met": self.met or None,
+            "devices": None if self.devices is None else list(self.devices),
+        }
+        return {
+            **given,
+            "memory": self.memory,
+            **{key: value for key, value in known.items() if value is not None},
+            **(ended if self.exit_code is not None else {}),
+        }
+
+
+class ClockState(Base):
+    """The one row of steady time (:mod:`orchestrator.control.clock`)."""
+
+    __tablename__ = "clock"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    boot: Mapped[str]
+    """Of the machine, as long as its monotonic clock counts on."""
+    offset: Mapped[int]
+    """Steady time less monotonic time [ms]."""
+    drift: Mapped[int]
+    """Wall-clock time less steady time [ms]."""
+
+
+class ShareUsage(Base):
+    """What a share has used of a queue, decayed to ``as_of`` (steady time [ms])."""
+
+    __tablename__ = "share_usage"
+    queue: Mapped[str] = mapped_column(primary_key=True)
+    share: Mapped[str] = mapped_column(primary_key=True)
+    seconds: Mapped[float]
+    """GPU-seconds; CPU-seconds of jobs without GPUs."""
+    as_of: Mapped[int]

@@ -1,0 +1,54 @@
+"""The schema of the database: created at once in a new database, else migrated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqlalchemy import Column, Connection, MetaData, String, Table, insert, inspect, select
+
+from orchestrator.persistence.models import Base, ComputeEnvironment, JobQueue
+
+MIGRATIONS = Path(__file__).parent / "migrations"
+NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).partition("_")[0]
+"""Revision of the tables of :mod:`orchestrator.persistence.models`."""
+_VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
+_OLDEST = "0001"
+"""The revision of databases from before migrations existed."""
+
+
+class NewerSchema(Exception):
+    """The database has a revision that this Muster does not know; the message is its name."""
+
+
+def bring_up_to_date(connection: Connection) -> None:
+    """Create the tables, or migrate existing ones. Raises NewerSchema.
+
+    Alembic is imported only where there is something to migrate: it takes as long as half of the rest of a start.
+    """
+    tables = inspect(connection).get_table_names()
+    present = connection.scalar(select(_VERSION.c.version_num)) if _VERSION.name in tables else None
+    if present == NEWEST:
+        return
+    if present is None and "jobs" not in tables:
+        if connection.dialect.name == "sqlite":  # Python's driver begins no transaction for CREATE TABLE
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        Base.metadata.create_all(connection)
+        _VERSION.create(connection, checkfirst=True)
+        connection.execute(insert(_VERSION).values(version_num=NEWEST))
+        connection.execute(insert(ComputeEnvironment).values(name="local", document={"type": "UNMANAGED"}))
+        connection.execute(insert(JobQueue).values(name="default", environments=["local"]))
+        return
+    from alembic import command
+    from alembic.config import Config
+    from alembic.script import ScriptDirectory
+
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    config.attributes["connection"] = connection
+    if present is not None and present not in {
+        each.revision for each in ScriptDirectory.from_config(config).walk_revisions()
+    }:
+        raise NewerSchema(present)
+    if present is None:
+        command.stamp(config, _OLDEST)
+    command.upgrade(config, "head")

@@ -1,0 +1,367 @@
+"""The truth about jobs: sessions on a database (SQLAlchemy; SQLite by default, PostgreSQL by URL), and its migrations."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from sqlalchemy import (
+    URL,
+    Connection,
+    create_engine,
+    event,
+    inspect,
+    make_url,
+    text,
+)
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
+
+_RESERVE = 5 << 20
+"""Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
+_FULL = ("SQLITE_FULL", "SQLITE_IOERR_SHMSIZE")
+_CONTROLLER_LOCK = 0x6D7573746572
+"""Key of PostgreSQL's advisory lock: one controller a database."""
+
+
+log = logging.getLogger("muster.controller")
+
+
+class DatabaseError(Exception):
+    """The database can't be used; the message says why and what to do."""
+
+
+class DatabaseFull(DatabaseError):
+    """The volume of the database has no room for what is new; what ends jobs is still written."""
+
+
+class Database:
+    """Sessions on one database; ``committed``, where set, is called with the jobs that a commit has changed."""
+
+    def __init__(self, url: str) -> None:
+        """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
+
+        Raises:
+            DatabaseError: It can't be reached, is of a newer Muster, or another controller has it.
+        """
+        self.committed: Callable[[Sequence[Job]], None] | None = None
+        self.changed: Callable[[Collection[str]], None] | None = None
+        """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
+        self.ended: Callable[[Session, Job], None] | None = None
+        """Called with each job that a transaction ends, before it is written: what it adds to the session is committed with that."""
+        self._lock: Connection | None = None
+        self._file_lock: IO[bytes] | None = None
+        self._damage: str | None = None
+        """What was said when a damaged page was first met."""
+        self._file: Path | None = None
+        self._identity: tuple[int, int] | None = None
+        """Device and inode of the file, once it is open."""
+        try:
+            self.engine = create_engine(
+                url,
+                pool_pre_ping=not url.startswith("sqlite"),
+                connect_args=_connect_args(make_url(url)),
+                json_deserializer=_read_document,
+            )
+        except (SQLAlchemyError, ModuleNotFoundError) as error:
+            raise DatabaseError(_explain(_shown(url), error)) from None
+        try:
+            self._open()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, SQLAlchemyError):
+                raise DatabaseError(_explain(_shown(url), error)) from None
+            raise
+
+    def _open(self) -> None:
+        """Take the lock, then migrate: nothing of a database that another controller has is touched."""
+        if self.engine.dialect.name == "sqlite":
+            event.listen(self.engine, "do_connect", self._check_before_connect)
+            event.listen(self.engine, "connect", _tune_sqlite)
+            if (path := self.engine.url.database) not in (None, "", ":memory:"):
+                self._file = Path(str(path))
+                self._file_lock = self._take_file_lock(self._file)
+                _make_private(self._file)
+        else:
+            self._lock = self._take_lock()
+        self._migrate()
+        if self._file is not None:
+            found = self._file.stat()
+            self._identity = found.st_dev, found.st_ino
+            self._reserve()
+
+    @classmethod
+    def at(cls, home: Path) -> Database:
+        """The SQLite database of a Muster home directory."""
+        return cls(f"sqlite:///{home / 'muster.db'}")
+
+    @contextmanager
+    def session(self) -> Iterator[Session]:
+        """A session: committed at the end of the block (and wherever the block commits), rolled back on an exception.
+
+        Raises DatabaseError where the database can't be used, also after a commit into a file that is gone: what was written there
+        must not be acknowledged.
+        """
+        self.check()
+        try:
+            with _Session(self.engine, expire_on_commit=False, info={"database": self}) as session:
+                yield session
+                session.commit()
+        except DBAPIError as error:
+            if _is_damaged(error):
+                self._damage = _explain(self._shown, error)
+            elif not isinstance(error, OperationalError | InterfaceError):
+                raise
+            elif _is_full(error):
+                raise DatabaseFull(f"database {self._shown}: its volume is full; make room there") from error
+            raise DatabaseError(_explain(self._shown, error)) from error
+
+    @property
+    def volume(self) -> Path | None:
+        """A directory on the volume that the database grows on; None where that is another machine's."""
+        return self._file.absolute().parent if self._file is not None else None
+
+    def check(self) -> None:
+        """Make sure that the SQLite file is still the one that was opened, and not known to be damaged: two system calls.
+
+        Raises DatabaseError where it is not, and from the first damaged page on: each write could make that worse.
+        """
+        if self._damage is not None:
+            raise DatabaseError(self._damage)
+        if self._file is None or self._identity is None:
+            return
+        try:
+            found = self._file.stat()
+        except FileNotFoundError:
+            raise DatabaseError(
+                f"database {self._file} was deleted while the controller runs; put that file back"
+            ) from None
+        except OSError as error:
+            raise DatabaseError(f"database {self._file} can't be reached ({error.strerror})") from None
+        if (found.st_dev, found.st_ino) != self._identity:
+            raise DatabaseError(
+                f"database {self._file} was replaced by another file while the controller runs; put the former one back, or "
+                "restart the controller to use this one"
+            )
+
+    def keep_lock(self) -> None:
+        """Make sure that this controller is still the database's only one (PostgreSQL forgets it with the connection).
+
+        Raises DatabaseError where another has it by now, or the server can't be reached.
+        """
+        if self._lock is None:
+            return
+        try:
+            self._lock.scalar(text("SELECT 1"))
+        except SQLAlchemyError:
+            self._lock.close()
+            try:
+                self._lock = self._take_lock()
+            except SQLAlchemyError as error:
+                raise DatabaseError(f"database {self._shown}: {_first_line(error)}") from error
+
+    @property
+    def _shown(self) -> str:
+        return _shown(str(self.engine.url))
+
+    def _check_before_connect(self, *_: object) -> None:
+        """SQLite would make a new, empty file in place of one that was deleted."""
+        self.check()
+
+    def _reserve(self) -> None:
+        """Have SQLite own space that no other program on the volume can take: free pages in its file, and a write-ahead log as long as it
+        grows between two checkpoints. With that a controller ends jobs, and records their ends, on a volume without a free byte.
+        """
+        try:
+            with self.engine.connect() as connection:
+                connection.exec_driver_sql("DROP TABLE IF EXISTS muster_reserve")
+                connection.exec_driver_sql("CREATE TABLE muster_reserve (room BLOB)")
+                connection.exec_driver_sql(f"INSERT INTO muster_reserve VALUES (zeroblob({_RESERVE}))")
+                connection.commit()
+                connection.exec_driver_sql("DROP TABLE muster_reserve")
+                connection.commit()
+                connection.exec_driver_sql("PRAGMA wal_checkpoint(PASSIVE)").close()
+        except OperationalError as error:
+            if not _is_full(error):
+                raise
+            log.warning("database %s: its volume is nearly full; make room there", self._shown)
+
+    def close(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+        self.engine.dispose()
+        if self._file_lock is not None:
+            self._file_lock.close()
+
+    def _take_lock(self) -> Connection:
+        """PostgreSQL drops it when the connection ends, however its process ends."""
+        connection = self.engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        if not connection.scalar(text(f"SELECT pg_try_advisory_lock({_CONTROLLER_LOCK})")):
+            connection.close()
+            raise self._taken()
+        return connection
+
+    def _take_file_lock(self, path: Path) -> IO[bytes] | None:
+        """The same for an SQLite file, beside it: its own locks are SQLite's. None where SQLite itself says what is wrong."""
+        try:
+            file = open(f"{path.resolve()}.lock", "ab", opener=_private)  # noqa: SIM115 - held until close()
+        except OSError:
+            return None
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            if isinstance(error, BlockingIOError):
+                raise self._taken() from None
+            raise DatabaseError(f"database {self._shown}: {file.name} can't be locked ({error.strerror})") from None
+        return file
+
+    def _taken(self) -> DatabaseError:
+        return DatabaseError(f"database {self._shown}: another controller has it; use that one, or stop it first")
+
+    def _migrate(self) -> None:
+        with self._unchecked() as connection:
+            try:
+                bring_up_to_date(connection)
+            except NewerSchema as newer:
+                raise DatabaseError(
+                    f"database {_shown(str(self.engine.url))} was written by a newer Muster (schema {newer}); "
+                    "install that version, or use another database"
+                ) from None
+
+    @contextmanager
+    def _unchecked(self) -> Iterator[Connection]:
+        """A transaction in which SQLite lets a table be replaced that others refer to (it can't alter one in place)."""
+        with self.engine.connect() as connection:
+            is_sqlite = self.engine.dialect.name == "sqlite"
+            if is_sqlite:
+                connection.exec_driver_sql("PRAGMA foreign_keys=OFF")
+                connection.commit()
+            with connection.begin():
+                yield connection
+            if is_sqlite:
+                connection.exec_driver_sql("PRAGMA foreign_keys=ON")
+                connection.commit()
+
+
+def _make_private(path: Path) -> None:
+    """Create an SQLite file for its user alone, or close one to others: the environments of jobs hold secrets."""
+    with suppress(OSError):  # said by SQLite, in its own words
+        os.close(_private(str(path), os.O_RDWR | os.O_CREAT))
+    for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):  # SQLite gives new ones the mode of the first
+        with suppress(OSError):
+            path.with_name(name).chmod(0o600)
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+def _shown(url: str) -> str:
+    """The URL without its password."""
+    scheme, sign, rest = url.partition("://")
+    return f"{scheme}{sign}{rest.rpartition('@')[2]}"
+
+
+def _is_damaged(error: Exception) -> bool:
+    """Whether SQLite found that the file is not as it wrote it."""
+    name = getattr(getattr(error, "orig", None), "sqlite_errorname", "")
+    return str(name).startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB"))
+
+
+def _explain(shown: str, error: Exception) -> str:
+    """One line: which database, what is wrong, and what to do about it."""
+    if not _is_damaged(error):
+        return f"database {shown}: {_first_line(error)}"
+    path, found = shown.partition(":///")[2], getattr(error, "orig", error)
+    return (
+        f"database {shown} is damaged ({found}): stop the controller and put a backup in its place, or what "
+        f"`sqlite3 {path} .recover` can still read"
+    )
+
+
+def _is_full(error: Exception) -> bool:
+    """Whether SQLite or PostgreSQL found no room on its volume."""
+    cause = getattr(error, "orig", None)
+    return getattr(cause, "sqlite_errorname", "") in _FULL or getattr(cause, "sqlstate", "") == "53100"
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:500]
+
+
+def _connect_args(url: URL) -> dict[str, Any]:
+    """So that a PostgreSQL server that vanished is noticed within seconds; what the URL itself says counts more."""
+    if url.get_backend_name() != "postgresql":
+        return {}
+    told = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+    return {name: value for name, value in {**told, "tcp_user_timeout": 10_000}.items() if name not in url.query}
+
+
+def _read_document(text: str) -> Any:
+    """A JSON column. One that is damaged is empty, so that its row alone can't be used, and not the whole query's."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return {}
+
+
+class _Session(Session):
+    """A session that tells its database which jobs a commit has changed."""
+
+    def commit(self) -> None:
+        super().commit()
+        self.info["database"].check()
+
+
+@event.listens_for(_Session, "after_commit")
+def _tell(session: Session) -> None:
+    jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
+    database = session.info["database"]
+    if jobs and database.committed:
+        database.committed(list(jobs.values()))
+    if ids and database.changed:
+        database.changed(ids)
+
+
+@event.listens_for(_Session, "after_rollback")
+def _forget(session: Session) -> None:
+    session.info.pop("jobs", None)
+    session.info.pop("ids", None)
+
+
+@event.listens_for(_Session, "before_flush")
+def _tell_ends(session: Session, _context: object, _instances: object) -> None:
+    if (ended := session.info["database"].ended) is None:
+        return
+    for each in list(session.dirty):
+        if isinstance(each, Job) and each.is_terminal and inspect(each).attrs.status.history.has_changes():
+            ended(session, each)
+
+
+@event.listens_for(_Session, "after_flush")
+def _note_jobs(session: Session, _context: object) -> None:
+    jobs = session.info.setdefault("jobs", {})
+    for changed in (session.new, session.dirty):
+        for each in changed:
+            if isinstance(each, Job):
+                jobs[each.id] = each
+            elif isinstance(each, Attempt) and each.job is not None:
+                jobs[each.job.id] = each.job
+
+
+def _tune_sqlite(connection: Any, _record: object) -> None:
+    cursor = connection.cursor()
+    # WAL lets the API read while the controller writes; FULL makes a commit survive a power cut, as law 4 asks.
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=10000", "foreign_keys=ON"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()

@@ -1,0 +1,82 @@
+"""Compiles a spec to the AWS Batch requests that carry it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrator.spec.model import Spec
+
+_MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "race", "export", "record", "render")}
+
+
+def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:
+    """The ``RegisterJobDefinition`` request of a spec.
+
+    Args:
+        spec: The job.
+        directory: Directory from which the job was submitted: the working directory of its command, if it exists on the nodes.
+    """
+    module = _MODULES.get(spec.kind)
+    command = ["python", "-P", "-m", module] if module else list(spec.command or [])
+    ours = {
+        "MUSTER_SPEC": json.dumps(spec.model_dump(mode="json", exclude_none=True), separators=(",", ":")),
+        "MUSTER_ON_CHILD_FAILURE": spec.on_child_failure,
+        "MUSTER_RANKS_PER_NODE": str(spec.ranks_per_node),
+        "MUSTER_MIN_NODES": str(spec.nodes.min),
+        "MUSTER_DIRECTORY": directory,
+        "MUSTER_LOG_LIMIT": str(spec.logs.limit),
+    }
+    if spec.train:
+        ours["MUSTER_STALL_TIMEOUT"] = f"{spec.stall_timeout:g}"
+    if spec.preemptible:
+        ours["MUSTER_PREEMPTIBLE"] = "1"
+    resources = {"VCPU": f"{spec.resources.cpus:g}", "MEMORY": str(spec.resources.memory)}
+    if spec.resources.gpus:
+        resources["GPU"] = str(spec.resources.gpus)
+    container: dict[str, Any] = {
+        "image": spec.image,
+        "command": command,
+        "environment": [{"name": name, "value": value} for name, value in {**spec.environment, **ours}.items()],
+        "resourceRequirements": [{"type": kind, "value": value} for kind, value in resources.items()],
+    }
+    if spec.secrets:
+        container["secrets"] = [{"name": name, "valueFrom": reference} for name, reference in spec.secrets.items()]
+    request: dict[str, Any] = {
+        "jobDefinitionName": spec.name,
+        "type": "multinode",
+        "nodeProperties": {
+            "numNodes": spec.nodes.max,
+            "mainNode": 0,
+            "nodeRangeProperties": [{"targetNodes": "0:", "container": container}],
+        },
+        "retryStrategy": {"attempts": spec.retry.attempts},
+    }
+    if module:  # its exit code 2 is a user's error: another attempt would only repeat it
+        request["retryStrategy"]["evaluateOnExit"] = [{"onExitCode": "2", "action": "EXIT"}]
+    if spec.priority:
+        request["schedulingPriority"] = spec.priority
+    if spec.timeout is not None:
+        request["timeout"] = {"attemptDurationSeconds": int(spec.timeout)}
+    return request
+
+
+def compile_submission(
+    spec: Spec, definition: str, environment: Mapping[str, str] | None = None, tags: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """The ``SubmitJob`` request of a spec whose definition (ARN) is registered.
+
+    ``environment`` is added on every node: the run that is continued, the checkpoint to start from. ``tags``: of the job.
+    """
+    request: dict[str, Any] = {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition}
+    if spec.share:
+        request["shareIdentifier"] = spec.share
+    if tags:
+        request["tags"] = dict(tags)
+    if environment:
+        pairs = [{"name": name, "value": value} for name, value in environment.items()]
+        request["nodeOverrides"] = {
+            "nodePropertyOverrides": [{"targetNodes": "0:", "containerOverrides": {"environment": pairs}}]
+        }
+    return request

@@ -1,0 +1,133 @@
+"""Jobs that evaluate a checkpoint of a training: their spec, and the checkpoints of a running training that are due. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import ValidationError
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.model import Spec, validate
+from orchestrator.spec.sections import Evaluation
+from shared_store.checkpoints import Checkpoint
+from shared_store.wording import explain, path_of
+
+AUTOMATIC_TAG = "muster:automatic-evaluation"
+"""Tag of the jobs that the controller submits by itself; its value is the evaluated checkpoint, ``RUN@ITERATION``."""
+
+
+def evaluation_document(
+    run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None, kind: str = "evaluate"
+) -> dict[str, Any]:
+    """The spec of a job that evaluates ``run``, or races it, on one node like those of its training.
+
+    Args:
+        run: Name of the run.
+        trained: Spec of the training.
+        section: What ``evaluate`` or ``race`` says beside the run.
+        name: Of the job; ``evaluate-RUN`` or ``race-RUN`` where None.
+        kind: ``evaluate`` or ``race``.
+    """
+    kept = {
+        key: trained[key]
+        for key in ("queue", "share", "image", "environment", "secrets")
+        if trained.get(key) is not None
+    }
+    resources = dict(trained.get("resources") or {})
+    if resources.get("gpus"):
+        resources["gpus"] = 1
+    return {
+        **kept,
+        "name": name or f"{kind}-{run}".replace(".", "-")[:100],
+        **({"resources": resources} if resources else {}),
+        kind: {"run": run, **section},
+    }
+
+
+def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
+    """The section ``evaluation`` of a training's spec; None where there is none. Raises SpecError: a job of the Batch API may say anything."""
+    section, train = (spec or {}).get("evaluation"), (spec or {}).get("train")
+    if section is None or not isinstance(train, dict) or not isinstance(train.get("iterations"), int):
+        return None
+    try:
+        return Evaluation.model_validate(section)
+    except ValidationError as error:
+        first: Any = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in ("evaluation", *path_of(first)))
+        raise SpecError(f"{key}: {explain(first)}") from None
+
+
+def place_of(queue: str, share: str | None, wanted: Evaluation) -> dict[str, str]:
+    """Queue and share of a training's automatic evaluations: the training's, which are given, unless the section names a queue."""
+    asked = {"queue": wanted.queue, "share": wanted.share}
+    if wanted.queue is None:
+        asked = {"queue": queue, "share": wanted.share or share}
+    return {key: value for key, value in asked.items() if value is not None}
+
+
+def automatic_evaluation(
+    run: str, trained: Mapping[str, Any], place: Mapping[str, str], wanted: Evaluation, iteration: int
+) -> Spec:
+    """The job that evaluates a checkpoint beside its training. Trainings may take its place, and it keeps no checkpoint. Raises SpecError.
+
+    ``place``: as :func:`place_of` says; ``iteration``: the checkpoint's.
+    """
+    section = {"checkpoint": iteration, "episodes": wanted.episodes, "worlds": wanted.worlds, "keep": False}
+    document = evaluation_document(run, {**trained, "queue": None, "share": None}, section)
+    if wanted.resources is not None:
+        document["resources"] = wanted.resources.model_dump()
+    document |= {"retry": wanted.retry.model_dump(), "preemptible": True, **place}
+    return validate(document, f"evaluation of {run}")
+
+
+@dataclass(frozen=True)
+class Counted:
+    """The checkpoints of a training that have been looked at."""
+
+    seen: str = ""
+    """Name of the newest one."""
+    waiting: int = 0
+    """Number of checkpoints since the last one that was evaluated."""
+    passed: int = 0
+    """Number of checkpoints that were due and skipped, because a newer one existed when the previous evaluation ended."""
+
+
+def first_count(checkpoints: Sequence[Checkpoint], first_epoch: int) -> Counted:
+    """For a job whose first attempt has this epoch: what earlier jobs of the run have saved does not count."""
+    earlier = [checkpoint.name for checkpoint in checkpoints if checkpoint.epoch < first_epoch]
+    return Counted(earlier[-1] if earlier else "")
+
+
+def due(
+    checkpoints: Sequence[Checkpoint], counted: Counted, every: int, iterations: int, busy: bool
+) -> tuple[Counted, Checkpoint | None]:
+    """Which checkpoint is to be evaluated now, and what is known of them then.
+
+    Args:
+        checkpoints: Those that are there, the newest last.
+        counted: What was known after the last look.
+        every: How many checkpoints come from one evaluation to the next.
+        iterations: Of the whole training, which evaluates its last checkpoint by itself.
+        busy: Whether the evaluation before waits or runs: one is open at a time.
+
+    Returns:
+        What is known now; and the newest checkpoint, where enough have come since the last one that was evaluated.
+    """
+    order = {checkpoint.name: (checkpoint.epoch, checkpoint.iteration) for checkpoint in checkpoints}
+    last = _order(counted.seen)
+    new = [checkpoint for checkpoint in checkpoints if order[checkpoint.name] > last]
+    if new:
+        count = sum(checkpoint.iteration < iterations for checkpoint in new)
+        counted = replace(counted, seen=new[-1].name, waiting=counted.waiting + count)
+    newest = checkpoints[-1] if checkpoints else None
+    if busy or newest is None or newest.iteration >= iterations or counted.waiting < every:
+        return counted, None
+    return replace(counted, waiting=0, passed=counted.passed + counted.waiting // every - 1), newest
+
+
+def _order(name: str) -> tuple[int, int]:
+    """Epoch and iteration of the checkpoint of this name; before all others where there is none."""
+    iteration, _, epoch = name.partition("-e")
+    return (int(epoch), int(iteration)) if epoch else (-1, -1)

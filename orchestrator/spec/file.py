@@ -1,0 +1,67 @@
+"""Reading a spec from a YAML file, remembering on which line each key stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec import strict_yaml
+from orchestrator.spec.changes import override
+from orchestrator.spec.kept_files import with_files
+from orchestrator.spec.model import Spec, validate
+from shared_store.files import DamagedFile, read_json
+
+
+def load(path: str, assignments: list[str] | None = None) -> Spec:
+    """The spec in the file ``path`` with ``--set`` assignments applied, and the files that its task's configuration names read.
+
+    Raises:
+        SpecError: A file can't be read, is not YAML, or is not a valid spec; one line with file, line and key.
+    """
+    document, lines = read(path)
+    if assignments and isinstance(document, dict):
+        document = override(document, assignments)
+        changed = [tuple(assignment.partition("=")[0].split(".")) for assignment in assignments]
+        # what --set changed stands on no line of the file
+        lines = {key: line for key, line in lines.items() if not any(key[: len(each)] == each for each in changed)}
+        lines |= dict.fromkeys(changed, 0)
+    if isinstance(document, dict):
+        document = with_files(document, path, lines)
+    return validate(_with_hyperparameters(document, path, lines), path, lines)
+
+
+def _with_hyperparameters(document: Any, path: str, lines: Mapping[strict_yaml.Path, int]) -> Any:
+    """The document with the content of the JSON file that ``train.hyperparameters`` names. Raises SpecError."""
+    train = document.get("train") if isinstance(document, dict) else None
+    named = train.get("hyperparameters") if isinstance(train, dict) else None
+    if not isinstance(train, dict) or not isinstance(named, str):
+        return document
+    key = ("train", "hyperparameters")
+    where = f"{path}:{lines[key]}" if lines.get(key) else "--set"
+    try:
+        content = read_json(Path(named), strict_yaml.MOST_CHARACTERS)
+    except DamagedFile as error:
+        raise SpecError(f"{where}: {'.'.join(key)}: {error}") from None
+    except OSError as error:
+        raise SpecError(f"{where}: {'.'.join(key)}: {named}: {error.strerror}") from None
+    if content is None:
+        raise SpecError(f"{where}: {'.'.join(key)}: {named}: there is no such file in {Path.cwd()}")
+    return {**document, "train": {**train, "hyperparameters": content}}
+
+
+def read(path: str) -> tuple[Any, Mapping[strict_yaml.Path, int]]:
+    """The document of a YAML file, and the line of each key path. Raises SpecError."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise SpecError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SpecError(f"{path}: not a text file (UTF-8)") from None
+    try:
+        return strict_yaml.load(text, aliases=True)
+    except strict_yaml.YamlError as error:
+        key = f"{error.key}: " if error.key else "not valid YAML: "
+        where = f"{path}:{error.line}" if error.line else path
+        raise SpecError(f"{where}: {key}{error}") from None

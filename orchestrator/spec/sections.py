@@ -1,0 +1,80 @@
+"""Sections of a job YAML shared by several kinds of jobs: nodes, resources, checkpoints, logs, retries, evaluation."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from orchestrator.spec.values import Memory, Section, Size
+from shared_store.log_files import LEAST_LIMIT, LIMIT
+
+Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
+
+
+class NodeRange(Section):
+    """Number of nodes: ``nodes: 3`` or ``nodes: {min: 2, max: 4}`` (start with as many as are free)."""
+
+    min: int = Field(ge=1, le=250)
+    max: int = Field(ge=1, le=250)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_number(cls, value: object) -> object:
+        if isinstance(value, dict):
+            return value
+        if isinstance(value, int) and not isinstance(value, bool):
+            return {"min": value, "max": value}
+        raise ValueError("expected a whole number of nodes, or {min: 2, max: 4}")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> NodeRange:
+        if self.min > self.max:
+            raise ValueError(f"min ({self.min}) is more than max ({self.max})")
+        return self
+
+
+class Resources(Section):
+    """Resources of each node."""
+
+    cpus: float = Field(default=1.0, gt=0, description="CPU cores; fractions are allowed")
+    gpus: int = Field(default=0, ge=0, description="GPUs; one rank process is started for each")
+    memory: Memory = Field(default=1024, ge=4, description="memory, such as 4GiB")
+
+
+class CheckpointPolicy(Section):
+    """When checkpoints are written, and how many are kept (always including the best one)."""
+
+    every: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
+        default=25, description="iterations; auto: as often as 1 % of the time allows"
+    )
+    keep: int = Field(default=5, ge=2)
+
+
+class Logs(Section):
+    """How much of each node's output is kept."""
+
+    limit: Annotated[Size, Field(ge=LEAST_LIMIT)] = Field(
+        default=LIMIT,
+        description="of each node in each attempt, at least 1MiB; of a longer log its beginning and its end are kept",
+    )
+
+
+class Retry(Section):
+    """Total number of attempts of a failing gang."""
+
+    attempts: int = Field(default=3, ge=1, le=10)
+
+
+class Evaluation(Section):
+    """Evaluate every few checkpoints of a training, each in a job of its own beside it."""
+
+    every: int = Field(ge=1, description="checkpoints from one evaluation to the next")
+    episodes: int = Field(default=100, ge=1, le=1_000_000)
+    worlds: int = Field(default=1024, ge=1, description="simulated worlds, at most one for each episode")
+    queue: str | None = Field(default=None, description="job queue; that of the training where absent")
+    share: Share | None = Field(default=None, description="share identifier in that queue")
+    resources: Resources | None = Field(
+        default=None, description="of the one node; where absent those of a node of the training, with at most one GPU"
+    )
+    retry: Retry = Field(default_factory=Retry)

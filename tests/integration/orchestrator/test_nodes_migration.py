@@ -1,0 +1,154 @@
+"""Databases whose attempts had their nodes as JSON (schema 0008), brought up to date: nothing is lost, and their jobs go on.
+
+``schema_0008.sql`` was written by the version that had that schema: its controller had run jobs into every state when it was
+killed. The row of job ``submitted`` is a copy of that of ``runnable``, and ``starting`` lacks the handle of its gang, as where the
+controller dies between the record of an attempt and its launch.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import create_engine, select, text
+
+from orchestrator.client import Client
+from orchestrator.domain.hosts import Placement
+from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.session import Database
+from orchestrator.server import Server
+from shared_store.epoch import Claim, take_epoch
+from shared_store.layout import Store
+from tests.support.orchestrator.databases import migrate
+from tests.support.orchestrator.jobs import await_status, detail
+
+DUMP = Path(__file__).parents[2] / "support" / "orchestrator" / "schema_0008.sql"
+BEFORE = {
+    "submitted": "SUBMITTED",
+    "pending": "PENDING",
+    "runnable": "RUNNABLE",
+    "starting": "STARTING",
+    "running": "RUNNING",
+    "done": "SUCCEEDED",
+    "failed": "FAILED",
+    "array": "SUCCEEDED",
+}
+"""State of each job in the dump."""
+
+
+@pytest.fixture
+def old(database_url: str) -> str:
+    """URL of the database of the dump."""
+    migrate(database_url, "upgrade", "0008")
+    engine = create_engine(database_url)
+    with engine.begin() as connection:
+        for line in DUMP.read_text().splitlines():
+            if line.startswith("INSERT"):
+                connection.exec_driver_sql(line)
+    engine.dispose()
+    return database_url
+
+
+def nodes_as_json(url: str) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """The nodes of each attempt of a database of schema 0008."""
+    engine = create_engine(url)
+    with engine.connect() as connection:
+        rows = connection.execute(text("SELECT job_id, number, CAST(nodes AS VARCHAR) FROM attempts")).all()
+    engine.dispose()
+    return {(job, number): json.loads(nodes) for job, number, nodes in rows}
+
+
+def test_every_node_is_a_row_that_says_what_the_json_said_and_back_again(old: str) -> None:
+    told = nodes_as_json(old)
+    database = Database(old)
+    with database.session() as session:
+        attempts = session.scalars(select(Attempt)).all()
+        assert {(each.job_id, each.number): [node.shown() for node in each.nodes] for each in attempts} == told
+        assert len(told) == 7 and sum(len(nodes) for nodes in told.values()) == 11
+        main = session.scalars(select(Job).where(Job.name == "failed")).one().attempts[0].nodes[0]
+        assert main.placement == Placement("localhost", (), 0.1, 16)
+        assert (main.exit_code, main.error, main.met) == (1, 'RuntimeError: it\'s "over"', True)
+        launched = session.scalars(select(Job).where(Job.name == "running")).one().attempts[0].nodes[1]
+        assert (launched.exit_code, launched.stopped_at, launched.address) == (None, None, "127.98.96.2")
+    database.close()
+    migrate(old, "downgrade", "0008")
+    assert nodes_as_json(old) == told
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        "[1]",
+        '[{"index": 0, "host": "h", "gpus": 1}]',
+        '[{"index": "x", "host": "h"}]',
+        "{}",
+        '[{"index": 0, "host": "h"}, {}]',
+    ],
+)
+def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old: str, damaged: str) -> None:
+    kept = [
+        {"index": 0, "host": "h", "gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"},
+        {"index": 1, "host": "h"},
+    ]
+    written = {1: json.dumps(kept), 2: damaged}
+    engine = create_engine(old)
+    with engine.begin() as connection:
+        which = "WHERE number = :number AND job_id = (SELECT id FROM jobs WHERE name = 'failed')"
+        for number, nodes in written.items():
+            connection.execute(text(f"UPDATE attempts SET nodes = :nodes {which}"), {"nodes": nodes, "number": number})
+    engine.dispose()
+    database = Database(old)
+    with database.session() as session:
+        first, second = session.scalars(select(Job).where(Job.name == "failed")).one().attempts
+        assert [node.placement for node in first.nodes] == [
+            Placement("h", ("GPU-a", "GPU-b"), 0.0, 0),
+            Placement("h", (), 0.0, 0),
+        ]
+        assert (first.nodes[0].devices, first.nodes[0].reason) == (("7",), "a\\x00b\\ud800")
+        assert first.nodes[1].devices is None
+        assert second.nodes == []
+    database.close()
+
+
+def test_jobs_in_every_state_go_on_where_the_older_controller_left_them(old: str, tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir(mode=0o700)
+    store = Store(tmp_path / "home" / "store").open()
+    before = nodes_as_json(old)
+    engine = create_engine(old)
+    with engine.connect() as connection:
+        jobs = dict(connection.execute(text("SELECT name, id FROM jobs WHERE parent IS NULL")).all())
+        assert dict(connection.execute(text("SELECT name, status FROM jobs WHERE parent IS NULL")).all()) == BEFORE
+    engine.dispose()
+    for name in ("starting", "running"):  # as the killed controller had made their runs
+        run = store.run(f"{name}-{jobs[name][:8]}")
+        run.create({"run": run.name, "queue": "default"})
+        take_epoch(run, 0, Claim("killed", jobs[name], 1))
+    server = Server(tmp_path / "home", port=0, cpus=2, database=old)
+    server.start()
+    try:
+        with Client(server.url) as client:
+            for name in ("submitted", "pending", "runnable", "starting", "running"):
+                ended = await_status(client, jobs[name], "SUCCEEDED", "FAILED")
+                assert ended["status"] == "SUCCEEDED", f"{name}: {ended['statusReason']}"
+            lost, again = detail(client, jobs["running"])["attempts"]
+            assert (lost["ending"], again["ending"]) == ("failed", "succeeded"), "its processes were gone"
+            assert [node["exitCode"] for node in again["nodes"]] == [0, 0]
+            [begun] = detail(client, jobs["starting"])["attempts"]
+            assert begun["ending"] == "succeeded", "the attempt that was recorded, launched now"
+            assert [each["status"] for each in (detail(client, jobs[n]) for n in ("done", "failed", "array"))] == [
+                "SUCCEEDED",
+                "FAILED",
+                "SUCCEEDED",
+            ]
+            [done] = detail(client, jobs["done"])["attempts"]
+            answered = [{key: value for key, value in node.items() if key != "log"} for node in done["nodes"]]
+            assert answered == [{**node, "progress": None, "running": False} for node in before[jobs["done"], 1]]
+    finally:
+        server.close()
+
+
+def test_a_text_that_no_column_can_hold_is_written_out() -> None:
+    assert Node(reason="a\0b").reason == "a\\x00b"
+    assert Node(error="\ud800 é").error == "\\ud800 é"

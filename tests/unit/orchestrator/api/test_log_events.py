@@ -1,0 +1,110 @@
+"""Positions and times in a growing log file, and filter patterns: without a server."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.api.logs import events as log_events
+from orchestrator.api.logs.events import LogFile, View
+from orchestrator.api.logs.filter import parse
+from shared_store.logs import format_line
+from tests.conftest import PATIENCE
+
+LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'said "hi" at 50%', "",
+         "Fehler: größer"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("pattern", "matching"),
+    [
+        ("", range(7)),
+        ("ERROR", [0, 1]),
+        ("error", []),
+        ("ERR", [0, 1]),
+        ("ERROR loader", [1]),
+        ("loader ERROR", [1]),
+        ('"ERROR in"', [1]),
+        ('"loader ERROR"', []),
+        ("ERROR -404", [1]),
+        ('-ERROR -"loss is" -"" ', []),
+        ("?nan ?404", [0, 2]),
+        ('ERROR ?trainer ?"loss is"', [0]),
+        (r'"\"hi\""', [4]),
+        ("50%", [4]),
+        ("größer", [6]),
+        (r"%\d{3}%", [0, 3]),
+        (r"%iteration \d+/\d+$%", [3]),
+        (r"%^in%", []),
+        (r"%^(ERROR)%", None),
+        (r"%^ERROR|nan$%", [0, 1, 2]),
+        (r"%[Ee]rr?or|[^a-z]rr%", []),
+        (r"%[A-Z]{5}% -%\d%", [1]),
+        (r"%lo+s{1,2} .*n%", [2]),
+        (r"%^$%", [5]),
+        (r"%x*%", range(7)),
+    ],
+)
+def test_filter_patterns(pattern: str, matching: Any) -> None:
+    if matching is None:
+        with pytest.raises(ValueError):
+            parse(pattern)
+    else:
+        matches = parse(pattern)
+        assert [i for i, line in enumerate(LINES) if matches(line)] == list(matching)
+
+
+def test_no_regex_can_stop_the_server() -> None:
+    matches = parse("%.*a*a*a*a*a*a*a*b.*c.*d%")  # Python's re needs longer than the universe has
+    began = time.monotonic()
+    assert not matches("a" * 20_000)
+    assert time.monotonic() - began < PATIENCE
+
+
+def test_a_poll_near_the_end_reads_only_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "node-0.log"
+    path.write_text("".join(format_line(1e9 + i / 100, 0, "o", f"line {i} {'x' * 80}") for i in range(100_000)))
+    file, read = LogFile(path, "s"), []
+    genuine = View._read
+
+    def counting(view: View, offset: int, size: int) -> bytes:
+        read.append(size)
+        return genuine(view, offset, size)
+
+    monkeypatch.setattr(View, "_read", counting)
+    view = file.look()
+    found = [event.text.split()[1] for event in view.forward(since=int(1e12) + 999_900)]
+    assert found == [str(i) for i in range(99_990, 100_000)]
+    assert sum(read) < 70_000 < view.end // 100
+
+
+def test_any_start_and_any_look_give_the_same_events(tmp_path: Path) -> None:
+    """Against the plain definition, on a file that grows, with torn lines, long ones and a clock that jumps."""
+    dice, path, clock = random.Random(7), tmp_path / "node-0.log", 1e9
+    file, written = LogFile(path, "s"), b""
+    for _ in range(60):
+        for _ in range(dice.randrange(80)):
+            clock += dice.choice([0.0, 0.0004, 0.01, 2.0, -1.5 if dice.random() < 0.1 else 0.0])
+            text = "t" * dice.choice([0, 3, 50, 200, 40_000 if dice.random() < 0.02 else 7])
+            line = format_line(clock, dice.choice([None, 0, 12]), "e", text)
+            written += dice.choice([b"torn\n", b"\n", b"\xff\x00 o \n"]) if dice.random() < 0.02 else line.encode()
+        path.write_bytes(written + b"2026-01-01T00:00:0")
+        file.look()
+    view, expected, offset, top = file.look(), [], 0, 0
+    for raw in written.splitlines(keepends=True):
+        if match := log_events._LINE.fullmatch(raw[:-1]):
+            top = max(top, log_events._milliseconds(match[1]))
+            expected.append((top, offset, offset + len(raw)))
+        offset += len(raw)
+    assert view.end == len(written) and view.top == top and len(view.marks) > 5
+    for _ in range(300):
+        since, start = dice.choice(expected)[0] + dice.randrange(-1, 2), dice.randrange(len(written) + 9)
+        fresh = dice.choice([view, LogFile(path, "s").look()])
+        found = [(e.time, e.offset, e.end) for e in fresh.forward(since, start)]
+        assert found == [e for e in expected if e[0] >= since and e[1] >= start]
+        back = [(e.time, e.offset, e.end) for e in fresh.backward(since, start)]
+        assert back == [e for e in expected if e[0] < since and e[1] < start][::-1]

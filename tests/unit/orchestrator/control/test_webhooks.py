@@ -1,0 +1,98 @@
+"""The file of webhooks, which jobs each is told of, and the signature."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.control.webhooks import PAUSES, Webhook, WebhooksError, kind_of, read_webhooks
+from orchestrator.persistence.models import Job
+from tests.support.orchestrator.receiver import SECRET, write_webhooks
+
+URL = "https://chat.example:8443/hooks/T0/secret"
+
+
+def test_a_message_is_signed_as_the_example_of_standard_webhooks() -> None:
+    webhook = Webhook(url=URL, secret=SECRET)
+    headers = webhook.headers("msg_p5jXN8AQM9LWM0D4loKWxJek", 1614265330, b'{"test": 2432232314}')
+    assert headers["webhook-signature"] == "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
+    assert headers["webhook-id"] == "msg_p5jXN8AQM9LWM0D4loKWxJek" and headers["webhook-timestamp"] == "1614265330"
+
+
+def test_the_tries_go_on_for_about_eleven_hours() -> None:
+    assert len(PAUSES) == 7 and 10.5 < sum(PAUSES) / 3600 < 11.5
+    assert all(later == 5 * earlier for earlier, later in itertools.pairwise(PAUSES))
+
+
+def test_the_file_names_receivers_whose_secrets_and_paths_are_not_shown(tmp_path: Path) -> None:
+    path = write_webhooks(tmp_path / "hooks.json", chat={"url": URL, "statuses": ["FAILED"]}, log={"url": URL})
+    chat, log = read_webhooks(path)
+    assert (chat.name, chat.receiver, chat.statuses) == ("chat", "https://chat.example:8443", ["FAILED"])
+    assert (log.statuses, log.queues, log.kinds) == (["SUCCEEDED", "FAILED"], None, None)
+    assert SECRET not in repr(chat) and read_webhooks(None) == ()
+
+
+SHORT = "whsec_c2hvcnQ="
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"url": "chat.example"}, "chat.url: expected a URL such as https://chat.example/hooks/muster"),
+        ({"url": "file:///etc/passwd"}, "chat.url: expected a URL such as https://chat.example/hooks/muster"),
+        ({"secret": SHORT}, "chat.secret: expected whsec_ and 24 to 64 random bytes in base64"),
+        ({"secret": SECRET.removeprefix("whsec_")}, "chat.secret: expected whsec_ and 24 to 64 random bytes"),
+        ({"secret": 7}, "chat.secret: expected a text"),
+        ({"secrt": "x"}, "chat.secrt: unknown key; valid here: url, secret, statuses, queues, kinds, link"),
+        ({"statuses": ["DONE"]}, "chat.statuses"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line_without_a_secret(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    path = write_webhooks(tmp_path / "hooks.json", chat={"url": URL, **changes})
+    with pytest.raises(WebhooksError) as caught:
+        read_webhooks(path)
+    told = str(caught.value)
+    assert words in told and told.startswith(f"{path}: ") and "\n" not in told
+    for secret in (SECRET, SHORT, SECRET.removeprefix("whsec_")):
+        assert secret not in told
+
+
+def test_a_file_that_is_none_or_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hooks.json"
+    with pytest.raises(WebhooksError, match=r"webhooks can't be read \(No such file or directory\)$"):
+        read_webhooks(str(path))
+    write_webhooks(path, chat={"url": URL})
+    path.chmod(0o644)
+    with pytest.raises(WebhooksError, match="others can read these secrets; chmod 600"):
+        read_webhooks(str(path))
+    path.chmod(0o600)
+    for text in ("{", "[]", "{}", '{"a b": {}}', '{"a": {"name": "b"}}'):
+        path.write_text(text)
+        with pytest.raises(WebhooksError, match=r"not JSON|expected a JSON object|is no name of a webhook"):
+            read_webhooks(str(path))
+
+
+def ended(status: str = "FAILED", queue: str = "robots", parent: str | None = None, spec: str = "") -> Job:
+    environment = [{"name": "MUSTER_SPEC", "value": spec}] if spec else []
+    ranges = [{"targetNodes": "0:", "container": {"environment": environment}}]
+    properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
+    return Job(id="j", name="n", queue=queue, status=status, parent=parent, node_properties=properties)
+
+
+def test_a_webhook_is_told_of_the_states_queues_and_kinds_that_it_names_and_of_arrays_as_a_whole() -> None:
+    webhook = Webhook(url=URL, secret=SECRET, statuses=["FAILED"], queues=["robots"], kinds=["train"])
+    train = json.dumps({"train": {"task": "Ant"}})
+    assert webhook.wants(ended(spec=train))
+    assert not webhook.wants(ended("SUCCEEDED", spec=train)) and not webhook.wants(ended(queue="lab", spec=train))
+    assert not webhook.wants(ended(spec=json.dumps({"evaluate": {"run": "x"}})))
+    everything = Webhook(url=URL, secret=SECRET)
+    assert everything.wants(ended("SUCCEEDED", "lab")) and not everything.wants(ended("RUNNING"))
+    assert not everything.wants(ended(parent="array"))
+
+
+def test_what_a_damaged_job_does_is_not_known() -> None:
+    assert kind_of(ended(spec="{")) == kind_of(Job(id="j", own_node_properties={})) == "command"

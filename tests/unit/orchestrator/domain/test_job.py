@@ -1,0 +1,142 @@
+"""States and their transitions, and what the ends of nodes mean for a job."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from orchestrator.domain.job import TRANSITIONS, Ending, NodeEnd, Status, check_transition, judge
+
+S = Status
+LEGAL = {
+    (S.SUBMITTED, S.PENDING),
+    (S.SUBMITTED, S.RUNNABLE),
+    (S.SUBMITTED, S.FAILED),
+    (S.PENDING, S.RUNNABLE),
+    (S.PENDING, S.SUCCEEDED),
+    (S.PENDING, S.FAILED),
+    (S.RUNNABLE, S.STARTING),
+    (S.RUNNABLE, S.FAILED),
+    (S.STARTING, S.RUNNING),
+    (S.STARTING, S.RUNNABLE),
+    (S.STARTING, S.SUCCEEDED),
+    (S.STARTING, S.FAILED),
+    (S.RUNNING, S.RUNNABLE),
+    (S.RUNNING, S.SUCCEEDED),
+    (S.RUNNING, S.FAILED),
+}
+
+
+def end(code: int, ended: float = 1.0) -> NodeEnd:
+    return NodeEnd(code, f"exit {code}", ended)
+
+
+def ends(*codes: tuple[int, float] | int | None) -> list[NodeEnd | None]:
+    """By node index; a code, a code and its time, or None for a node that runs."""
+    return [None if each is None else end(*each) if isinstance(each, tuple) else end(each) for each in codes]
+
+
+@pytest.mark.parametrize(("before", "after"), list(itertools.product(Status, Status)))
+def test_a_job_moves_as_on_aws_and_in_no_other_way(before: Status, after: Status) -> None:
+    if before == after or (before, after) in LEGAL:
+        check_transition(before, after)
+    else:
+        with pytest.raises(ValueError, match=f"^a job can't go from {before} to {after}$"):
+            check_transition(before, after)
+
+
+def test_a_job_that_is_over_stays_over_and_every_other_one_can_end() -> None:
+    for status in Status:
+        assert status.is_terminal == (not TRANSITIONS[status])
+        assert status.is_terminal or Status.FAILED in TRANSITIONS[status]
+    assert [status for status in Status if status.is_terminal] == [Status.SUCCEEDED, Status.FAILED]
+
+
+RUNS, DONE, FAILED, LEFT = None, 0, 1, 75
+GOES_ON = None
+
+# policy, index of the main node, how the nodes ended → ending, reason, exit code
+VERDICTS = [
+    # nothing has ended
+    ("restart", 0, (RUNS, RUNS), GOES_ON),
+    ("ignore", 0, (RUNS,), GOES_ON),
+    # the main node's end ends the job and decides
+    ("restart", 0, (DONE, RUNS), (Ending.SUCCEEDED, "Essential container in task exited", 0)),
+    ("ignore", 1, (RUNS, DONE), (Ending.SUCCEEDED, "Essential container in task exited", 0)),
+    ("fail", 0, (DONE, FAILED), (Ending.SUCCEEDED, "Essential container in task exited", 0)),
+    ("restart", 0, (LEFT, RUNS), (Ending.REQUEUE, "exit 75", 75)),
+    ("ignore", 0, (LEFT, LEFT), (Ending.REQUEUE, "exit 75", 75)),
+    ("restart", 0, (FAILED, RUNS), (Ending.FAILED, "main node: exit 1", 1)),
+    ("fail", 0, (FAILED, RUNS), (Ending.FAILED, "main node: exit 1", 1)),
+    ("ignore", 0, (FAILED, RUNS), (Ending.FAILED, "main node: exit 1", 1)),
+    ("restart", 1, (RUNS, (137, 2.0)), (Ending.FAILED, "main node: exit 137", 137)),
+    # children that end well end nothing
+    ("restart", 0, (RUNS, DONE), GOES_ON),
+    ("fail", 0, (RUNS, LEFT), GOES_ON),
+    # a child's failure is what the policy says
+    ("restart", 0, (RUNS, FAILED), (Ending.FAILED, "node 1: exit 1", 1)),
+    ("fail", 0, (RUNS, FAILED), (Ending.FATAL, "node 1: exit 1", 1)),
+    ("ignore", 0, (RUNS, FAILED), GOES_ON),
+    ("ignore", 0, (RUNS, FAILED, 137), GOES_ON),
+    ("restart", 2, (FAILED, RUNS, RUNS), (Ending.FAILED, "node 0: exit 1", 1)),
+    # of several failures the first by time is the cause, whoever's it is
+    ("restart", 0, ((1, 5.0), (137, 4.0)), (Ending.FAILED, "node 1: exit 137", 137)),
+    ("restart", 0, ((1, 4.0), (137, 5.0)), (Ending.FAILED, "main node: exit 1", 1)),
+    ("fail", 0, ((1, 5.0), (137, 4.0)), (Ending.FATAL, "node 1: exit 137", 137)),
+    ("fail", 0, ((1, 4.0), (137, 5.0)), (Ending.FAILED, "main node: exit 1", 1)),
+    ("ignore", 0, ((1, 5.0), (137, 4.0)), (Ending.FAILED, "main node: exit 1", 1)),
+    ("restart", 0, (RUNS, (2, 9.0), (3, 8.0), (0, 1.0)), (Ending.FAILED, "node 2: exit 3", 3)),
+    ("restart", 0, (RUNS, (2, 8.0), (3, 8.0)), (Ending.FAILED, "node 1: exit 2", 2)),
+]
+
+
+@pytest.mark.parametrize(("policy", "main", "codes", "expected"), VERDICTS)
+def test_the_ends_of_nodes_are_judged(
+    policy: str,
+    main: int,
+    codes: tuple[tuple[int, float] | int | None, ...],
+    expected: tuple[Ending, str, int] | None,
+) -> None:
+    verdict = judge(policy, main, ends(*codes))
+    assert (verdict and (verdict.ending, verdict.reason, verdict.exit_code)) == expected
+
+
+ASKED = [
+    # what was told to end is the cause only where nothing else is, in any order of reading, and whatever the clocks say
+    ((RUNS, (143, 1.0, True)), "node 1: exit 143", False),
+    ((RUNS, (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
+    ((RUNS, (137, 2.0), (143, 1.0, True)), "node 1: exit 137", True),
+    (((143, 1.0, True), (137, 2.0), (143, 0.5, True)), "node 1: exit 137", True),
+    (((1, 3.0), (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
+    (((143, 1.0, True), RUNS, RUNS), "main node: exit 143", False),
+    (((143, 2.0, True), (143, 1.0, True), RUNS), "node 1: exit 143", False),
+    (((143, 2.0, True), (143, 1.0, True)), "node 1: exit 143", True),
+    (((143, 2.0, True), DONE), "main node: exit 143", True),
+]
+
+
+@pytest.mark.parametrize(("codes", "reason", "certain"), ASKED)
+def test_a_node_that_was_told_to_end_is_not_the_cause(
+    codes: tuple[tuple[int, float, bool] | tuple[int, float] | int | None, ...], reason: str, certain: bool
+) -> None:
+    found = [
+        NodeEnd(each[0], f"exit {each[0]}", each[1], asked=True) if isinstance(each, tuple) and len(each) > 2 else plain
+        for each, plain in zip(
+            codes, ends(*(each[:2] if isinstance(each, tuple) else each for each in codes)), strict=True
+        )
+    ]
+    verdict = judge("restart", 0, found)
+    assert verdict
+    assert (verdict.reason, verdict.certain) == (reason, certain)
+
+
+def test_on_aws_only_the_main_node_matters() -> None:
+    for main_code, *child_codes in itertools.product((None, 0, 1, 75), repeat=3):
+        alone = judge("ignore", 0, ends(main_code))
+        assert judge("ignore", 0, ends(main_code, *child_codes)) == alone
+
+
+def test_a_gang_never_goes_on_without_its_main_node() -> None:
+    for policy, main_code, child in itertools.product(("restart", "fail", "ignore"), (0, 1, 75, 137), (None, 0, 1, 75)):
+        assert judge(policy, 0, ends(main_code, child)) is not None

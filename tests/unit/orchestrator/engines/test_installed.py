@@ -1,0 +1,96 @@
+"""Engines by entry points, and the options that each declares."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from orchestrator.engines import installed
+from orchestrator.engines.api import EngineError, EngineType, Option
+from orchestrator.engines.installed import ENGINES, check_tags, engine_type
+
+DOCUMENTATION = Path(__file__).parents[4] / "docs"
+
+
+def test_muster_s_own_engines_are_entry_points_in_their_usual_order() -> None:
+    assert ENGINES[:5] == ("local", "docker", "ray", "slurm", "aws-batch")
+    assert all(isinstance(engine_type(name), EngineType) for name in ENGINES)
+
+
+def test_an_engine_that_is_not_installed_is_refused_with_those_that_are() -> None:
+    with pytest.raises(EngineError, match="there is no engine 'kubernetes'; there are local, docker, ray, slurm, aws-"):
+        engine_type("kubernetes")
+
+
+@pytest.mark.parametrize(
+    ("value", "why"),
+    [
+        ("nowhere_at_all:ENGINE", "engine odd: nowhere_at_all:ENGINE can't be imported: No module named"),
+        ("orchestrator.engines.local:NONE", "engine odd: .* can't be imported: .*NONE"),
+        ("orchestrator.engines.api:Option", "engine odd: orchestrator.engines.api:Option is no EngineType"),
+    ],
+)
+def test_an_entry_point_that_leads_to_no_engine_is_named(value: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    point = installed.EntryPoint("odd", value, installed.GROUP)
+    monkeypatch.setitem(installed._POINTS, "odd", point)  # type: ignore[arg-type]
+    with pytest.raises(EngineError, match=why):
+        engine_type("odd")
+
+
+@pytest.mark.parametrize(
+    ("tags", "engines", "of_a_queue"),
+    [
+        ({"muster:partition": "gpu", "muster:nice": "-5", "owner": "any"}, ["slurm"], False),
+        ({"muster:engine": "ray", "muster:hosts": "ray/a,ray/b", "muster:images": "refuse"}, ["ray"], False),
+        ({"muster:images": "refuse"}, ["local"], True),
+        ({"muster:share": "alice", "muster:qos": "low"}, ["slurm", "aws-batch"], True),
+        ({"mustard:partiton": "any"}, ["slurm"], True),
+    ],
+)
+def test_options_of_the_engines_are_tags(tags: dict[str, str], engines: list[str], of_a_queue: bool) -> None:
+    check_tags(tags, engines, of_a_queue=of_a_queue)
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "engine", "of_a_queue", "why"),
+    [
+        (
+            *("muster:partiton", "gpu", "slurm", False),
+            "tag muster:partiton: a compute environment of the slurm engine has no such option; did you mean partition?",
+        ),
+        (
+            *("muster:job-que", "night", "aws-batch", True),
+            "tag muster:job-que: a queue of the aws-batch engine has no such option; did you mean job-queue?",
+        ),
+        (
+            *("muster:gpu", "a100", "local", True),
+            "tag muster:gpu: a queue of the local engine has no such option; there are images",
+        ),
+        (
+            *("muster:nice", "much", "slurm", True),
+            "tag muster:nice is 'much', not a whole number; it is sbatch's --nice of a job without priority",
+        ),
+        (*("muster:account", " ", "slurm", True), "tag muster:account is empty; it is an account"),
+        (*("muster:images", "refused", "local", False), "tag muster:images is 'refused'; did you mean refuse?"),
+    ],
+)
+def test_a_tag_that_is_misspelt_or_of_a_wrong_kind_is_refused_with_the_nearest_name(
+    tag: str, value: str, engine: str, of_a_queue: bool, why: str
+) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(why)}$"):
+        check_tags({tag: value}, [engine], of_a_queue=of_a_queue)
+
+
+@pytest.mark.parametrize("name", ["slurm", "aws-batch"])
+def test_every_option_is_in_the_documentation_of_its_engine(name: str) -> None:
+    page = (DOCUMENTATION / "engines" / f"{name}.md").read_text()
+    assert {option.name for option in engine_type(name).options} == set(
+        re.findall(r"^\| `muster:([a-z-]+)`", page, re.M)
+    )
+
+
+@pytest.mark.parametrize("value", ["5", "-5", "0"])
+def test_a_whole_number_may_be_negative(value: str) -> None:
+    Option("nice", "a number", int).check(value)

@@ -1,0 +1,188 @@
+"""Phases and causes of nodes: what each engine makes of its own states, and what the controller makes of a cause."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from orchestrator.control.endings import seen_end
+from orchestrator.engines.api import Cause, NodePhase, NodeStatus
+from orchestrator.engines.ray.engine import _status as ray_status
+from orchestrator.engines.slurm.commands import SlurmJob
+from orchestrator.engines.slurm.engine import _node as slurm_node
+from orchestrator.engines.slurm.engine import _queued as slurm_queued
+from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
+from shared_store.outcomes import Outcome
+
+ENDED, QUEUED, RUNNING, STARTING = NodePhase.ENDED, NodePhase.QUEUED, NodePhase.RUNNING, NodePhase.STARTING
+MEETING = "muster: meeting " + json.dumps({"addresses": ["10.0.0.1", "10.0.0.2"]}) + "\n"
+
+
+@pytest.mark.parametrize("phase", [QUEUED, STARTING, NodePhase.UNREACHABLE])
+def test_a_node_that_does_not_run_says_why(phase: NodePhase) -> None:
+    with pytest.raises(ValueError, match=f"a node that is {phase} says why"):
+        NodeStatus(phase)
+
+
+@pytest.mark.parametrize("fields", [{"cause": Cause.EXIT}, {"exit_code": 0}])
+def test_a_node_that_runs_has_no_end(fields: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="a node that is running has no cause and no exit code"):
+        NodeStatus(RUNNING, **fields)
+
+
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        (0, Cause.EXIT),
+        (75, Cause.EXIT),
+        (128, Cause.EXIT),
+        (137, Cause.SIGNAL),
+        (143, Cause.SIGNAL),
+        (None, Cause.HOST_LOST),
+    ],
+)
+def test_an_exit_code_says_what_ended_a_process_of_the_local_engine(code: int | None, cause: Cause) -> None:
+    node = ended("127.64.0.1", code, "words")
+    assert (node.phase, node.cause, node.exit_code, node.words) == (ENDED, cause, code, "words")
+
+
+@pytest.mark.parametrize(
+    ("state", "cause", "words"),
+    [
+        ({"ExitCode": 0}, Cause.EXIT, ""),
+        ({"ExitCode": 3, "Error": ""}, Cause.EXIT, ""),
+        ({"ExitCode": 127, "Error": "no such file"}, Cause.EXIT, "no such file"),
+        ({"ExitCode": 137, "OOMKilled": False}, Cause.SIGNAL, ""),
+        ({"ExitCode": 137, "OOMKilled": True}, Cause.OUT_OF_MEMORY, OUT_OF_MEMORY),
+    ],
+)
+def test_docker_s_state_of_a_container_says_what_ended_it(state: dict[str, Any], cause: Cause, words: str) -> None:
+    pytest.importorskip("docker")
+    from orchestrator.engines.docker.engine import _ended
+
+    node = _ended(state, "10.192.0.2")
+    assert (node.phase, node.cause, node.exit_code, node.words) == (ENDED, cause, state["ExitCode"], words)
+
+
+@pytest.mark.parametrize(
+    ("node", "phase", "why", "seen"),
+    [
+        ({"started": False}, "joining", "joining the Ray cluster", (STARTING, None, "joining the Ray cluster")),
+        ({"started": False}, "placing", "waits for room", (QUEUED, None, "waits for room")),
+        ({"started": False}, "running", "", (RUNNING, None, "")),
+        ({"started": True}, "running", "", (RUNNING, None, "")),
+        ({"started": True}, "stopping", "node 1: SIGKILL does not end it", (RUNNING, None, "")),
+        ({"running": False, "code": 0}, "running", "", (ENDED, Cause.EXIT, "")),
+        ({"running": False, "code": 143}, "running", "", (ENDED, Cause.SIGNAL, "")),
+        ({"running": False}, "running", "", (ENDED, Cause.HOST_LOST, "")),
+        ({"running": False, "detail": "early", "cause": "stopped"}, "stopped", "", (ENDED, Cause.STOPPED, "early")),
+    ],
+)
+def test_what_ray_s_driver_says_of_a_node_is_its_phase(
+    node: dict[str, Any], phase: str, why: str, seen: tuple[Any, ...]
+) -> None:
+    told = {"running": True, "address": "10.0.0.1", "code": None, "detail": "", "started": True, "gpus": "0,1", **node}
+    status = ray_status(told, {"phase": phase, "why": why}, True)
+    assert (status.phase, status.cause, status.words) == seen and status.gpus == ("0", "1")
+
+
+def test_a_node_whose_ray_driver_died_has_vanished() -> None:
+    told = {"running": True, "address": "", "code": None, "detail": "", "started": True}
+    assert ray_status(told, {"phase": "running", "why": ""}, False).cause is Cause.HOST_LOST
+
+
+def job(state: str, reason: str = "None") -> SlurmJob:
+    return SlurmJob("5", state, reason, "n1", "job/1/1")
+
+
+@pytest.mark.parametrize(("state", "phase"), [("PENDING", QUEUED), ("REQUEUED", QUEUED), ("CONFIGURING", STARTING)])
+def test_a_job_in_slurm_s_queue_is_queued_until_its_nodes_are_made_ready(state: str, phase: NodePhase) -> None:
+    status = slurm_queued(job(state), "slurmctld does not answer")
+    assert (status.phase, status.stale) == (phase, "slurmctld does not answer") and status.words.startswith("Slurm: ")
+
+
+@pytest.mark.parametrize(
+    ("found", "output", "seen"),
+    [
+        (job("RUNNING"), "", (STARTING, None, None)),
+        (job("RUNNING"), MEETING, (RUNNING, None, None)),
+        (job("COMPLETING"), MEETING, (RUNNING, None, None)),
+        (job("FAILED"), "srun: error: n1: task 0: Exited with exit code 3", (ENDED, Cause.EXIT, 3)),
+        (job("FAILED"), "srun: error: n1: task 0: Killed", (ENDED, Cause.SIGNAL, 137)),
+        (job("FAILED"), "srun: error: n1: tasks 0-1: Out Of Memory", (ENDED, Cause.OUT_OF_MEMORY, 137)),
+        (job("PREEMPTED"), MEETING, (ENDED, Cause.PREEMPTED, 75)),
+        (job("NODE_FAIL"), MEETING, (ENDED, Cause.HOST_LOST, 137)),
+        (job("BOOT_FAIL"), MEETING, (ENDED, Cause.HOST_LOST, 137)),
+        (job("CANCELLED"), MEETING, (ENDED, Cause.STOPPED, 137)),
+        (job("TIMEOUT"), MEETING, (ENDED, Cause.STOPPED, 137)),
+        (job("OUT_OF_MEMORY"), MEETING, (ENDED, Cause.OUT_OF_MEMORY, 137)),
+        (None, MEETING, (ENDED, None, None)),
+    ],
+)
+def test_slurm_s_job_and_what_srun_says_are_a_node_s_phase(
+    found: SlurmJob | None, output: str, seen: tuple[Any, ...]
+) -> None:
+    node = slurm_node({"main": 0, "output": "/store/slurm.out"}, found, output, 0, None)
+    assert (node.phase, node.cause, node.exit_code) == seen
+
+
+def test_on_slurm_an_outcome_says_more_than_the_job() -> None:
+    outcome = Outcome(0, 1, 75, None, "left on request", None, 1.0, 1.0)
+    node = slurm_node({"main": 0, "output": ""}, job("CANCELLED"), MEETING, 0, outcome)
+    assert (node.phase, node.cause, node.exit_code, node.address) == (ENDED, Cause.EXIT, 75, "10.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("code", "reason", "cause"),
+    [
+        (0, "", Cause.EXIT),
+        (3, "Essential container in task exited", Cause.EXIT),
+        (143, "", Cause.SIGNAL),
+        (137, OUT_OF_MEMORY, Cause.OUT_OF_MEMORY),
+        (None, "Host EC2 (instance i-1) terminated.", Cause.HOST_LOST),
+        (None, "", Cause.HOST_LOST),
+        (None, "CannotPullContainerError: no such image", None),
+    ],
+)
+def test_aws_s_exit_code_and_reason_say_what_ended_a_node(code: int | None, reason: str, cause: Cause | None) -> None:
+    pytest.importorskip("boto3")
+    from orchestrator.engines.aws_batch.engine import _ended
+
+    node = _ended("10.0.0.1", code, reason)
+    assert (node.phase, node.cause, node.exit_code, node.words) == (ENDED, cause, code, reason)
+
+
+@pytest.mark.parametrize(("status", "phase"), [("RUNNABLE", QUEUED), ("SUBMITTED", QUEUED), ("STARTING", STARTING)])
+def test_a_node_that_aws_has_not_started_is_queued_until_it_has_an_instance(status: str, phase: NodePhase) -> None:
+    pytest.importorskip("boto3")
+    from orchestrator.engines.aws_batch.engine import _waits
+
+    assert _waits(status, "", "AWS Batch gets 2 instances") == NodeStatus(phase, words="AWS Batch gets 2 instances")
+
+
+@pytest.mark.parametrize(
+    ("cause", "code", "lost"),
+    [
+        (Cause.EXIT, 3, False),
+        (Cause.OUT_OF_MEMORY, 137, False),
+        (Cause.STOPPED, 137, False),
+        (None, None, False),
+        (Cause.SIGNAL, 137, True),
+        (Cause.HOST_LOST, None, True),
+        (Cause.PREEMPTED, 75, True),
+    ],
+)
+def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
+    cause: Cause | None, code: int | None, lost: bool
+) -> None:
+    for words in ("", "what the engine says"):
+        end = seen_end(NodeStatus(ENDED, "", words, cause, code), True, 5.0)
+        assert (end.lost, end.exit_code, end.ended) == (lost, code or 137, 5.0)
+        assert end.reason == (words or "the supervisor died without an outcome")
+
+
+def test_a_job_of_the_batch_api_that_is_preempted_has_lost_its_host() -> None:
+    end = seen_end(NodeStatus(ENDED, "", "preempted by Slurm", Cause.PREEMPTED, 75), False, 5.0)
+    assert (end.lost, end.exit_code) == (True, 137)

@@ -1,0 +1,103 @@
+"""Where the secrets of jobs come from, and what is said where they can't be given."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.engines.secrets import Secrets, SecretsError
+
+MANAGER = "arn:aws:secretsmanager:us-east-1:123456789012:secret:"
+
+
+def asking(value_from: str) -> dict[str, Any]:
+    return {"secrets": [{"name": "PASSWORD", "valueFrom": value_from}]}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "secrets.json"
+    path.touch(0o600)
+    path.write_text(
+        json.dumps({"db": "hunter2", "token": "abc", "login": {"user": "me", "key": 7}, "text": '{"a": "b"}'})
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("value_from", "value"),
+    [
+        ("db", "hunter2"),
+        (f"{MANAGER}db-AbCdEf", "hunter2"),
+        (f"{MANAGER}db", "hunter2"),
+        ("arn:aws:ssm:us-east-1:123456789012:parameter/prod/token", "abc"),
+        (f"{MANAGER}login-AbCdEf:key::", "7"),
+        (f"{MANAGER}text-AbCdEf:a::", "b"),
+        ("login", '{"user": "me", "key": 7}'),
+    ],
+)
+def test_a_secret_is_found_by_its_reference_or_by_the_name_in_it(file: Path, value_from: str, value: str) -> None:
+    assert Secrets(str(file)).of(asking(value_from), "default") == {"PASSWORD": value}
+
+
+def test_a_secret_of_some_queues_is_given_to_their_jobs_alone(file: Path) -> None:
+    kept = {"value": {"key": "abc"}, "queues": ["robots"]}
+    file.write_text(json.dumps({"token": kept, "broken": {"value": "abc", "queues": "robots"}}))
+    secrets = Secrets(str(file))
+    assert secrets.of(asking(f"{MANAGER}token:key::"), "robots") == {"PASSWORD": "abc"}
+    for name, queue in (("token", "lab"), ("token", "robot"), ("broken", "robots")):
+        with pytest.raises(SecretsError, match=f"'{name}' is not for job queue {queue}; add the queue in") as caught:
+            secrets.check([asking(name)], queue)
+        assert "abc" not in str(caught.value)
+
+
+def test_a_file_is_read_anew_for_every_launch(file: Path) -> None:
+    secrets = Secrets(str(file))
+    file.write_text('{"db": "rotated"}')
+    assert secrets.of(asking("db"), "default") == {"PASSWORD": "rotated"}
+
+
+def test_variables_leave_the_controllers_environment() -> None:
+    environment = {"MUSTER_SECRET_prod_db": "hunter2", "PATH": "/bin"}
+    secrets = Secrets("env", environment)
+    assert environment == {"PATH": "/bin"}, "or every node would inherit them"
+    assert secrets.of(asking("arn:aws:ssm:us-east-1:123456789012:parameter/prod/db"), "default") == {
+        "PASSWORD": "hunter2"
+    }
+    assert secrets.of(asking("prod/db"), "default") == {"PASSWORD": "hunter2"}
+
+
+@pytest.mark.parametrize(
+    ("value_from", "message"),
+    [
+        ("other", "'other' is not in"),
+        (f"{MANAGER}login:nope::", "has no key 'nope'"),
+        (f"{MANAGER}db:a::", "has no key 'a'"),
+    ],
+)
+def test_what_is_missing_is_named_without_a_value(file: Path, value_from: str, message: str) -> None:
+    with pytest.raises(SecretsError) as caught:
+        Secrets(str(file)).of(asking(value_from), "default")
+    assert message in str(caught.value) and "hunter2" not in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_controller_gives_no_secrets_unless_it_was_told_to(file: Path) -> None:
+    assert Secrets().of({"secrets": []}, "default") == {}
+    with pytest.raises(SecretsError, match="muster serve --secrets"):
+        Secrets().of(asking("db"), "default")
+    environment = {"MUSTER_SECRET_db": "hunter2", "HOME": "/"}
+    Secrets(str(file), environment)
+    assert environment == {"HOME": "/"}, "a process of a job would inherit it"
+    file.chmod(0o640)
+    with pytest.raises(SecretsError, match="chmod 600"):
+        Secrets(str(file))
+    with pytest.raises(SecretsError, match="No such file"):
+        Secrets(str(file.parent / "none"))
+    for text, message in (("[]", "expected a JSON object"), ("{", "not JSON")):
+        file.write_text(text)
+        file.chmod(0o600)
+        with pytest.raises(SecretsError, match=message):
+            Secrets(str(file))

@@ -1,0 +1,237 @@
+"""On which hosts a gang fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orchestrator.domain.gang import Shape
+from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.resources import Resources
+from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.fit import fit
+from orchestrator.scheduling.placement import never_fits, place
+from tests.support.orchestrator.scheduling import compute_environment, gang, host, job, node, queue, reason, snapshot
+
+
+def where(shape: Shape, *hosts: Host) -> str | None:
+    """The host of each node by index."""
+    placements = place(shape, hosts)
+    return " ".join(placement.host for placement in placements) if placements else None
+
+
+def test_hosts_are_filled_one_after_the_other() -> None:
+    assert where(gang(*[node(2)] * 3), host("a", 4), host("b", 2)) == "a a b"
+
+
+def test_every_node_gets_gpus_of_its_own() -> None:
+    assert place(gang(node(1, 2), node(1, 1)), [host("a", 4, 3)]) == (
+        Placement("a", ("a0", "a1"), 1, 100),
+        Placement("a", ("a2",), 1, 100),
+    )
+
+
+def test_fractions_of_a_cpu_add_up() -> None:
+    assert where(gang(*[node(0.1)] * 10), host(cpus=1)) == " ".join("a" * 10)
+    assert where(gang(*[node(0.1)] * 10), host(cpus=1 - 1e-12)) is not None
+    assert where(gang(*[node(0.1)] * 11), host(cpus=1)) is None
+
+
+@pytest.mark.parametrize(("cpus", "expected"), [(8, "a a a a"), (3.5, "a a a"), (2, "a a"), (1.9, None)])
+def test_an_elastic_gang_takes_as_many_nodes_as_fit(cpus: float, expected: str | None) -> None:
+    assert where(gang(*[node(1)] * 4, minimum=2), host(cpus=cpus)) == expected
+
+
+def test_an_elastic_gang_of_unlike_nodes_drops_the_last_ones() -> None:
+    shape = gang(node(1, 1), node(1), node(4), minimum=1)
+    assert where(shape, host("a", 8, 1)) == "a a a"
+    assert where(shape, host("a", 5, 1)) == "a a"
+    assert where(shape, host("a", 1, 1)) == "a"
+    assert where(shape, host("a", 8, 0)) is None
+
+
+def test_no_more_nodes_than_asked_for() -> None:
+    placements = place(gang(*[node(1)] * 4, minimum=2), [host(cpus=8)], 3)
+    assert placements is not None and len(placements) == 3
+    assert place(gang(*[node(1)] * 4, minimum=2), [host(cpus=8)], 1) is None
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_unlike_nodes_fit_on_unlike_hosts_in_whatever_order_they_come(order: tuple[int, int]) -> None:
+    nodes = [node(2), node(4)]
+    shape = gang(*(nodes[i] for i in order))
+    hosts = [host("large", 4), host("small", 2)]
+    assert never_fits(shape, hosts) is None
+    assert where(shape, *hosts) == " ".join(("small", "large")[i] for i in order)
+
+
+def test_nodes_without_gpus_leave_those_with_gpus_their_host() -> None:
+    assert where(gang(node(4), node(1, 1)), host("gpu", 4, gpus=1), host("cpu", 4)) == "cpu gpu"
+
+
+def test_a_node_with_gpus_leaves_the_only_host_with_enough_cpus_to_the_other() -> None:
+    # filling hosts as they come would put the first node on the wide host, on which alone the second one fits
+    assert where(gang(node(4, 1), node(8)), host("wide", 8, gpus=1), host("narrow", 4, gpus=1)) == "narrow wide"
+
+
+def test_memory_counts() -> None:
+    assert where(gang(*[node(1, 0, 5000)] * 2), host("a"), host("b")) == "a b"
+    assert where(gang(*[node(1, 0, 5000)] * 3), host("a"), host("b")) is None
+
+
+def test_a_node_that_takes_nothing_fits_anywhere() -> None:
+    assert where(gang(*[Resources(0, 0, 0)] * 3), host(cpus=0, memory=0)) == "a a a"
+
+
+def test_why_a_gang_never_fits_is_told_of_the_nodes_that_it_can_not_do_without() -> None:
+    shape = gang(node(1), node(99), node(1), minimum=1)
+    assert never_fits(shape, [host()]) is None
+    assert never_fits(shape, [host(cpus=0.5)]) == (
+        "each node needs 1 CPU, 0 GPUs, 100 MiB; the largest host has 0.5 CPUs, 0 GPUs, 8 GiB"
+    )
+
+
+def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Host:
+    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, away=away)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "minimum", "why"),
+    [
+        ([node(0.5)] * 3, 3, "needs 3 hosts, one for each node; there are 2"),
+        ([node(0.5)] * 4, 3, "needs at least 3 hosts, one for each node; there are 2"),
+        (
+            [node(1, 1)] * 2,
+            2,
+            "needs 2 hosts with 1 CPU, 1 GPU, 100 MiB, one for each node; there is 1",
+        ),
+    ],
+)
+def test_too_few_hosts_that_take_a_node_each_are_counted_in_hosts(
+    nodes: list[Resources], minimum: int, why: str
+) -> None:
+    hosts = [single("a"), single("b", gpus=1)]
+    shape = gang(*nodes, minimum=minimum)
+    assert never_fits(shape, hosts) == why
+    assert never_fits(shape, hosts, elastic=True) is None, "more may come"
+
+
+def test_where_hosts_come_and_go_only_a_node_that_is_larger_than_any_is_refused() -> None:
+    assert never_fits(gang(node(8)), [], elastic=True) is None, "nobody knows what will come"
+    assert never_fits(gang(node(8)), [single("a")], elastic=True) == (
+        "each node needs 8 CPUs, 0 GPUs, 100 MiB; the largest host has 4 CPUs, 0 GPUs, 8 GiB"
+    )
+
+
+def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:
+    hosts = [single("a", away=True), single("b"), single("c")]
+    assert where(gang(*[node()] * 2), *hosts) == "b c"
+    assert where(gang(*[node()] * 3, minimum=2), *hosts) == "b c", "fewer nodes start now"
+    assert where(gang(*[node()] * 3), *hosts) == "b c a"
+    assert never_fits(gang(*[node()] * 3), hosts) is None
+    assert where(gang(*[node()] * 4), *hosts) is None
+
+
+nodes = st.builds(node, st.sampled_from([0.5, 1, 2, 3, 5]), st.integers(0, 3), st.sampled_from([100, 500, 2000]))
+hosts_strategy = st.lists(
+    st.tuples(st.sampled_from([0, 1, 2.5, 4, 8]), st.integers(0, 4), st.sampled_from([50, 1000, 4000])), max_size=4
+).map(lambda each: [host(f"h{i}", cpus, gpus, memory) for i, (cpus, gpus, memory) in enumerate(each)])
+
+
+@settings(max_examples=100, deadline=None)
+@given(hosts_strategy, nodes, st.integers(1, 6))
+def test_a_gang_of_equal_nodes_fits_exactly_where_it_can(hosts: list[Host], each: Resources, count: int) -> None:
+    room = sum(
+        min(
+            int((h.cpus + 1e-9) // each.cpus),
+            len(h.gpus) // each.gpus if each.gpus else count,
+            h.memory // each.memory,
+        )
+        for h in hosts
+    )
+    assert (place(gang(*[each] * count), hosts) is not None) == (room >= count)
+
+
+@settings(max_examples=100, deadline=None)
+@given(hosts_strategy, st.lists(nodes, min_size=1, max_size=5), st.data())
+def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
+    hosts: list[Host], members: list[Resources], data: st.DataObject
+) -> None:
+    minimum = data.draw(st.integers(1, len(members)))
+    placements = place(gang(*members, minimum=minimum), hosts)
+    if placements is None:
+        assert never_fits(gang(*members, minimum=minimum), hosts)
+        return
+    assert minimum <= len(placements) <= len(members)
+    for placement, wanted in zip(placements, members, strict=False):
+        assert placement.resources == wanted
+    for each in hosts:
+        here = [placement for placement in placements if placement.host == each.name]
+        assert sum(placement.cpus for placement in here) <= each.cpus + 1e-6
+        assert sum(placement.memory for placement in here) <= each.memory
+        gpus = [gpu for placement in here for gpu in placement.gpus]
+        assert len(gpus) == len(set(gpus)) and set(gpus) <= set(each.gpus)
+
+
+def test_one_machine_that_two_engines_serve_is_placed_on_once() -> None:
+    twice = [replace(host("localhost"), machine="pc"), replace(host("docker/pc"), machine="pc")]
+    found = fit(gang(node(3), node(3)), queue(compute_environments=("all",)), {"all": compute_environment()}, twice)
+    assert found.allocation is None and found.problem is not None and "all hosts together have 4 CPUs" in found.problem
+
+
+def test_what_has_hosts_still_to_come_is_no_problem_and_has_no_place_yet() -> None:
+    found = fit(
+        gang(*[node(3)] * 3),
+        queue(compute_environments=("all",)),
+        {"all": compute_environment()},
+        [host()],
+        elastic=["all"],
+    )
+    assert (found.allocation, found.problem) == (None, None)
+
+
+def test_a_compute_environment_that_is_disabled_is_used_where_no_other_would_do() -> None:
+    compute_environments = {
+        "off": compute_environment("off", enabled=False),
+        "on": compute_environment("on", hosts=("a",)),
+    }
+    both = queue(compute_environments=("off", "on"))
+    small = fit(gang(node(2)), both, compute_environments, [host("a", 2), host("b", 8)]).allocation
+    large = fit(gang(node(6)), both, compute_environments, [host("a", 2), host("b", 8)]).allocation
+    assert (
+        small is not None
+        and large is not None
+        and (small.compute_environment, large.compute_environment) == ("on", "off")
+    )
+
+
+machines = st.sampled_from(["", "m1", "m2"])
+pools_strategy = st.lists(
+    st.tuples(st.none() | st.sets(st.sampled_from(["h0", "h1", "h2"])), st.none() | st.sampled_from([0, 1, 4])),
+    min_size=1,
+    max_size=3,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(hosts_strategy, st.lists(machines, min_size=4, max_size=4), pools_strategy, nodes, st.integers(1, 4), st.data())
+def test_a_gang_alone_starts_exactly_where_it_is_said_to_fit(
+    hosts: list[Host], on: list[str], compute_environments: list, each: Resources, count: int, data: st.DataObject
+) -> None:
+    hosts = [replace(host, machine=machine) for host, machine in zip(hosts, on, strict=False)]
+    known = [
+        compute_environment(f"p{i}", None if names is None else tuple(sorted(names)), max_cpus=most)
+        for i, (names, most) in enumerate(compute_environments)
+    ]
+    shape = gang(*[each] * count, minimum=data.draw(st.integers(1, count)))
+    ordered = queue(compute_environments=tuple(each.name for each in known))
+    found = fit(shape, ordered, {each.name: each for each in known}, hosts)
+    decided = decide(snapshot(hosts, [job("a", shape)], queues=[ordered], compute_environments=known))
+    assert [(start.compute_environment, start.placements) for start in decided.starts] == (
+        [tuple(found.allocation)] if found.allocation else []
+    )
+    if found.allocation is None:
+        assert found.problem is not None and reason(decided, "a").endswith(found.problem)

@@ -1,0 +1,97 @@
+"""Which checkpoints of a training are due for an evaluation, and what the job is that evaluates one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
+from orchestrator.spec.sections import Evaluation
+from shared_store.checkpoints import Checkpoint
+
+TRAINED: dict[str, Any] = {
+    "name": "ant",
+    "nodes": {"min": 2, "max": 4},
+    "resources": {"cpus": 4.0, "gpus": 2, "memory": 2048},
+    "environment": {"NOTE": "a"},
+    "image": "mine",
+    "train": {"task": "Ant", "worlds": 8, "iterations": 100},
+}
+
+
+def saved(*iterations: int, epoch: int = 1) -> list[Checkpoint]:
+    return [Checkpoint(Path(f"{each:08d}-e{epoch}"), each, epoch) for each in iterations]
+
+
+def look(checkpoints: list[Checkpoint], counted: Counted, *, every: int = 2, busy: bool = False) -> tuple[Counted, int]:
+    """What is known after a look, and the iteration that is due; 0 where none is."""
+    known, chosen = due(checkpoints, counted, every, 100, busy)
+    return known, chosen.iteration if chosen else 0
+
+
+def test_every_second_checkpoint_is_due_however_many_retention_has_left() -> None:
+    known, found = look(saved(10), Counted())
+    assert (known, found) == (Counted("00000010-e1", 1), 0)
+    known, found = look(saved(10), known)
+    assert (known, found) == (Counted("00000010-e1", 1), 0), "nothing new"
+    known, found = look(saved(20), known)
+    assert (known, found) == (Counted("00000020-e1", 0), 20)
+    assert look(saved(20), known) == (known, 0), "once"
+    known, found = look(saved(20, 30, 40), known)
+    assert (known, found) == (Counted("00000040-e1", 0), 40)
+
+
+def test_while_one_is_evaluated_the_others_wait_and_then_the_newest_is_taken() -> None:
+    known, _ = look(saved(10, 20), Counted())
+    for iterations in ((10, 20, 30), (30, 40), (40, 50), (50, 60), (60, 70)):
+        known, found = look(saved(*iterations), known, busy=True)
+        assert found == 0
+    assert known == Counted("00000070-e1", 5)
+    known, found = look(saved(60, 70), known)
+    assert (known, found) == (Counted("00000070-e1", 0, 1), 70), "40 was due, too"
+
+
+def test_the_last_checkpoint_is_left_to_the_training_itself() -> None:
+    known, found = look(saved(90, 100), Counted("00000080-e1", 0), every=1)
+    assert (known, found) == (Counted("00000100-e1", 1), 0), "the training is done: 90 is no news any more"
+    assert look(saved(90), Counted("00000080-e1", 0), every=1)[1] == 90
+
+
+def test_a_later_epoch_is_newer_whatever_its_iteration() -> None:
+    known, found = look([*saved(50, 60), *saved(30, 40, epoch=2)], Counted("00000060-e1", 0))
+    assert (known, found) == (Counted("00000040-e2", 0), 40)
+
+
+def test_what_earlier_jobs_of_the_run_have_saved_does_not_count() -> None:
+    assert first_count([*saved(10, 20), *saved(30, epoch=3)], 3) == Counted("00000020-e1")
+    assert first_count(saved(30, epoch=3), 3) == first_count([], 1) == Counted()
+
+
+def test_the_job_has_one_node_like_those_of_the_training_and_keeps_no_checkpoint() -> None:
+    wanted = Evaluation(every=2, episodes=32, worlds=16)
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
+    assert spec.evaluate is not None and spec.evaluate.model_dump(exclude_none=True) == {
+        **{"run": "ant-1", "checkpoint": 40, "episodes": 32, "worlds": 16, "config": {}, "keep": False}
+    }
+    assert (spec.name, spec.queue, spec.share, spec.image) == ("evaluate-ant-1", "slow", "a", "mine")
+    assert (spec.nodes.max, spec.resources.gpus, spec.resources.cpus, spec.environment) == (1, 1, 4.0, {"NOTE": "a"})
+    assert (spec.priority, spec.preemptible, spec.retry.attempts) == (0, True, 3)
+
+
+def test_the_section_says_where_else_and_with_what() -> None:
+    section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
+    wanted = wanted_of({**TRAINED, "evaluation": section})
+    assert wanted is not None
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
+    assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
+    assert (spec.resources.gpus, spec.retry.attempts) == (0, 1)
+
+
+def test_a_spec_of_the_batch_api_is_read_with_care() -> None:
+    assert wanted_of({"train": "x", "evaluation": {"every": 1}}) is None
+    assert wanted_of(None) is wanted_of(TRAINED) is wanted_of({"command": ["x"], "evaluation": {"every": 1}}) is None
+    with pytest.raises(SpecError, match=r"^evaluation\.every: expected a value greater than or equal to 1, found 0$"):
+        wanted_of({**TRAINED, "evaluation": {"every": 0}})

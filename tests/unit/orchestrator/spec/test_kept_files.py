@@ -1,0 +1,126 @@
+"""Files that a job names in its task's configuration: read, checked and kept in the job when it is submitted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec import file as specfile
+from orchestrator.spec import kept_files
+from orchestrator.spec.changes import override
+from orchestrator.spec.kept_files import MOST, changes_with_files, with_files
+
+GOOD = "# ½ 😀 \"quoted\" \\ and\ttabs\ndef reward_function(params):\n    return params['speed']\n"
+METADATA = {"action_space": [{"steering_angle": angle, "speed": 1} for angle in (-20, 0, 20)]}
+JOB = """name: racer
+train:
+  task: Racer
+  worlds: 8
+  iterations: 2
+  config:
+    reward_function: mine.py
+"""
+
+
+@pytest.fixture(autouse=True)
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(GOOD)
+    (tmp_path / "space.json").write_text(json.dumps(METADATA))
+    (tmp_path / "job.yaml").write_text(JOB)
+    return tmp_path
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are read, and not tried: that takes a process each."""
+    monkeypatch.setattr(kept_files, "_check", lambda path, how: None)
+
+
+def config(changes: list[str] | None = None) -> dict[str, Any]:
+    spec = specfile.load("job.yaml", changes)
+    assert spec.train is not None
+    return spec.train.config
+
+
+def test_a_job_has_the_text_of_the_files_that_it_names(directory: Path) -> None:
+    found = config(["train.config.action_space=space.json"])
+    assert found == {"reward_function": {"file": "mine.py", "text": GOOD}, "action_space": METADATA}
+    whole = {"name": "again", "train": {**_train(), "config": found}}
+    (directory / "kept.yaml").write_text(json.dumps(whole, ensure_ascii=False))
+    (directory / "mine.py").unlink()
+    again = specfile.load("kept.yaml").train
+    assert again is not None and again.config == found
+
+
+def _train() -> dict[str, Any]:
+    return {"task": "Racer", "worlds": 8, "iterations": 2}
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_change_of_a_run_has_the_text_of_the_file_whatever_is_in_it() -> None:
+    def racer() -> dict[str, Any]:
+        return {"train": {"task": "Racer"}}
+
+    given = ["train.iterations=9", "train.config.reward_function=mine.py", "train.config.track=chicane"]
+    first, second, third = changes_with_files(racer, given)
+    assert (first, third) == (given[0], given[2]) and second.isascii()
+    kept = {"file": "mine.py", "text": GOOD}
+    assert override({}, [second]) == {"train": {"config": {"reward_function": kept}}}
+    (whole,) = changes_with_files(racer, ["train.config={reward_function: mine.py, track: oval}"])
+    assert override({}, [whole])["train"]["config"] == {"reward_function": kept, "track": "oval"}
+    assert changes_with_files(lambda: {"train": {"task": "Ant"}}, given) == given
+
+
+@pytest.mark.parametrize("train", [_train() | {"task": "elsewhere.mine:Task"}, {"config": 3}, None])
+def test_where_no_field_is_known_to_name_a_file_nothing_is_read(train: Any) -> None:
+    if isinstance(train, dict) and "task" in train:
+        train["config"] = {"reward_function": "missing.py"}
+    assert with_files({"name": "other", "train": train}, "job.yaml") == {"name": "other", "train": train}
+
+
+def test_what_is_wrong_with_a_file_is_told_at_the_line_that_names_it(directory: Path) -> None:
+    (directory / "mine.py").write_text("import os\n" + GOOD)
+    with pytest.raises(SpecError) as refused:
+        specfile.load("job.yaml")
+    said = "mine.py:1: IMPORT_ERROR: os can't be imported; a reward function may import math, random, numpy, scipy, shapely"
+    assert str(refused.value) == f"job.yaml:7: train.config.reward_function: {said}"
+    (directory / "mine.py").unlink()
+    with pytest.raises(SpecError) as refused:
+        specfile.load("job.yaml")
+    here = f"a path is relative to the directory of the command, {directory}"
+    assert str(refused.value) == f"job.yaml:7: train.config.reward_function: mine.py: No such file or directory; {here}"
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_file_that_does_not_fit_into_a_job_is_refused_with_the_limit(directory: Path) -> None:
+    (directory / "mine.py").write_text(GOOD + "#" * (MOST - 400))
+    assert len(config()["reward_function"]["text"]) > MOST - 400
+    (directory / "mine.py").write_text(GOOD + "#" * MOST)
+    with pytest.raises(
+        SpecError, match=r"mine\.py: it takes 20,\d{3} bytes of the job's definition, and may take 20,480"
+    ):
+        specfile.load("job.yaml")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"{\n 1", r"space\.json:2: it is not JSON \(Expecting property name"),
+        (b"\xff\xfe", r"space\.json: it is not a text file \(UTF-8\)"),
+        (b'"other.json"', r"space\.json: it holds a text alone"),
+        (
+            b'{"action_space": [{"steering_angle": 0, "speed": 9}, {}]}',
+            r"action_space\.action_space\.0\.speed: expected a number",
+        ),
+    ],
+)
+def test_an_action_space_is_checked_when_its_file_is_read(directory: Path, content: bytes, said: str) -> None:
+    (directory / "space.json").write_bytes(content)
+    with pytest.raises(SpecError, match=said):
+        config(["train.config.action_space=space.json"])

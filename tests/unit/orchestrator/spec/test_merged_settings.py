@@ -1,0 +1,206 @@
+"""A submission refuses what the rank would refuse of an algorithm's settings and the task's own together, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.file import load
+
+WRONG = [
+    ("Ant", "ppo", "learning_rate_limits: [0.1, 0.001]", "learning_rate_limits: expected the least, then the greatest"),
+    ("Ant", "ppo", "weight_decay: 0.1", "weight_decay: adam has none; set optimizer: adamw"),
+    (
+        "CartpolePixels",
+        "ppo",
+        "channels: [8, 8]",
+        "channels, kernel_sizes and strides: give one number of each for every convolution",
+    ),
+    ("Ant", "sac", "updates: 3", "updates: expected a multiple of policy_delay (2), got 3"),
+    # the task's own 8 updates
+    ("Cartpole", "sac", "policy_delay: 3", "updates: expected a multiple of policy_delay (3), got 8"),
+    ("Cartpole", "sac", "v_min: 9.0", "v_min: expected less than v_max (5), got 9"),
+    (
+        "CartpolePixels",
+        "sac",
+        "updates: 8",
+        "it can't learn from images, and observation group 'policy' is one; use ppo",
+    ),
+    (
+        "Ant",
+        "sac",
+        "critic_group: critics",
+        "critic_group: there is no observation group 'critics'; there are policy, critic",
+    ),
+    (
+        "Ant",
+        "rsl_rl",
+        "obs_groups: {critic: [critics]}",
+        "obs_groups: critic: there is no observation group 'critics'; there are policy, critic",
+    ),
+    (
+        "Ant",
+        "rsl_rl",
+        "algorithm: {class_name: Distillation}",
+        "teacher_checkpoint: name the run that trained the teacher",
+    ),
+    ("Ant", "rsl_rl", "teacher_checkpoint: taught@3", "teacher_checkpoint: PPO has no teacher; leave it out"),
+]
+
+
+def job(path: Path, task: str, algorithm: str, settings: str) -> str:
+    file = path / "job.yaml"
+    file.write_text(
+        f"name: a\ntrain:\n  task: {task}\n  worlds: 4\n  iterations: 2\n  algorithm: {algorithm}\n"
+        f"  {algorithm}:\n    {settings}\n"
+    )
+    return str(file)
+
+
+@pytest.mark.parametrize(("task", "algorithm", "settings", "said"), WRONG)
+def test_rules_over_several_settings_are_refused_with_file_line_and_key(
+    tmp_path: Path, task: str, algorithm: str, settings: str, said: str
+) -> None:
+    path = job(tmp_path, task, algorithm, settings)
+    with pytest.raises(SpecError) as refused:
+        load(path)
+    key = f"train.{algorithm}" + ("." if said.partition(":")[0].isidentifier() else ": ")
+    given = settings.partition(":")[0] == said.partition(":")[0]
+    assert str(refused.value) == f"{path}:{8 if given else 7}: {key}{said}"
+
+
+def test_what_the_job_gives_goes_before_what_the_task_has(tmp_path: Path) -> None:
+    for task, algorithm, settings in (
+        ("Cartpole", "sac", "{policy_delay: 3, updates: 9}"),
+        ("CartpolePixels", "ppo", "{channels: [8], kernel_sizes: [3], strides: [1]}"),
+        ("Ant", "ppo", "{weight_decay: 0.1, optimizer: adamw}"),
+        ("Ant", "rsl_rl", "{algorithm: {class_name: Distillation}, teacher_checkpoint: taught}"),
+        ("Ant", "rsl_rl", "{algorithm: {class_name: 'my_module:MyDistillation'}, teacher_checkpoint: taught}"),
+        ("Ant", "rsl_rl", "{algorithm: {class_name: 'my_module:MyDistillation'}}"),
+    ):
+        file = tmp_path / "job.yaml"
+        file.write_text(
+            f"name: a\ntrain: {{task: {task}, worlds: 4, iterations: 2, algorithm: {algorithm}, {algorithm}: {settings}}}\n"
+        )
+        load(str(file))
+
+
+def test_a_task_that_is_not_known_here_is_left_to_its_rank(tmp_path: Path) -> None:
+    for algorithm, settings in (("ppo", "minibatches: 64"), ("sac", "updates: 3"), ("rsl_rl", "obs_groups: {a: [b]}")):
+        load(job(tmp_path, "my_task:Task", algorithm, settings))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "said"),
+    [
+        ("rsl_rl", "algorithm: {max_grad_norm: .inf}", "8: train.rsl_rl.algorithm.max_grad_norm: "),
+        ("rsl_rl", "actor: {hidden_dims: [8, -.inf]}", "8: train.rsl_rl.actor.hidden_dims.1: "),
+        ("sac", "v_max: .inf", "8: train.sac.v_max: "),
+    ],
+)
+def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
+    tmp_path: Path, algorithm: str, settings: str, said: str
+) -> None:
+    path = job(tmp_path, "Ant", algorithm, settings)
+    with pytest.raises(SpecError) as refused:
+        load(path)
+    found = "-inf" if "-.inf" in settings else "inf"
+    assert str(refused.value) == f"{path}:{said}expected a finite number, found a number ({found})"
+
+
+def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:
+    file = tmp_path / "job.yaml"
+    text = "name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n  algorithm: {}\n  {}: {{epochs: 3}}\n"
+    for algorithm, section, belongs in (("sac", "ppo", "sac"), ("my_module:Mine", "ppo", "settings")):
+        file.write_text(text.format(algorithm, section))
+        with pytest.raises(SpecError) as refused:
+            load(str(file))
+        said = f"train.{section}: the algorithm is {algorithm}, so its settings belong under train.{belongs}"
+        assert str(refused.value) == f"{file}:7: {said}"
+
+
+HOPPER = {
+    "hopper_settings.py": """
+from typing import ClassVar
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True))
+class HopConfig:
+    hops: int = 3
+    fixed: ClassVar[tuple[str, ...]] = ("hops",)
+""",
+    "hopper.py": """
+from hopper_settings import HopConfig
+from worker.learning.plain_ppo import PlainPPO
+
+class Hop(PlainPPO):
+    config_type = HopConfig
+""",
+    "hopper-1.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: hopper\nVersion: 1.0\n",
+    "hopper-1.0.dist-info/entry_points.txt": (
+        "[muster.algorithms]\nhop = hopper:Hop\n[muster.settings]\nhop = hopper_settings:HopConfig\n"
+    ),
+}
+"""An installed package with an algorithm."""
+CONTROLLER = """
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.model import validate
+
+def submit(**train):
+    base = {"task": "Cartpole", "worlds": 1, "iterations": 1, "algorithm": "hop"}
+    return validate({"name": "a", "train": {**base, **train}}, "job.yaml").train.given()
+
+print(submit(hop={"hops": 4}))
+for wrong in ({"hop": {"hopps": 4}}, {"hop": {"hops": "many"}}, {"ppo": {"epochs": 1}}, {"config": {"hop": {}}}):
+    try:
+        submit(**wrong)
+    except SpecError as error:
+        print(error)
+"""
+RANK = """
+from worker.learning import algorithms
+from worker.learning.job import configure
+from worker.tasks import find_task
+
+section = {"algorithm": "hop", "hop": {"hops": 4}}
+found = algorithms.find_algorithm("hop")
+print(found.__name__, algorithms.settings(found, "hop", configure(find_task("Cartpole"), section), section).hops)
+"""
+
+
+def said_by(program: str, tmp_path: Path) -> list[str]:
+    for name, text in HOPPER.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_an_algorithm_of_an_installed_package_is_known_to_the_submission(tmp_path: Path) -> None:
+    assert said_by(CONTROLLER, tmp_path) == [
+        "{'hops': 4}",
+        "job.yaml: train.hop.hopps: unknown key; did you mean hops?",
+        "job.yaml: train.hop.hops: expected a whole number, found a text ('many')",
+        "job.yaml: train.ppo: the algorithm is hop, so its settings belong under train.hop",
+        "job.yaml: train.config.hop: not a key of CartpoleConfig; settings of hop stand under train.hop",
+    ]
+
+
+def test_an_algorithm_of_an_installed_package_is_known_to_the_rank(tmp_path: Path) -> None:
+    assert said_by(RANK, tmp_path) == ["Hop 4"]
+
+
+def test_every_installed_algorithm_names_its_class_and_its_settings() -> None:
+    from orchestrator.spec.model import ALGORITHMS
+    from worker.learning.algorithms import find_algorithm, installed
+
+    assert installed().keys() == ALGORITHMS.keys()
+    assert all(find_algorithm(name).config_type is ALGORITHMS[name] for name in ALGORITHMS)

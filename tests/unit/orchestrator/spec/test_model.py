@@ -1,0 +1,429 @@
+"""The job YAML: what is wrong with it is told in one line, with file, line and key; what is right compiles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.domain.gang import gang_needs
+from orchestrator.spec.changes import override
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.file import load, read
+from orchestrator.spec.model import Spec, validate
+from orchestrator.spec.values import known_tasks
+from worker.learning.ppo.settings import PPOConfig
+
+REPOSITORY = Path(__file__).parents[4]
+SHIPPED = sorted((REPOSITORY / "job_specs").glob("*.yaml"))
+TRAIN = "train: {task: Cartpole, worlds: 4, iterations: 2}"
+COMMAND = "name: a\ncommand: [x]\n"
+
+
+def ppo(text: str) -> str:
+    return f"name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iterations: 2\n  ppo: {{{text}}}\n"
+
+
+def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
+    """What is said of a file, without the directory that it lies in."""
+    path = tmp_path / "job.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SpecError) as caught:
+        load(str(path), list(assignments))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message.replace(f"{tmp_path}/", "")
+
+
+# -- what is wrong ----------------------------------------------------------------------------------------------------
+
+LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digit, at most 100"
+RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
+TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, LiftCubes, Quadruped, Racer, RacerPixels, RacerPixelsAndState"
+TOP = (
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, race, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
+    "on_child_failure, timeout, stall_timeout"
+)
+
+WRONG_KEYS = {
+    f"name: a\n{TRAIN}\nnodez: 2\n": "job.yaml:3: nodez: unknown key; did you mean nodes?",
+    f"name: a\n{TRAIN}\nxyzzyq: 2\n": f"job.yaml:3: xyzzyq: unknown key; valid here: {TOP}",
+    "nme: a\ncommand: [x]\n": "job.yaml:1: nme: unknown key; did you mean name? (and 1 more)",
+    f"name: a\n{TRAIN}\nnodez: 2\nretyr: 2\n": "job.yaml:3: nodez: unknown key; did you mean nodes? (and 1 more)",
+    "name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iteration: 2\n": (
+        "job.yaml:5: train.iteration: unknown key; did you mean iterations? (and 1 more)"
+    ),
+    ppo("learning_rat: 1.0"): "job.yaml:6: train.ppo.learning_rat: unknown key; did you mean learning_rate?",
+    f"{COMMAND}checkpoint: {{evry: 1}}\n": "job.yaml:3: checkpoint.evry: unknown key; did you mean every?",
+    f"{COMMAND}checkpoint: {{whatever: 1}}\n": "job.yaml:3: checkpoint.whatever: unknown key; did you mean every?",
+    f"{COMMAND}retry: {{zz: 1}}\n": "job.yaml:3: retry.zz: unknown key; valid here: attempts",
+    f"{COMMAND}resources:\n  gpu: 1\n": "job.yaml:4: resources.gpu: unknown key; did you mean gpus?",
+    f"{COMMAND}nodes: {{min: 3, mx: 4}}\n": "job.yaml:3: nodes.mx: unknown key; did you mean max? (and 1 more)",
+    "name: a\nevaluate: {run: x, checkpont: 3}\n": (
+        "job.yaml:2: evaluate.checkpont: unknown key; did you mean checkpoint?"
+    ),
+}
+
+MISSING = {
+    "": "job.yaml: expected a mapping of keys such as name, nodes, train; found nothing",
+    "- a\n": "job.yaml: expected a mapping of keys such as name, nodes, train; found a list",
+    "text": "job.yaml: expected a mapping of keys such as name, nodes, train; found a text ('text')",
+    "command: [x]\n": "job.yaml: name: is required",
+    "name: a\n": "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found none",
+    f"{COMMAND}{TRAIN}\n": (
+        "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
+    ),
+    "name: a\ntrain: {worlds: 4, iterations: 2}\n": "job.yaml:2: train.task: is required",
+    "name: a\nevaluate: {}\n": "job.yaml:2: evaluate.run: is required",
+    "name: a\nrace: {laps: 3}\n": "job.yaml:2: race.laps: unknown key; valid here: "
+    "run, checkpoint, trials, continuous, off_track_penalty, crash_penalty, max_resets, seconds, track, seed, config, keep (and 1 more)",
+    "name: a\nrace: {run: x, trials: 101}\n": "job.yaml:2: race.trials: expected a value less than or equal to 100, found 101",
+    "name: a\nnodes: 2\nrace: {run: x}\n": "job.yaml: race: it runs on one node with at most one GPU",
+    f"{COMMAND}nodes: {{min: 3}}\n": "job.yaml:3: nodes.max: is required",
+}
+
+NODES = "job.yaml:3: nodes: expected a whole number of nodes, or {min: 2, max: 4}"
+WRONG_VALUES = {
+    f"{COMMAND}nodes: three\n": f"{NODES}, found 'three'",
+    f"{COMMAND}nodes: true\n": f"{NODES}, found True",
+    f"{COMMAND}nodes: 1.5\n": f"{NODES}, found 1.5",
+    f"{COMMAND}nodes:\n": f"{NODES}, found None",
+    f"{COMMAND}nodes: 0\n": (
+        "job.yaml:3: nodes.min: expected a value greater than or equal to 1, found 0 (and 1 more)"
+    ),
+    f"{COMMAND}nodes: 251\n": (
+        "job.yaml:3: nodes.min: expected a value less than or equal to 250, found 251 (and 1 more)"
+    ),
+    f"{COMMAND}nodes: {{min: 3, max: 2}}\n": "job.yaml:3: nodes: min (3) is more than max (2)",
+    f"{COMMAND}resources: 3\n": "job.yaml:3: resources: expected a mapping, found a whole number (3)",
+    f"{COMMAND}resources:\n": "job.yaml:3: resources: expected a mapping, found nothing",
+    f"{COMMAND}resources:\n  gpus: 1\n  memory: 4 gigs\n": (
+        "job.yaml:5: resources.memory: expected an amount of memory such as 512MiB or 4GiB, found '4 gigs'"
+    ),
+    f"{COMMAND}resources: {{memory: 1MiB}}\n": (
+        "job.yaml:3: resources.memory: expected a value greater than or equal to 4, found 1"
+    ),
+    f"{COMMAND}resources: {{memory: 4.5}}\n": (
+        "job.yaml:3: resources.memory: expected a whole number, found a number (4.5)"
+    ),
+    f"{COMMAND}resources: {{cpus: 0}}\n": "job.yaml:3: resources.cpus: expected a value greater than 0, found 0",
+    f"{COMMAND}resources: {{cpus: two}}\n": "job.yaml:3: resources.cpus: expected a number, found a text ('two')",
+    f"{COMMAND}resources: {{cpus: .inf}}\n": (
+        "job.yaml:3: resources.cpus: expected a finite number, found a number (inf)"
+    ),
+    f"{COMMAND}resources: {{gpus: -1}}\n": (
+        "job.yaml:3: resources.gpus: expected a value greater than or equal to 0, found -1"
+    ),
+    f"{COMMAND}resources: {{gpus: 1.5}}\n": (
+        "job.yaml:3: resources.gpus: expected a whole number, found a number (1.5)"
+    ),
+    f"{COMMAND}timeout: soon\n": "job.yaml:3: timeout: expected a duration such as 90s, 45m, 2h or 1d, found 'soon'",
+    f"{COMMAND}timeout: 5s\n": "job.yaml:3: timeout: expected a value greater than or equal to 60, found '5s'",
+    f"{COMMAND}timeout: true\n": "job.yaml:3: timeout: expected a number, found true or false (True)",
+    f"{COMMAND}timeout: .inf\n": "job.yaml:3: timeout: expected a finite number, found a number (inf)",
+    f"{COMMAND}retry: {{attempts: 11}}\n": (
+        "job.yaml:3: retry.attempts: expected a value less than or equal to 10, found 11"
+    ),
+    f"{COMMAND}retry: {{attempts: '3'}}\n": ("job.yaml:3: retry.attempts: expected a whole number, found a text ('3')"),
+    f"{COMMAND}on_child_failure: resart\n": (
+        "job.yaml:3: on_child_failure: expected 'restart', 'fail' or 'ignore', found 'resart'"
+    ),
+    f"{COMMAND}checkpoint: {{keep: 1}}\n": (
+        "job.yaml:3: checkpoint.keep: expected a value greater than or equal to 2, found 1"
+    ),
+    "name: a b\ncommand: [x]\n": f"job.yaml:1: name: {LETTERS}, found 'a b'",
+    f"name: {'a' * 101}\ncommand: [x]\n": f"job.yaml:1: name: {LETTERS}, found '{'a' * 56}…",
+    "name: 7\ncommand: [x]\n": "job.yaml:1: name: expected a text, found a whole number (7)",
+    "name: on\ncommand: [x]\n": "job.yaml:1: name: expected a text, found true or false (True)",
+    "name: a\ncommand: python x\n": "job.yaml:2: command: expected a list, found a text ('python x')",
+    "name: a\ncommand:\n  - python\n  - 3\n": "job.yaml:4: command.1: expected a text, found a whole number (3)",
+    'name: a\ncommand: [x, "a\\0b"]\n': ("job.yaml:2: command.1: expected a text without a zero byte, found 'a\\x00b'"),
+    f"{COMMAND}environment: [a]\n": "job.yaml:3: environment: expected a mapping, found a list",
+    f"{COMMAND}environment:\n  A: 1\n": "job.yaml:4: environment.A: expected a text, found a whole number (1)",
+    f"{COMMAND}environment: {{MUSTER_X: a}}\n": (
+        "job.yaml:3: environment: MUSTER_X is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
+    ),
+    f"{COMMAND}environment: {{a=b: a}}\n": (
+        "job.yaml:3: environment: 'a=b' can't be set: a name has no '=', and neither name nor value a zero byte"
+    ),
+    "name: a\ntrain: Cartpole\n": "job.yaml:2: train: expected a mapping, found a text ('Cartpole')",
+    "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": (
+        "job.yaml:2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class)"
+    ),
+    "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
+        f"job.yaml:2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class)"
+    ),
+    ppo("schedule: adaptiv"): "job.yaml:6: train.ppo.schedule: expected 'adaptive' or 'fixed', found 'adaptiv'",
+    ppo("gamma: 1.5"): "job.yaml:6: train.ppo.gamma: expected a value less than or equal to 1, found 1.5",
+    ppo("hidden_sizes: 64"): "job.yaml:6: train.ppo.hidden_sizes: expected a list, found a whole number (64)",
+    ppo("normalize_observations: 'yes'"): (
+        "job.yaml:6: train.ppo.normalize_observations: expected true or false, found a text ('yes')"
+    ),
+    ppo("learning_rate: 5e-4"): (
+        "job.yaml:6: train.ppo.learning_rate: expected a number, found a text ('5e-4'); in YAML it is written 5.0e-4"
+    ),
+    ppo("learning_rate: 1.5e3"): (
+        "job.yaml:6: train.ppo.learning_rate: expected a number, found a text ('1.5e3'); in YAML it is written 1.5e+3"
+    ),
+    ppo("learning_rate: .nan"): "job.yaml:6: train.ppo.learning_rate: expected a finite number, found a number (nan)",
+    "name: a\nevaluate: {run: ../x}\n": f"job.yaml:2: evaluate.run: {RUN_LETTERS}, found '../x'",
+    "name: a\nexport: {run: x, checkpoint: new}\n": (
+        "job.yaml:2: export.checkpoint: expected an iteration, best or latest, found 'new'"
+    ),
+}
+
+NOT_YAML = {
+    "name: a\nname: b\n": "job.yaml:2: name: given twice, first on line 1",
+    f"name: a\n{TRAIN}\nresources:\n  memory: 4GiB\n  memory: 5GiB\n": (
+        "job.yaml:5: resources.memory: given twice, first on line 4"
+    ),
+    "name: [a\n": "job.yaml:2: not valid YAML: expected ',' or ']', but got '<stream end>'",
+    "name: a\n\tb: c\n": "job.yaml:2: not valid YAML: found character '\\t' that cannot start any token",
+    "name: *x\n": "job.yaml:1: not valid YAML: found undefined alias 'x'",
+    "? [a]\n: b\n": "job.yaml:1: not valid YAML: found unhashable key",
+    "name: a\n---\nname: b\n": "job.yaml:2: not valid YAML: but found another document",
+    "name: !!python/object/apply:os.getcwd []\n": (
+        "job.yaml:1: not valid YAML: could not determine a constructor for the tag "
+        "'tag:yaml.org,2002:python/object/apply:os.getcwd'"
+    ),
+    "name: \x01\n": "job.yaml: not valid YAML: unacceptable character #x0001: special characters are not allowed",
+    "a: &x {b: *x}\n": "job.yaml:1: not valid YAML: an alias stands inside of what it stands for",
+    b"name: \xff\n": "job.yaml: not a text file (UTF-8)",
+}
+
+
+@pytest.mark.parametrize("text", WRONG_KEYS)
+def test_a_wrong_key_is_told_with_its_line_and_the_nearest_valid_one(tmp_path: Path, text: str) -> None:
+    assert problem(tmp_path, text) == WRONG_KEYS[text]
+
+
+@pytest.mark.parametrize("text", MISSING)
+def test_what_is_missing_is_told(tmp_path: Path, text: str) -> None:
+    assert problem(tmp_path, text) == MISSING[text]
+
+
+@pytest.mark.parametrize("text", WRONG_VALUES)
+def test_a_wrong_value_is_told_with_its_line_and_what_was_expected(tmp_path: Path, text: str) -> None:
+    assert problem(tmp_path, text) == WRONG_VALUES[text]
+
+
+@pytest.mark.parametrize("text", NOT_YAML)
+def test_what_is_not_yaml_is_told_with_its_line(tmp_path: Path, text: str | bytes) -> None:
+    assert problem(tmp_path, text).startswith(NOT_YAML[text])
+
+
+def test_a_file_that_can_not_be_read_is_named(tmp_path: Path) -> None:
+    for path, said in ((tmp_path / "none.yaml", "No such file or directory"), (tmp_path, "Is a directory")):
+        with pytest.raises(SpecError) as caught:
+            load(str(path))
+        assert str(caught.value) == f"{path}: {said}"
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers(-3, 300) | st.floats() | st.text(max_size=6),
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(
+                st.sampled_from([*Spec.model_fields, "task", "worlds", "ppo", "min", "cpus", "zzz"])
+                | st.integers(0, 3),
+                inner,
+                max_size=4,
+            )
+        ),
+        max_leaves=12,
+    )
+)
+def test_any_document_is_a_spec_or_refused_in_one_line(document: object) -> None:
+    try:
+        assert isinstance(validate(document, "job.yaml"), Spec)
+    except SpecError as error:
+        assert str(error).startswith("job.yaml: ")
+        assert "\n" not in str(error)
+
+
+# -- overrides --------------------------------------------------------------------------------------------------------
+
+
+def test_a_value_given_on_the_command_line_counts(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_text(f"name: a\n{TRAIN}\n")
+    spec = load(str(path), ["train.iterations=9", "train.ppo.clip=0.3", "nodes={min: 1, max: 2}", "name=b"])
+    assert spec.train
+    assert (spec.train.iterations, spec.train.ppo.clip, spec.nodes.max, spec.name) == (9, 0.3, 2, "b")
+
+
+def test_overriding_leaves_the_document_as_it_was() -> None:
+    document = {"train": {"worlds": 4}}
+    assert override(document, ["train.worlds=8"]) == {"train": {"worlds": 8}}
+    assert document == {"train": {"worlds": 4}}
+
+
+@pytest.mark.parametrize(
+    ("assignment", "said"),
+    [
+        ("x", "--set x: expected KEY=VALUE, such as train.iterations=600"),
+        ("=3", "--set =3: expected KEY=VALUE, such as train.iterations=600"),
+        ("train..x=3", "--set train..x=3: expected KEY=VALUE, such as train.iterations=600"),
+        ("name.x=1", "--set name.x=1: name is not a section"),
+        (
+            "nodes=[",
+            "--set nodes=[: the value is not valid YAML (line 1, nodes): "
+            "expected the node content, but found '<stream end>'",
+        ),
+        (
+            "train.config={a: &a 1}",
+            "--set train.config={a: &a 1}: the value is not valid YAML (line 1, train.config.a): "
+            "anchors and aliases (&a) are not accepted here; write the value out",
+        ),
+        (
+            "train.config={a: .inf}",
+            "--set: train.config.a: expected a finite number, found a number (inf)",
+        ),
+        (
+            f"{'a.' * 60}a=1",
+            f"--set {('a.' * 60)[:76]} … (47 more characters): the key has 61 levels; at most 50",
+        ),
+        ("train.ppo.clp=0.3", "--set: train.ppo.clp: unknown key; did you mean clip?"),
+    ],
+)
+def test_a_wrong_override_is_told(tmp_path: Path, assignment: str, said: str) -> None:
+    assert problem(tmp_path, f"name: a\n{TRAIN}\n", assignment) == said
+
+
+# -- what is right ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90s", 90), ("45m", 2700), ("2h", 7200), ("1d", 86400), ("1.5 h", 5400), ("600", 600)]
+)
+def test_durations_are_read_in_their_units(text: str, seconds: float) -> None:
+    assert validate({"name": "a", "command": ["x"], "timeout": yaml.safe_load(text)}, "s").timeout == seconds
+
+
+@pytest.mark.parametrize(
+    ("text", "mebibytes"),
+    [("512MiB", 512), ("4GiB", 4096), ("0.5 GiB", 512), ("1TiB", 2**20), ("1GB", 953), ("64", 64)],
+)
+def test_amounts_of_memory_are_read_in_their_units(text: str, mebibytes: int) -> None:
+    document = {"name": "a", "command": ["x"], "resources": {"memory": yaml.safe_load(text)}}
+    assert validate(document, "s").resources.memory == mebibytes
+
+
+def test_a_number_of_nodes_is_a_range_of_one() -> None:
+    spec = validate({"name": "a", "command": ["x"], "nodes": 3}, "s")
+    assert (spec.nodes.min, spec.nodes.max) == (3, 3)
+
+
+@pytest.mark.parametrize(("gpus", "ranks"), [(0, 1), (1, 1), (8, 8)])
+def test_a_node_has_one_rank_a_gpu_and_at_least_one(gpus: int, ranks: int) -> None:
+    assert validate({"name": "a", "command": ["x"], "resources": {"gpus": gpus}}, "s").ranks_per_node == ranks
+
+
+def test_a_task_of_one_s_own_is_taken_by_module_and_class() -> None:
+    document = {"name": "a", "train": {"task": "my_robot.tasks:Walker", "worlds": 1, "iterations": 1}}
+    assert validate(document, "s").train.task == "my_robot.tasks:Walker"  # type: ignore[union-attr]
+
+
+def test_the_known_tasks_are_the_installed_ones() -> None:
+    assert known_tasks() == TASKS.split(", ")
+
+
+def test_there_is_a_spec_to_copy() -> None:
+    assert {path.name for path in SHIPPED} >= {"ant.yaml", "cartpole.yaml", "all-reduce.yaml"}
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_every_shipped_spec_is_valid_and_compiles_to_batch_requests(path: Path) -> None:
+    spec = load(str(path))
+    definition = compile_definition(spec, "/somewhere")
+    assert json.loads(json.dumps(definition)) == definition
+    assert len(gang_needs(definition["nodeProperties"]).nodes) == spec.nodes.max
+    assert compile_submission(spec, "arn")["jobName"] == spec.name
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+def test_a_compiled_spec_comes_back_as_it_was(path: Path) -> None:
+    spec = load(str(path))
+    carried = gang_needs(compile_definition(spec, "/")["nodeProperties"]).spec
+    assert validate(carried, "MUSTER_SPEC") == spec
+
+
+def test_lines_are_known_for_every_key(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_text("# comment\nname: a\n\ntrain:\n  ppo:\n    hidden_sizes:\n    - 64\n    - 32\ncommand: [x, y]\n")
+    assert read(str(path))[1] == {
+        ("name",): 2,
+        ("train",): 4,
+        ("train", "ppo"): 5,
+        ("train", "ppo", "hidden_sizes"): 6,
+        ("train", "ppo", "hidden_sizes", 0): 7,
+        ("train", "ppo", "hidden_sizes", 1): 8,
+        ("command",): 9,
+        ("command", 0): 9,
+        ("command", 1): 9,
+    }
+
+
+# -- agreement with the worker ----------------------------------------------------------------------------------------
+
+
+PROBES = [0, 1, 2, -1, 0.0, 0.5, 1.0, 1.5, -0.5, math.nan, math.inf, True, False, "", "fixed", "linear", "elu", "ELU"]
+PROBES += [[], [8], [8, 0], [8, 1.5], [8, True], [8, 4, 2], ["8"], {}, "0.001"]
+
+
+@pytest.mark.parametrize("name", [item.name for item in dataclasses.fields(PPOConfig)])
+def test_the_worker_accepts_of_each_setting_of_ppo_what_the_job_file_accepts(name: str) -> None:
+    for value in PROBES:
+        section = {"task": "Ant", "worlds": 1, "iterations": 1, "ppo": {name: value}}
+        try:
+            validate({"name": "job", "train": section}, "job.yaml")
+            written = True
+        except SpecError:
+            written = False
+        try:
+            PPOConfig(**{name: value})
+            made = True
+        except ValueError:
+            made = False
+        assert written == made, value
+
+
+def bomb(levels: int) -> str:
+    """Entries of a mapping in which each key stands for eight times the one before."""
+    entries = ["a0: &a0 [x, x, x, x, x, x, x, x]"]
+    entries += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, levels)]
+    return ", ".join(entries)
+
+
+def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> None:
+    train = "{task: 'my:Task', worlds: 4, iterations: 2, config: {first: &c {size: 3}, second: {<<: *c}}}"
+    (tmp_path / "job.yaml").write_text(f"name: a\ntrain: {train}\n")
+    loaded = load(str(tmp_path / "job.yaml")).train
+    assert loaded is not None and loaded.config == {"first": {"size": 3}, "second": {"size": 3}}
+    said = problem(tmp_path, f"name: a\n{TRAIN}\nenvironment: {{{bomb(7)}}}\n")
+    assert said == "job.yaml:3: not valid YAML: more than 10000 values with the aliases written out"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (f"{{{bomb(9)}}}", "train.config.a0): anchors and aliases (&a0) are not accepted here; write the value out"),
+        ("[" * 5000, "nested deeper than 50 levels"),
+        (f"[{'1,' * 11_000}1]", "more than 10000 values"),
+        (f"0x{'f' * 20_000}", "a number of more than 64 bits"),
+        ("!!binary /w==", "binary is not a kind of value that JSON has"),
+        (f"'{'x' * 30_000}'", "30015 characters of changes; at most 24576"),
+    ],
+)
+def test_a_change_beyond_a_limit_is_refused_in_one_short_line_that_names_it(value: str, said: str) -> None:
+    with pytest.raises(SpecError) as refused:
+        override({}, [f"train.config={value}"])
+    assert said in str(refused.value) and len(str(refused.value)) < 400 and "\n" not in str(refused.value)

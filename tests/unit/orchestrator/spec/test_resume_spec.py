@@ -1,0 +1,329 @@
+"""`muster resume --set`: every key of the spec is applied to the job that goes on, or refused by name. A key without a decision fails."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel
+
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.continuing import Changes
+from orchestrator.api.native.runs import _check_changes, _check_rate
+from orchestrator.spec.changes import override
+from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.model import ALGORITHMS, Spec, validate
+from shared_store.checkpoints import Checkpoint
+from shared_store.layout import Run, Store
+from shared_store.settings import setting_at
+from tests.support.orchestrator.trained import add_checkpoint, add_run
+
+RUN = Run(Path("/store/runs/ant"))
+TRAIN = {"task": "Ant", "worlds": 4, "iterations": 2}
+KINDS: dict[str, dict[str, Any]] = {
+    "train": {"train": TRAIN},
+    "evaluate": {"evaluate": {"run": "other"}},
+    "race": {"race": {"run": "other"}},
+    "export": {"export": {"run": "other"}},
+    "record": {"record": {"run": "other"}},
+    "render": {"render": {"run": "other"}},
+    "command": {"command": ["true"]},
+}
+
+Place = Callable[[dict[str, Any], dict[str, Any]], Any]
+"""Where a job has a setting, in the requests RegisterJobDefinition and SubmitJob that are sent for it."""
+
+
+def container(definition: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = definition["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    return found
+
+
+def variable(name: str) -> Place:
+    return lambda definition, _: next(
+        (each["value"] for each in container(definition)["environment"] if each["name"] == name), None
+    )
+
+
+def resource(kind: str) -> Place:
+    return lambda definition, _: next(
+        (each["value"] for each in container(definition)["resourceRequirements"] if each["type"] == kind), None
+    )
+
+
+def carried(key: str) -> Place:
+    """In the spec that the rank reads; tests of the worker show what it does with it."""
+    return lambda definition, _: setting_at(json.loads(variable("MUSTER_SPEC")(definition, {})), key)
+
+
+APPLIED: dict[str, tuple[str, Any, Place]] = {
+    "name": ("again", "again", lambda _, job: job["jobName"]),
+    "queue": ("gpu", "gpu", lambda _, job: job["jobQueue"]),
+    "share": ("mine", "mine", lambda _, job: job.get("shareIdentifier")),
+    "priority": ("7", 7, lambda definition, _: definition.get("schedulingPriority")),
+    "preemptible": ("true", "1", variable("MUSTER_PREEMPTIBLE")),
+    "nodes.min": ("{min: 2, max: 3}", "2", variable("MUSTER_MIN_NODES")),
+    "nodes.max": ("{min: 2, max: 3}", 3, lambda definition, _: definition["nodeProperties"]["numNodes"]),
+    "resources.cpus": ("2.5", "2.5", resource("VCPU")),
+    "resources.gpus": ("2", "2", variable("MUSTER_RANKS_PER_NODE")),
+    "resources.memory": ("2GiB", "2048", resource("MEMORY")),
+    "secrets": ("{KEY: name}", {"KEY": "name"}, carried("secrets")),
+    "track.wandb.project": ("a", "a", carried("track.wandb.project")),
+    "track.wandb.entity": ("a", "a", carried("track.wandb.entity")),
+    "track.wandb.group": ("a", "a", carried("track.wandb.group")),
+    "track.wandb.tags": ("[a]", ["a"], carried("track.wandb.tags")),
+    "track.wandb.mode": ("offline", "offline", carried("track.wandb.mode")),
+    "track.mlflow.uri": ("sqlite:///a", "sqlite:///a", carried("track.mlflow.uri")),
+    "track.mlflow.experiment": ("a", "a", carried("track.mlflow.experiment")),
+    "track.mlflow.tags": ("{a: b}", {"a": "b"}, carried("track.mlflow.tags")),
+    "train.iterations": ("9", 9, carried("train.iterations")),
+    "evaluate.run": ("ant", "ant", carried("evaluate.run")),
+    "evaluate.checkpoint": ("3", 3, carried("evaluate.checkpoint")),
+    "evaluate.episodes": ("3", 3, carried("evaluate.episodes")),
+    "evaluate.worlds": ("3", 3, carried("evaluate.worlds")),
+    "evaluate.seed": ("3", 3, carried("evaluate.seed")),
+    "evaluate.config": ("{x: 1}", {"x": 1}, carried("evaluate.config")),
+    "evaluate.keep": ("false", False, carried("evaluate.keep")),
+    "race.run": ("ant", "ant", carried("race.run")),
+    "race.checkpoint": ("3", 3, carried("race.checkpoint")),
+    "race.trials": ("5", 5, carried("race.trials")),
+    "race.continuous": ("true", True, carried("race.continuous")),
+    "race.off_track_penalty": ("5.0", 5.0, carried("race.off_track_penalty")),
+    "race.crash_penalty": ("5.0", 5.0, carried("race.crash_penalty")),
+    "race.max_resets": ("3", 3, carried("race.max_resets")),
+    "race.seconds": ("60.0", 60.0, carried("race.seconds")),
+    "race.track": ("chicane", "chicane", carried("race.track")),
+    "race.seed": ("3", 3, carried("race.seed")),
+    "race.config": ("{x: 1}", {"x": 1}, carried("race.config")),
+    "race.keep": ("false", False, carried("race.keep")),
+    "evaluation.every": ("{every: 3}", 3, carried("evaluation.every")),
+    "evaluation.episodes": ("{every: 3, episodes: 7}", 7, carried("evaluation.episodes")),
+    "evaluation.worlds": ("{every: 3, worlds: 7}", 7, carried("evaluation.worlds")),
+    "evaluation.queue": ("{every: 3, queue: idle}", "idle", carried("evaluation.queue")),
+    "evaluation.share": ("{every: 3, share: mine}", "mine", carried("evaluation.share")),
+    "evaluation.resources.cpus": ("{every: 3, resources: {cpus: 2.5}}", 2.5, carried("evaluation.resources.cpus")),
+    "evaluation.resources.gpus": ("{every: 3, resources: {gpus: 1}}", 1, carried("evaluation.resources.gpus")),
+    "evaluation.resources.memory": (
+        "{every: 3, resources: {memory: 2GiB}}",
+        2048,
+        carried("evaluation.resources.memory"),
+    ),
+    "evaluation.retry.attempts": ("{every: 3, retry: {attempts: 2}}", 2, carried("evaluation.retry.attempts")),
+    "export.run": ("ant", "ant", carried("export.run")),
+    "export.checkpoint": ("3", 3, carried("export.checkpoint")),
+    "export.episodes": ("3", 3, carried("export.episodes")),
+    "export.worlds": ("3", 3, carried("export.worlds")),
+    "record.run": ("ant", "ant", carried("record.run")),
+    "record.checkpoint": ("3", 3, carried("record.checkpoint")),
+    "record.worlds": ("3", 3, carried("record.worlds")),
+    "record.episodes": ("3", 3, carried("record.episodes")),
+    "record.seed": ("3", 3, carried("record.seed")),
+    "render.run": ("ant", "ant", carried("render.run")),
+    "render.checkpoint": ("3", 3, carried("render.checkpoint")),
+    "render.format": ("png", "png", carried("render.format")),
+    "render.worlds": ("3", 3, carried("render.worlds")),
+    "render.seconds": ("2.5", 2.5, carried("render.seconds")),
+    "render.width": ("128", 128, carried("render.width")),
+    "render.height": ("128", 128, carried("render.height")),
+    "command": ("[echo, hello]", ["echo", "hello"], lambda definition, _: container(definition)["command"]),
+    "environment": ("{COLOUR: red}", "red", variable("COLOUR")),
+    "image": ("mine:2", "mine:2", lambda definition, _: container(definition)["image"]),
+    "checkpoint.every": ("auto", "auto", carried("checkpoint.every")),
+    "checkpoint.keep": ("3", 3, carried("checkpoint.keep")),
+    "logs.limit": ("2MiB", str(2 << 20), variable("MUSTER_LOG_LIMIT")),
+    "retry.attempts": ("7", 7, lambda definition, _: definition["retryStrategy"]["attempts"]),
+    "on_child_failure": ("fail", "fail", variable("MUSTER_ON_CHILD_FAILURE")),
+    "timeout": ("2h", 7200, lambda definition, _: (definition.get("timeout") or {}).get("attemptDurationSeconds")),
+    "stall_timeout": ("10m", "600", variable("MUSTER_STALL_TIMEOUT")),
+}
+"""Of each key that may change: another value as ``--set`` has it, what becomes of it, and where the job has that."""
+REFUSED = {
+    "train.task": "Cartpole",
+    "train.seed": "7",
+    "train.algorithm": "sac",
+    "train.config": "{rewards: {forward: 2.0}}",
+}
+"""Of each key that can't change: another value."""
+ELSEWHERE = {"train.worlds", "train.settings", "train.hyperparameters"}
+"""Depends on the checkpoint, or on the class of the user's own: tests/training/faults/test_refusals.py and tests/long/faults/test_resume_others.py.
+Hyperparameters are settings by other names: tests/unit/worker/racer/test_hyperparameters.py."""
+
+
+def sections_of(annotation: Any) -> list[type[BaseModel]]:
+    kinds = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
+    return [kind for kind in kinds if issubclass(kind, BaseModel)]
+
+
+def keys_of(model: type[BaseModel], path: str = "") -> Iterator[str]:
+    """Every key of the spec that is no section."""
+    for name, field in model.model_fields.items():
+        inner = sections_of(field.annotation)
+        yield from (key for section in inner for key in keys_of(section, f"{path}{name}."))
+        if not inner:
+            yield f"{path}{name}"
+
+
+def kind_of(key: str) -> str:
+    first = key.partition(".")[0]
+    return first if first in KINDS else "train"
+
+
+def changed(kind: str, *assignments: str, **train: Any) -> tuple[Spec, Spec]:
+    document: dict[str, Any] = {"name": "ant", **KINDS[kind]}
+    if train:
+        document["train"] = {**TRAIN, **train}
+    return validate(document, "run ant"), validate(override(document, assignments), "run ant", merged=False)
+
+
+def requests_of(spec: Spec) -> tuple[dict[str, Any], dict[str, Any]]:
+    return compile_definition(spec, "/"), compile_submission(spec, "arn")
+
+
+def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
+    algorithms = {f"train.{name}.{field}" for name, kind in ALGORITHMS.items() for field in kind.__pydantic_fields__}
+    assert len(algorithms) > 50
+    assert set(keys_of(Spec)) == {*APPLIED, *REFUSED, *ELSEWHERE, *algorithms}
+
+
+@pytest.mark.parametrize("key", APPLIED)
+def test_a_key_that_is_accepted_is_in_the_job_that_goes_on(key: str) -> None:
+    text, expected, place = APPLIED[key]
+    named = next((section for section in ("nodes", "evaluation") if key.startswith(f"{section}.")), key)
+    before, after = changed(kind_of(key), f"{named}={text}")
+    _check_changes(RUN, before, after)
+    assert place(*requests_of(before)) != expected and place(*requests_of(after)) == expected
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_key_of_the_run_s_history_is_refused_by_name_and_leads_to_a_clone(key: str) -> None:
+    before, after = changed("train", f"{key}={REFUSED[key]}")
+    with pytest.raises(
+        ClientError, match=rf"^run ant: {key} is .* can't become .*: muster clone ant --name NEW begins"
+    ):
+        _check_changes(RUN, before, after)
+
+
+def test_a_job_does_not_become_one_of_another_kind() -> None:
+    before, after = changed("train")[0], changed("command")[0]
+    with pytest.raises(ClientError, match="run ant is a train job; it can't go on as command"):
+        _check_changes(RUN, before, after)
+
+
+PROBES = ["1", "2", "0.5", "0.25", "true", "false", "[8]", "[8, 4, 2]", "[0.1, 0.2]", "adamw", "fixed", "tanh"]
+PROBES += ["critic", "min", "min_or_mean", "{a: [b]}", "{actor: [policy]}", "{a: 1}", "{learning_rate: 0.5}"]
+PROBES += ["run@3", "default"]
+
+
+def accepted_value(name: str, key: str) -> str:
+    """Some value that the setting takes."""
+    for probe in PROBES:
+        try:
+            document = {"name": "a", "train": {**TRAIN, "algorithm": name}}
+            spec = validate(override(document, [f"train.{name}.{key}={probe}"]), "x", merged=False)
+        except Exception:
+            continue
+        assert spec.train is not None
+        if spec.train.given().get(key) is not None:
+            return probe
+    raise AssertionError(f"no probe is a value of train.{name}.{key}: add one")
+
+
+@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+def test_each_setting_of_an_algorithm_is_carried_to_the_rank_or_refused_by_name(name: str) -> None:
+    kind = ALGORITHMS[name]
+    fixed = set(kind.fixed)
+    assert {key.partition(".")[0] for key in fixed} <= {item.name for item in dataclasses.fields(kind)}
+    assert set(kind.clone_may_change) <= fixed
+    for item in dataclasses.fields(kind):
+        probe = accepted_value(name, item.name)
+        before, after = changed("train", f"train.{name}.{item.name}={probe}", algorithm=name)
+        if item.name in fixed:
+            may = "muster clone ant" if item.name in kind.clone_may_change else "start a new run for that$"
+            with pytest.raises(ClientError, match=rf"run ant: train\.{name}\.{item.name} is not set .*{may}"):
+                _check_changes(RUN, before, after)
+        else:
+            _check_changes(RUN, before, after)
+            assert carried(f"train.{name}.{item.name}")(*requests_of(after)) is not None
+
+
+VALUES = {
+    "num_outputs": 5,
+    "predictor_hidden_dims": [9],
+    "target_hidden_dims": [9],
+    "activation": "tanh",
+    "state_normalization": "true",
+    "reward_normalization": "true",
+    "learning_rate": 0.5,
+    "optimizer": "sgd",
+}
+"""Another one, where a text is none."""
+
+
+@pytest.mark.parametrize("key", [key for key in ALGORITHMS["rsl_rl"].fixed if "." in key])
+def test_what_is_fixed_inside_a_section_is_refused_by_its_whole_name(key: str) -> None:
+    required = {"num_outputs": 4, "weight": 1.0, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}
+    curious = {"algorithm": {"rnd_cfg": required}} if "rnd_cfg" in key else {}
+    value = VALUES.get(key.rpartition(".")[2], "other")
+    before, after = changed("train", f"train.rsl_rl.{key}={value}", algorithm="rsl_rl", rsl_rl=curious)
+    with pytest.raises(ClientError, match=rf"train\.rsl_rl\.{key} is .* and can't become .*clone ant"):
+        _check_changes(RUN, before, after)
+
+
+RATES = [("ppo", "learning_rate"), ("rsl_rl", "algorithm.learning_rate")]
+FORMS = {
+    "ppo": ["train.ppo.learning_rate=0.001", "train.ppo={learning_rate: 0.001}"],
+    "rsl_rl": [
+        "train.rsl_rl.algorithm.learning_rate=0.001",
+        "train.rsl_rl.algorithm={learning_rate: 0.001}",
+        "train.rsl_rl={algorithm: {learning_rate: 0.001}}",
+    ],
+}
+"""How ``--set`` may give the rate of each algorithm that adapts it."""
+
+
+def saved_with(path: Path, rate: float, name: str, *assignments: str) -> Checkpoint:
+    """A checkpoint whose rate is this one now, of a job with these settings."""
+    store = Store(path / "store").open()
+    add_run(store, "ant")
+    train = override({"train": {"algorithm": name}}, assignments)["train"]
+    return add_checkpoint(store, "ant", 1, algorithm=name, train=train, learning_rate=rate)
+
+
+@pytest.mark.parametrize(("name", "form"), [(name, form) for name in FORMS for form in FORMS[name]])
+def test_a_learning_rate_that_would_have_no_effect_is_refused_in_whatever_form_it_is_given(
+    tmp_path: Path, name: str, form: str
+) -> None:
+    key = dict(RATES)[name]
+    chosen = saved_with(tmp_path, 0.0004, name, f"train.{name}.{key}=0.001")
+    after = changed("train", form, algorithm=name)[1]
+    with pytest.raises(ClientError) as refused:
+        _check_rate(RUN, chosen, after, [form])
+    assert str(refused.value).startswith(
+        f"run ant: train.{name}.{key} is 0.001 already, so that the run would go on with the rate of its checkpoint, "
+        "which is 0.0004 now; set another value"
+    )
+    _check_rate(RUN, chosen, after, ["train.iterations=9"])
+
+
+@pytest.mark.parametrize(("name", "key"), RATES)
+def test_a_learning_rate_that_takes_effect_or_is_in_effect_is_accepted(tmp_path: Path, name: str, key: str) -> None:
+    form = f"train.{name}.{key}=0.001"
+    after = changed("train", form, algorithm=name)[1]
+    _check_rate(RUN, saved_with(tmp_path / "new", 0.0004, name), after, [form])
+    _check_rate(RUN, saved_with(tmp_path / "other", 0.0004, name, f"train.{name}.{key}=0.002"), after, [form])
+    # a fixed rate: the checkpoint has the one that is asked for, as ppo keeps it
+    _check_rate(RUN, saved_with(tmp_path / "fixed", 0.0010000000474974513, name, form), after, [form])
+
+
+def test_two_options_that_say_the_same_are_refused() -> None:
+    assert Changes(assignments=("train.iterations=3",), nodes=4).all() == ["train.iterations=3", "nodes=4"]
+    assert Changes(assignments=("nodes=2",)).all() == ["nodes=2"]
+    for assignment in ("nodes=2", "nodes.max=2"):
+        with pytest.raises(
+            ClientError, match=rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
+        ):
+            Changes(assignments=(assignment,), nodes=4).all()

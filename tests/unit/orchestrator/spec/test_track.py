@@ -1,0 +1,122 @@
+"""``track`` and ``secrets`` of the job YAML, and checkpoints by name: what is accepted, and in which words the rest is refused."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import jsonschema
+import pytest
+
+from orchestrator.domain.errors import SpecError
+from orchestrator.spec.compile import compile_definition
+from orchestrator.spec.json_schema import schema
+from orchestrator.spec.model import validate
+
+TRAIN = {"task": "Cartpole", "worlds": 4, "iterations": 2}
+
+
+def spec(**changes: Any) -> dict[str, Any]:
+    return {"name": "a", "train": TRAIN, **changes}
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ("wandb", {"wandb": {"tags": []}}),
+        (["wandb", "mlflow"], {"wandb": {"tags": []}, "mlflow": {"tags": {}}}),
+        ({"mlflow": None}, {"mlflow": {"tags": {}}}),
+        (
+            {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
+            {"wandb": {"project": "ant", "mode": "offline", "tags": ["x"]}},
+        ),
+        ({"mlflow": {"uri": "http://host:5000/a"}}, {"mlflow": {"uri": "http://host:5000/a", "tags": {}}}),
+    ],
+)
+def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, kept: Any) -> None:
+    found = validate(spec(track=given), "job.yaml")
+    assert found.track is not None and found.track.model_dump(mode="json", exclude_none=True) == kept
+    assert jsonschema.Draft202012Validator(schema()).is_valid(spec(track=given))
+    again = validate(found.model_dump(mode="json", exclude_none=True), "run.json")
+    assert again == found  # as a run that is resumed reads it
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"track": "wandv"}, "job.yaml: track: no service is called 'wandv'; did you mean wandb?"),
+        ({"track": ["wandb", 3]}, "job.yaml: track: no service is called '3'; there are wandb, mlflow"),
+        (
+            {"track": 3},
+            "job.yaml: track: expected wandb, mlflow, a list of them, or each with its settings, found 3",
+        ),
+        ({"track": {"wandb": {"projct": "x"}}}, "job.yaml: track.wandb.projct: unknown key; did you mean project?"),
+        (
+            {"track": {"wandb": {"mode": "off"}}},
+            "job.yaml: track.wandb.mode: expected 'online' or 'offline', found 'off'",
+        ),
+        (
+            {"track": {"mlflow": {"uri": "http://me:word@host"}}},
+            "job.yaml: track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD as secrets",
+        ),
+        (
+            {"track": {"mlflow": {"uri": "https://word@host/?password=word"}}},
+            "job.yaml: track.mlflow.uri: a password would be stored in the run; give MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD as secrets",
+        ),
+        (
+            {"track": "mlflow", "environment": {"MLFLOW_TRACKING_URI": "postgresql://host/db?password=word"}},
+            "job.yaml: environment.MLFLOW_TRACKING_URI: the key would be stored in the run; remove it, and give it as a secret: "
+            "secrets: {MLFLOW_TRACKING_URI: NAME}",
+        ),
+        (
+            {"track": "wandb", "environment": {"WANDB_API_KEY": "x"}},
+            "job.yaml: environment.WANDB_API_KEY: the key would be stored in the run; remove it, and give it as a secret: "
+            "secrets: {WANDB_API_KEY: NAME}",
+        ),
+        (
+            {"track": "wandb", "train": None, "evaluate": {"run": "x"}},
+            "job.yaml: track: only a training has metrics to track; this job has evaluate",
+        ),
+        (
+            {"secrets": {"MUSTER_TOKEN": "x"}},
+            "job.yaml: secrets: MUSTER_TOKEN is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster",
+        ),
+        (
+            {"secrets": {"KEY": ""}},
+            "job.yaml: secrets: 'KEY': expected the name under which the controller has the value",
+        ),
+        (
+            {"secrets": {"KEY": "x"}, "environment": {"KEY": "y"}},
+            "job.yaml: secrets: KEY is in environment, too; give it once",
+        ),
+        ({"secrets": {"KEY": 3}}, "job.yaml: secrets.KEY: expected a text, found a whole number (3)"),
+    ],
+)
+def test_what_cannot_be_tracked_or_given_is_refused_in_one_line(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(SpecError) as refused:
+        validate(spec(**changes), "job.yaml")
+    assert str(refused.value) == said and "word@" not in str(refused.value)
+
+
+def test_secrets_become_those_of_the_job_definition() -> None:
+    made = compile_definition(validate(spec(secrets={"WANDB_API_KEY": "wandb"}), "s"), "/home/me")
+    [entry] = made["nodeProperties"]["nodeRangeProperties"]
+    assert entry["container"]["secrets"] == [{"name": "WANDB_API_KEY", "valueFrom": "wandb"}]
+    [carried] = [each for each in entry["container"]["environment"] if each["name"] == "MUSTER_SPEC"]
+    assert json.loads(carried["value"])["secrets"] == {"WANDB_API_KEY": "wandb"}  # the name alone
+
+
+@pytest.mark.parametrize("kind", ["evaluate", "race", "export", "record", "render"])
+def test_a_checkpoint_is_named_in_the_same_ways_by_every_kind_of_job(kind: str) -> None:
+    for wanted in (3, "best", "latest"):
+        found = validate({"name": "a", kind: {"run": "x", "checkpoint": wanted}}, "job.yaml")
+        assert getattr(found, kind).checkpoint == wanted
+        assert jsonschema.Draft202012Validator(schema()).is_valid(
+            {"name": "a", kind: {"run": "x", "checkpoint": wanted}}
+        )
+    for wrong in (-1, "newest", True, 1.5):
+        with pytest.raises(SpecError) as refused:
+            validate({"name": "a", kind: {"run": "x", "checkpoint": wrong}}, "job.yaml")
+        assert str(refused.value).startswith(f"job.yaml: {kind}.checkpoint: expected an iteration, best or latest")

@@ -1,0 +1,77 @@
+"""The line between a gang's nodes: how the main node learns of its children's ends."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+
+import pytest
+
+from shared_store.contract import NodeContract
+from tests.conftest import wait_for
+from worker.node import lifeline
+from worker.node.lifeline import ChildEnd, Loss, MainEnd
+
+
+def contract(node: int, nodes: int, address: str) -> NodeContract:
+    return NodeContract("job", 1, node, nodes, 0, address, 29500, "run", "/store", 1, 1, address=address)
+
+
+def heard(main: MainEnd) -> Loss:
+    found: Loss = wait_for(main.lost, 10, "a loss")
+    return found
+
+
+def test_a_child_s_last_word_counts_and_a_cut_line_is_a_death() -> None:
+    main = MainEnd(contract(0, 4, "127.91.0.1"))
+    children = [ChildEnd(contract(node, 4, "127.91.0.1")) for node in (1, 2, 3)]
+    for child in children:
+        child.attach()
+    del child
+    assert main.lost() is None
+    children[0].tell(0, "done")
+    children[1].tell(75, "checkpointed and left on request")
+    del children[0], children[0]
+    assert main.lost() is None, "neither is a failure"
+    children[0].tell(3, "rank 3 exited with code 3")
+    del children[0]
+    assert heard(main) == Loss("node 3: rank 3 exited with code 3", 3)
+    assert main.lost() is None, "told once"
+
+
+def test_a_death_without_a_word_and_a_stranger() -> None:
+    main = MainEnd(contract(0, 2, "127.91.0.2"))
+    stranger = socket.create_connection(("127.91.0.2", lifeline.PORT))
+    stranger.sendall(b"GET / HTTP/1.0\r\n\r\n[1]\n{}\n")
+    child = ChildEnd(contract(1, 2, "127.91.0.2"))
+    child.attach()
+    stranger.close()
+    assert main.lost() is None
+    del child
+    assert heard(main).reason == "node 1 vanished: its supervisor or its host died"
+
+
+def test_what_no_child_would_say_is_passed_over() -> None:
+    main, ours = MainEnd(contract(0, 2, "127.91.0.4")), contract(0, 2, "127.91.0.4").gang
+    strangers = [
+        *({"gang": ours}, {"gang": ours, "node": "1"}, {"gang": ours, "node": None, "code": 3}),
+        *({"gang": ours, "code": "three", "reason": 3}, {"gang": ours, "more": 1}),
+    ]
+    for words in strangers:
+        with socket.create_connection(("127.91.0.4", lifeline.PORT)) as stranger:
+            stranger.sendall(json.dumps(words).encode() + b"\n")
+    for _ in range(20):
+        assert main.lost() is None
+        time.sleep(0.01)
+    with socket.create_connection(("127.91.0.4", lifeline.PORT)) as child:
+        child.sendall(json.dumps({"gang": ours, "node": 1, "code": 3}).encode() + b"\n")
+    assert heard(main) == Loss("node 1: ", 3), "one that lost half of its last word"
+
+
+def test_a_child_that_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lifeline, "_ARRIVAL", 0.2)
+    main = MainEnd(contract(0, 3, "127.91.0.3"))
+    child = ChildEnd(contract(1, 3, "127.91.0.3"))
+    child.attach()
+    assert heard(main).reason.startswith("node 2 has not come within")

@@ -1,0 +1,183 @@
+"""The start of a node on AWS Batch: ``python -P -m worker.aws_node -- COMMAND…``.
+
+AWS tells a node its index and, a child, the main node's address; what is the same for all nodes Muster's engine has put into
+``MUSTER_NODE`` and ``MUSTER_ENVIRONMENT``. From both this makes the node contract, gets the run on the volume ready, and becomes
+the node's supervisor: one that also prints its log, for CloudWatch, and on the main node ends the gang when a child dies,
+which AWS would not. Imports no torch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import sys
+import time
+import urllib.request
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+
+from shared_store.contract import ContractError, NodeContract, job_variables, sealed
+from shared_store.epoch import Claim, StaleEpoch, raise_epoch, read_claim, read_epoch
+from shared_store.layout import Run, Store, StoreError
+from shared_store.logs import OUTCOME_LINE, format_line, format_lines
+from shared_store.outcomes import EX_TEMPFAIL, Outcome
+from worker.node import supervisor
+from worker.node.lifeline import ChildEnd, Loss, MainEnd
+
+_PEER_GRACE = 5.0
+"""Seconds that the main node's ranks get after a child died: their collectives are broken, there is nothing to save."""
+_PATIENCE = 600.0
+"""Seconds that a child waits for the main node to take the run: its container starts first, but may be slow."""
+_NODE_VARIABLES = ("AWS_BATCH_JOB_NODE_INDEX", "AWS_BATCH_JOB_NUM_NODES", "AWS_BATCH_JOB_MAIN_NODE_INDEX")
+
+
+class AwsSupervisor(supervisor.Supervisor):
+    """A supervisor whose log and outcome are on standard output, too, and that knows how the children end."""
+
+    def __init__(self, contract: NodeContract, run: Run, command: list[str], line: MainEnd | ChildEnd | None) -> None:
+        """``line``: to the other nodes; None where a child's death is to change nothing."""
+        super().__init__(contract, run, command)
+        self._line = line
+        self._loss: Loss | None = None
+
+    def write_lines(self, rank: int | None, stream: str, texts: Sequence[str]) -> None:
+        super().write_lines(rank, stream, texts)
+        _say(format_lines(time.time(), rank, stream, texts))
+
+    def _watch(self) -> None:
+        super()._watch()
+        if isinstance(self._line, MainEnd) and (loss := self._line.lost()) and self._loss is None:
+            self._loss = loss
+            self.write(None, "e", f"{loss.reason}; ending the gang")
+            self.stop(loss.reason, _PEER_GRACE)
+
+    def _outcome(self, started: float) -> Outcome:
+        outcome = super()._outcome(started)
+        if self._loss is None or self.stopping != self._loss.reason:
+            return outcome  # a rank of this node was first
+        code = outcome.exit_code if outcome.exit_code not in (0, EX_TEMPFAIL) else self._loss.exit_code
+        return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None, asked=True)
+
+    def _commit(self, outcome: Outcome) -> int:
+        code = super()._commit(outcome)
+        if isinstance(self._line, ChildEnd):
+            self._line.tell(outcome.exit_code, outcome.reason)
+        _say(format_line(time.time(), None, "o", OUTCOME_LINE + json.dumps(asdict(outcome))))
+        return code
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError):
+        sys.stdout.write(line)
+        sys.stdout.flush()
+
+
+def complete(env: Mapping[str, str]) -> tuple[NodeContract, dict[str, str]]:
+    """The node's contract, and the environment with it: AWS's own variables stay as they are.
+
+    All but one: ``AWS_BATCH_JOB_ATTEMPT`` counts the controller's attempts, each of which is a job of AWS's.
+
+    Raises:
+        ContractError: A variable is missing or malformed; the message names it.
+    """
+    try:
+        told = json.loads(env["MUSTER_NODE"])
+        variables = json.loads(env.get("MUSTER_ENVIRONMENT", "{}"))
+        index, count, main = (int(env[name]) for name in _NODE_VARIABLES)
+        address = own_address(env)
+        contract = NodeContract(
+            node_index=index,
+            node_count=count,
+            main_index=main,
+            master_address=env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") or address,
+            address=address,
+            **{**told["contract"], "array": tuple(told["contract"]["array"]) if told["contract"]["array"] else None},
+        )
+    except KeyError as error:
+        raise ContractError(f"{error.args[0]} is missing; a node on AWS Batch is started by Muster's engine") from None
+    except (ValueError, TypeError) as error:
+        raise ContractError(f"MUSTER_NODE is malformed ({error}); it is written by Muster's engine") from None
+    kept = {name: value for name, value in env.items() if not name.startswith("MUSTER_")}
+    ours = contract.to_env()
+    if contract.is_gang:  # a single-node job has none of AWS's node variables
+        ours |= {name: value for name, value in env.items() if name.startswith("AWS_")}
+    else:
+        kept = {name: value for name, value in kept.items() if name not in _NODE_VARIABLES}
+        ours["AWS_BATCH_JOB_ID"] = env.get("AWS_BATCH_JOB_ID", contract.job).partition("#")[0]
+    ours["AWS_BATCH_JOB_ATTEMPT"] = str(contract.attempt)
+    return contract, {**kept, **variables, **sealed(job_variables(env), ours)}
+
+
+def own_address(env: Mapping[str, str]) -> str:
+    """This node's IPv4 address: what it was told, what ECS says of its task, or that of the route to the outside."""
+    if env.get("MUSTER_ADDRESS"):
+        return env["MUSTER_ADDRESS"]
+    if uri := env.get("ECS_CONTAINER_METADATA_URI_V4"):
+        with (
+            contextlib.suppress(OSError, ValueError, KeyError, IndexError),
+            urllib.request.urlopen(uri, timeout=5) as answer,
+        ):
+            return str(json.load(answer)["Networks"][0]["IPv4Addresses"][0])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it only asks the kernel for the route
+            return str(probe.getsockname()[0])
+        except OSError:
+            return socket.gethostbyname(socket.gethostname())
+
+
+def take_run(contract: NodeContract, description: Mapping[str, object], line: MainEnd | ChildEnd | None) -> None:
+    """Have the volume's run belong to this attempt: the controller, which has its own store, could not.
+
+    The main node does it, the children wait for it. A run that belongs to a later attempt stays with it; the supervisor refuses.
+
+    Raises:
+        StaleEpoch: Another controller's attempt has this epoch.
+        StoreError, OSError, ValueError: The volume can't be used.
+    """
+    run = Store(contract.store).open().run(contract.run)
+    if contract.node_index == contract.main_index:
+        spec = json.loads(os.environ.get("MUSTER_SPEC") or "null")
+        run.create({**description, "created": int(time.time() * 1000), "spec": spec})
+        if read_epoch(run) < contract.epoch:
+            raise_epoch(run, contract.epoch, Claim("", contract.job, contract.attempt))
+        elif (held := read_claim(run, contract.epoch)) and (held.job, held.attempt) != (contract.job, contract.attempt):
+            raise StaleEpoch(
+                f"run {run.name}: attempt {held.attempt} of job {held.job} has epoch {contract.epoch} already"
+            )
+        return
+    deadline = time.monotonic() + _PATIENCE
+    taken = attached = False
+    while not (taken and attached):  # both before anything runs that could fail
+        taken = taken or read_epoch(run) >= contract.epoch
+        attached = line is None or isinstance(line, MainEnd) or line.attach()
+        if time.monotonic() > deadline:
+            lacking = "taken the run" if attached else "answered"
+            raise StoreError(
+                f"the main node, {contract.master_address}, has not {lacking} within {_PATIENCE:.0f} s: see its log; "
+                "does the security group let the nodes of a gang talk to each other?"
+            )
+        time.sleep(0.0 if taken and attached else 0.1)
+
+
+def main(argv: list[str]) -> int:
+    """Entry point; exit codes as the supervisor's."""
+    try:
+        contract, environment = complete(os.environ)
+        description = json.loads(os.environ["MUSTER_NODE"])["description"]
+        os.environ.clear()
+        os.environ.update(environment)
+        line: MainEnd | ChildEnd | None = None
+        if contract.node_count > 1 and os.environ.get("MUSTER_ON_CHILD_FAILURE", "ignore") != "ignore":
+            line = MainEnd(contract) if contract.node_index == contract.main_index else ChildEnd(contract)
+        take_run(contract, description, line)
+    except (ContractError, StoreError, OSError, ValueError) as error:
+        print(f"muster: node on AWS Batch: {error}", file=sys.stderr)
+        return 2
+    except StaleEpoch as error:
+        print(f"muster: node on AWS Batch: {error}; leaving", file=sys.stderr)
+        return 3
+    return supervisor.main(argv, partial(AwsSupervisor, line=line))
