@@ -25,7 +25,7 @@ from shared_store.layout import Store
 from tests.conftest import Serving, run_muster, wait_for
 from tests.support.engines.aws_bench import AwsBench
 from tests.support.engines.sites import POLITE, WAIT
-from tests.support.processes import command, processes_of
+from tests.support.processes import command, parent, processes_of
 
 LAST = (
     '[ $RANK != 0 ] || until [ "$(ls $MUSTER_STORE/runs/run/outcomes/$MUSTER_JOB_ID/1 2>/dev/null | wc -l)" = $((WORLD_SIZE - 1)) ]; '
@@ -390,4 +390,6 @@ def _supervisor(bench: AwsBench, node: int) -> int:
 
 
 def _rank(bench: AwsBench, node: int) -> int:
-    return processes_of(bench.volume.path, AWS_BATCH_JOB_NODE_INDEX=str(node))[0]
+    """The script itself: what it starts may have a lower pid, since pids begin again at 1 after the highest."""
+    found = processes_of(bench.volume.path, AWS_BATCH_JOB_NODE_INDEX=str(node))
+    return next(pid for pid in found if parent(pid) not in found)
