@@ -16,8 +16,8 @@ from typing import Any, cast
 
 import uvicorn
 
-from orchestrator.api.http.app import BROWSER_HEADERS, create_app
 from orchestrator.api.http.access import Access
+from orchestrator.api.http.app import BROWSER_HEADERS, create_app
 from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit

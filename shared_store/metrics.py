@@ -97,7 +97,7 @@ def history_of(run: Run) -> MetricsHistory:
 
 
 def sampled(run: Run, most: int = 60, until_epoch: int | None = None) -> list[dict[str, Any]]:
-    """About ``most`` records of the run's history, spread evenly over its bytes, in order; the newest is among them. Raises OSError.
+    """At most ``most`` records of the run's history, spread evenly over its bytes, in order; the newest is the last. Raises OSError.
 
     Reads that many lines, however long the history is, and keeps nothing. ``until_epoch``: the last epoch whose records count.
     """
@@ -110,7 +110,10 @@ def sampled(run: Run, most: int = 60, until_epoch: int | None = None) -> list[di
         records, resumed_from = _sampled(path, size, max(2, most * size // max(1, sum(sizes))))
         found = {iteration: each for iteration, each in records.items() if iteration <= limit} | found
         limit = min(limit, resumed_from)
-    return [found[iteration] for iteration in sorted(found)]
+    order = sorted(found)
+    step = max(1.0, (len(order) - 1) / max(1, most - 1))
+    chosen = {round(i * step) for i in range(most)} if step > 1 else range(len(order))
+    return [found[order[i]] for i in sorted(chosen) if i < len(order)]
 
 
 def _sampled(path: Path, size: int, most: int) -> tuple[dict[int, dict[str, Any]], float]:
@@ -119,13 +122,13 @@ def _sampled(path: Path, size: int, most: int) -> tuple[dict[int, dict[str, Any]
     with open_regular(path) as file:
         first = file.readline(_LONGEST)
         begin, tail = len(first), max(0, size - _BLOCK)
-        for place in range(most):
+        for place in range(most if tail else 0):  # of a short file all is read below
             if file.seek(begin + (size - begin) * place // most) > begin:
                 file.readline(_LONGEST)  # the rest of a line
             _keep(found, file.readline(_LONGEST))
         if file.seek(max(begin, tail)) > begin:
             file.readline(_LONGEST)
-        for line in file.read(2 * _BLOCK).splitlines(keepends=True)[-2:]:
+        for line in file.read(2 * _BLOCK).splitlines(keepends=True)[-2 if tail else 0 :]:
             _keep(found, line)
     before = _record(first).get("resumed_from")
     return found, before if isinstance(before, int) else math.inf

@@ -111,7 +111,9 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
         errors += answer["errors"]
     if errors:
         raise ClientError(f"{len(errors)} of {several} can't be stopped: {errors[0]['message']}", 403)
-    return done(request, _address(*(form.one(each) for each in ("state", "queue", "search"))), f"{several} asked to stop")
+    return done(
+        request, _address(*(form.one(each) for each in ("state", "queue", "search"))), f"{several} asked to stop"
+    )
 
 
 def _wanted(state: str, queue: str, search: str) -> Wanted:
@@ -131,7 +133,9 @@ def _read_window(controller: Controller, wanted: Wanted, page: int) -> tuple[dic
     found = page_of_jobs(controller, wanted, start, ROWS)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
     total, counts = found["total"], found["counts"]
-    totals = {name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()}
+    totals = {
+        name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()
+    }
     shown = f"{start + 1}–{start + len(rows)} of {total}" if rows else "none"
     return rows, {**totals, "shown": shown, "more": "yes" if start + len(rows) < total else ""}
 
@@ -162,7 +166,9 @@ def _row(job: Mapping[str, Any]) -> dict[str, Any]:
         "reward": words.count(progress.get("reward")),
         "spark": words.spark(progress.get("rewards") or ()),
         "created": words.moment(job.get("createdAt")),
-        "took": words.duration((job["stoppedAt"] - job["startedAt"]) / 1000) if is_over and job.get("startedAt") else "",
+        "took": words.duration((job["stoppedAt"] - job["startedAt"]) / 1000)
+        if is_over and job.get("startedAt")
+        else "",
         "since": words.moment(job.get("startedAt")) if job and not is_over else "",
         "open": "" if is_over else "yes",
     }

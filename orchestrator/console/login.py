@@ -37,7 +37,9 @@ def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
         token = access.sign_in(form.one("key").strip())
     except Refusal:
         wait = limit.refusal_of_failures(request.client.host if request.client else "unknown")
-        problem = wait or "this key is not known here; `muster keys list` shows the keys, `muster keys create NAME` makes one"
+        problem = (
+            wait or "this key is not known here; `muster keys list` shows the keys, `muster keys create NAME` makes one"
+        )
         return render(request, "login.html", 429 if wait else 403, next=there, problem=problem)
     answer = RedirectResponse(there, 303)
     secure = request.url.scheme == "https"
@@ -58,5 +60,7 @@ def log_out(request: Request) -> Response:
 
 def _own(address: str) -> str:
     """The address where it is a path of this server, else ``/``: a login must not lead elsewhere."""
-    is_own = re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address) is not None  # no other host, no backslash, no control character
+    is_own = (
+        re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address) is not None
+    )  # no other host, no backslash, no control character
     return address if is_own and not address.startswith(LOGIN) else "/"

@@ -61,7 +61,13 @@ templates = Environment(
     auto_reload=False,
 )
 templates.globals |= {"asset": assets.url, "version": __version__, "bound": words.bound}
-templates.filters |= {"ago": words.ago, "count": words.count, "moment": words.moment, "since": words.since, "duration": words.duration}
+templates.filters |= {
+    "ago": words.ago,
+    "count": words.count,
+    "moment": words.moment,
+    "since": words.since,
+    "duration": words.duration,
+}
 
 
 def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:

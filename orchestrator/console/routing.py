@@ -50,7 +50,9 @@ def page_router() -> APIRouter:
 
 def finish(app: FastAPI) -> None:
     """After the last page: the navigation learns which pages there are, and an address that leads nowhere is a page for browsers."""
-    app.state.console_paths = {each.path for each in NAVIGATION if any(_leads(route, each.path) for route in app.routes)}
+    app.state.console_paths = {
+        each.path for each in NAVIGATION if any(_leads(route, each.path) for route in app.routes)
+    }
     before: Any = app.exception_handlers[HTTPException]
 
     async def not_found(request: Request, error: Exception) -> Response:

@@ -21,7 +21,7 @@ def duration(seconds: float | None) -> str:
     left = max(0, int(seconds))
     if left < 60:
         return f"{left} s"
-    parts = []
+    parts: list[str] = []
     for size, unit in _UNITS:
         amount, left = divmod(left, size)
         if amount or parts:

@@ -45,7 +45,7 @@ class Wanted:
 
     def conditions(self) -> list[ColumnElement[bool]]:
         """Of the rows, but for the states; jobs that the caller may not see are left out."""
-        found = [Job.parent.is_(None)]
+        found: list[ColumnElement[bool]] = [Job.parent.is_(None)]
         if (queues := permissions.visible_queues()) is not None:
             found.append(Job.queue.in_(queues))
         if self.queue:
