@@ -93,8 +93,7 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; shared by all who look at it."""
     detail = job_detail(request, job_id)
-    is_visible = detail["results"] is not None
-    return {"facts": facts_of(detail), **_rows(controller_of(request), detail), "hasRun": is_visible}
+    return {"facts": facts_of(detail), **_rows(controller_of(request), detail)}
 
 
 def _rows(controller: Controller, detail: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,7 +126,7 @@ class _Feed:
         self.facts = seen["facts"]
         for name, rows in (("attempts", self.attempts), ("checkpoints", self.checkpoints)):
             events += [Event(name, each.data) for each in rows.changes(seen[name], {})]
-        if seen["hasRun"]:
+        if self.facts["run"]:
             events += self._curves()
         lines, is_behind = self.log.changes()
         events += [lines] if lines else []

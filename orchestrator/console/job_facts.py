@@ -40,6 +40,7 @@ def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
         "status": status,
         "reason": (detail["statusReason"] or "") if status != Status.SUCCEEDED else "",
         "open": "" if is_over else "yes",
+        "run": "yes" if detail["results"] is not None else "",
         "saves": "yes" if status == Status.RUNNING and training else "",
         "done": iteration,
         "iterations": iterations or 1,
@@ -90,8 +91,8 @@ def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> d
         "took": words.duration((stopped - started) / 1000) if started and stopped else "",
         "since": words.moment(started) if started and not stopped else "",
         "cost": cost + lost_words,
-        "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.2f}",
-        "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.2f}",
+        "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.1f}",
+        "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.1f}",
         "nodes": _where(attempt["nodes"]),
     }
 
