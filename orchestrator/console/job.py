@@ -28,7 +28,7 @@ from orchestrator.control.reconciler import Controller
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
-from shared_store.metrics import history_of
+from shared_store.metrics import history_of, sampled
 
 router = page_router()
 
@@ -136,16 +136,14 @@ class _Feed:
 
     def _curves(self) -> list[Event]:
         """New iterations; ``again`` where an attempt went back behind what the page has, or it has missed too much."""
-        history = history_of(self.run)
-        newest = int((history.last() or {}).get("iteration") or 0)
+        newest = max((each["iteration"] for each in sampled(self.run, 2)), default=0)
         had, self.iteration = self.iteration, newest
         if had is None or newest == had:
             return []
-        records = history.after(had, _RECORDS + 1) if newest > had else []
+        records = history_of(self.run).after(had, _RECORDS + 1) if newest > had else []
         if newest < had or len(records) > _RECORDS:
             return [Event("metrics", {"again": True})]
-        names = sorted({name for each in records for name in each})
-        return [Event("metrics", columns(records, names))]
+        return [Event("metrics", columns(records, ["*"]))]
 
 
 def _had(given: str) -> tuple[int | None, dict[str, int] | None]:

@@ -55,6 +55,8 @@ EVALUATED = 256
 """Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
 WARNINGS = 10
 """Resets of worlds are logged for at most this many iterations; later ones are only counted."""
+_MOST_RANKS = 32
+"""Ranks of which each is told by itself in a record."""
 EPISODES = ("episodes", "episode_return", "episode_length", "squared_return")
 """The task's statistics that become reward, episode length and score; the others are reported by their names."""
 
@@ -435,14 +437,16 @@ def _print(text: str) -> None:
     print(text, flush=True)
 
 
-def straggler(seconds: list[float]) -> dict[str, float]:
+def straggler(seconds: list[float]) -> dict[str, Any]:
     """The rank with the longest rollout in the previous iteration, and its excess over the median: all others wait for it.
 
     Args:
-        seconds: By rank; empty figures for a gang of one.
+        seconds: By rank; empty figures for a gang of one. They are part of the figures of at most 32 ranks.
     """
     if len(seconds) == 1:
         return {}
     slowest = max(range(len(seconds)), key=seconds.__getitem__)
     usual = statistics.median(seconds)
-    return {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
+    figures = {"slowest_rank": slowest, "slowest_excess": seconds[slowest] / usual - 1.0 if usual > 0 else 0.0}
+    by_rank = [float(f"{each:.4g}") for each in seconds]
+    return {**figures, **({"rank_collect_seconds": by_rank} if len(seconds) <= _MOST_RANKS else {})}
