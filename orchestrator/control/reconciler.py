@@ -24,7 +24,7 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
-from orchestrator.domain.job import TERMINAL, WAITING, Ending, Status
+from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.group_commit import GroupCommit
@@ -332,12 +332,10 @@ class Controller:
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:
         job.cancelled, job.stop_reason = True, cancel.reason
 
-    @staticmethod
-    def _preempt(preempt: Preempt, session: Session, job: Job) -> None:
-        by, attempt = session.get_one(Job, preempt.by), job.open_attempt
-        if attempt is not None and attempt.ending is None:
-            attempt.ending = Ending.PREEMPTED
-            attempt.status_reason = f"preempted by job {by.name} ({by.id[:8]})"
+    def _preempt(self, preempt: Preempt, session: Session, job: Job) -> None:
+        by = session.get_one(Job, preempt.by)
+        if attempt := job.open_attempt:
+            self.attempts.preempt(session, job, attempt, f"preempted by job {by.name} ({by.id[:8]})")
 
     def _start(self, start: Start, session: Session, job: Job) -> None:
         # a request may have ended the job since the snapshot was taken
