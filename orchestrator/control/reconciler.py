@@ -24,9 +24,11 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
+from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.columns import storable
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.models import Job, JobQueue, now
 from orchestrator.persistence.queries import ask_to_end
@@ -192,7 +194,7 @@ class Controller:
             self._failed(what, ids[0], error)
             return ids
         for job_id in ids:
-            self._backoff.worked((what, job_id))
+            self._backoff.worked((what, job_id), lasting=True)
         return []
 
     def _carried_out(self, ids: Sequence[str], body: Callable[[Session, Job], None]) -> None:
@@ -207,11 +209,10 @@ class Controller:
         """Note what went wrong with a job: logged once, shown as its reason, and tried again later and later."""
         expected = isinstance(error, StoreUnavailable)
         reason = str(error) if expected else f"the controller failed on this job ({_words(error)}); trying again"
+        reason = excerpt(storable(reason), LONGEST_REASON)
         if self._backoff.failed((what, job_id), f"job {job_id}: {reason}", None if expected else error):
             with self.database.session() as session:  # by its id alone: its row may be what is damaged
-                told = (
-                    update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason[:1024])
-                )
+                told = update(Job).where(Job.id == job_id, Job.status.not_in(TERMINAL)).values(status_reason=reason)
                 session.execute(told)
 
     def _advance(self, session: Session, job: Job) -> None:
@@ -228,7 +229,7 @@ class Controller:
     def _look_again(self, ids: Collection[str]) -> None:
         """Requests have changed these jobs: what failed of them is tried at once."""
         for job_id in ids:
-            for what in ("settle", "advance", "start"):
+            for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._backoff.hurry((what, job_id))
         self.work_queue.look_again(ids)
 
@@ -321,12 +322,14 @@ class Controller:
 
     def _carry_out(self, decisions: Decisions) -> None:
         """Each decision by itself: one that fails does not stop the others."""
-        for cancel in decisions.cancels:
-            self._guarded("cancel", [cancel.job], partial(self._cancel, cancel))
-        for preempt in decisions.preempts:
-            self._guarded("preempt", [preempt.job], partial(self._preempt, preempt))
-        for start in decisions.starts:
-            self._guarded("start", [start.job], partial(self._start, start))
+        bodies: list[tuple[str, str, Callable[[Session, Job], None]]] = [
+            *(("cancel", each.job, partial(self._cancel, each)) for each in decisions.cancels),
+            *(("preempt", each.job, partial(self._preempt, each)) for each in decisions.preempts),
+            *(("start", each.job, partial(self._start, each)) for each in decisions.starts),
+        ]
+        for what, job_id, body in bodies:
+            if not self._backoff.waits((what, job_id)):
+                self._guarded(what, [job_id], body)
 
     @staticmethod
     def _cancel(cancel: Cancel, session: Session, job: Job) -> None:

@@ -54,11 +54,13 @@ both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NO
 silences = st.just([None] * NODES) | st.lists(st.none() | st.floats(0, 60), min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
 launches = st.one_of(
-    st.just(Launched("handle")), st.builds(LaunchDelayed, words, st.booleans()), st.just(LaunchRefused("refused"))
+    *[st.just(Launched("handle"))] * 4,
+    st.builds(LaunchDelayed, words, st.booleans()),
+    st.just(LaunchRefused("refused")),
 )
 looks = st.builds(Observed, moments, both, silences, words, words, words)
 gone = st.builds(Gone, moments, both | st.just([]), words)
-stops = st.none() | st.just(StopDelayed("not allowed")) | gone
+stops = st.one_of(gone, gone, gone, st.none(), st.just(StopDelayed("not allowed")))
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ def closed(page: Page) -> Close | None:
     return next((each for each in page.instructions if isinstance(each, Close)), None)
 
 
-stories = st.builds(told, terms, st.lists(turns, min_size=1, max_size=12))
+stories = st.builds(told, terms, st.lists(turns, min_size=8, max_size=14))
 
 
 @settings(max_examples=80, deadline=None)
