@@ -12,12 +12,13 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from sqlalchemy import func, select, update
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.control.attempts import Attempts, StoreUnavailable
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
+from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers
@@ -25,7 +26,7 @@ from orchestrator.control.snapshot import open_attempts, take_snapshot
 from orchestrator.control.usage import forget_before, held_by
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.domain.job import TERMINAL, WAITING, Status
+from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.columns import storable
@@ -233,52 +234,9 @@ class Controller:
                 self._backoff.hurry((what, job_id))
         self.work_queue.look_again(ids)
 
-    # -- jobs without a gang ------------------------------------------------------------------------------------------
-
     def _settle(self, session: Session, job: Job) -> None:
-        """A job that has no gang: ended on request, held back by others, an array by its children, or ready to run."""
         self.work_queue.note([job])
-        if job.is_terminal or job.open_attempt is not None:
-            return
-        if job.queued_since is None:
-            job.queued_since = job.created_at - self.clock.drift
-        if job.kind == "array":
-            self._settle_array(session, job)
-        elif job.stop_reason is not None:
-            job.move(Status.FAILED, job.stop_reason)
-        elif job.status in (Status.SUBMITTED, Status.PENDING):
-            states = {each.on_id: self._state(session, each.on_id) for each in job.dependencies}
-            failed = [on for on, status in states.items() if status == Status.FAILED]
-            pending = [on for on, status in states.items() if status != Status.SUCCEEDED]
-            if failed:
-                job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
-            elif pending:
-                others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
-                job.move(Status.PENDING, f"waits for the success of job {pending[0]}{others}")
-            else:
-                job.move(Status.RUNNABLE, WAITING)
-        elif job.status == Status.RUNNABLE:
-            _ = job.gang  # raises where the row is damaged, which is why the job is looked at
-
-    def _settle_array(self, session: Session, job: Job) -> None:
-        """An array is over when its last child is; one failed child makes it FAILED."""
-        query = select(Job.status, func.count()).where(Job.parent == job.id).group_by(Job.status)
-        counts: dict[str, int] = {status: count for status, count in session.execute(query)}
-        left = sum(count for status, count in counts.items() if not Status(status).is_terminal)
-        if job.status == Status.SUBMITTED:
-            job.move(Status.PENDING, f"an array of {job.array_size}")
-        if left:
-            return
-        failed = counts.get(Status.FAILED, 0)
-        if failed:
-            job.move(Status.FAILED, job.stop_reason or f"{failed} of {job.array_size} array jobs failed")
-        else:
-            job.move(Status.SUCCEEDED, "all array jobs succeeded")
-
-    @staticmethod
-    def _state(session: Session, job_id: str) -> str:
-        job = session.get(Job, job_id)
-        return job.status if job is not None else Status.FAILED
+        settle(session, job, self.clock)
 
     # -- admission ----------------------------------------------------------------------------------------------------
 

@@ -17,8 +17,9 @@ from orchestrator.domain.hosts import Host
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Plan
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.models import Attempt, Job, Node
 from tests.support.orchestrator.fake_controller import FakeController, properties
+from tests.support.orchestrator.rows import job
 from tests.support.waiting import wait_for
 
 
@@ -157,3 +158,18 @@ def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
     assert tracebacks == [f"job bad: the controller failed on this job (RuntimeError: {shown}); trying again"]
     monkeypatch.undo()
     bench.wait("urgent" if part == "preempt" else "bad", Status.RUNNING)
+
+
+@pytest.mark.parametrize("damaged", [{}, {"numNodes": 1}, {"numNodes": "x", "mainNode": 0}], ids=str)
+def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_starting(
+    bench: Bench, caplog: pytest.LogCaptureFixture, damaged: dict[str, Any]
+) -> None:
+    nodes = [Node(index=0, host="fake/small", cpus=1.0, memory=64)]
+    with bench.database.session() as session:
+        row = job("bad", status=Status.RUNNING, node_properties=damaged)
+        row.attempts.append(Attempt(number=1, epoch=1, nodes=nodes, compute_environment="fake"))
+        session.add(row)
+    bench.explains("bad", "the controller failed on this job")
+    bench.runs_and_ends("good-0", "good-1")
+    [failed] = [record.getMessage() for record in caplog.records if record.exc_info]
+    assert failed.startswith("job bad: the controller failed on this job")
