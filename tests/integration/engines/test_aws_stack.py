@@ -258,6 +258,10 @@ def test_status_says_what_is_there_and_writes_what_the_engine_needs(account: Acc
     (account.home / "aws.json").unlink()
     told = json.loads(account.muster("status", "--json", "--write").stdout)
     assert (account.home / "aws.json").read_text() == before
+    (account.home / "aws.json").write_text(json.dumps({**json.loads(before), "poll": "2"}))
+    refused = account.muster("status", "--write").stderr
+    assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a text ('2')")
+    (account.home / "aws.json").write_text(before)
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == (
         "muster: there is no stack other in us-east-1; create it with `muster aws up`\n"
