@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.hosts import Capacity, Placement
 from shared_store.contract import NodeContract
 from shared_store.log_files import LIMIT
 from shared_store.wording import nearest
@@ -314,8 +314,6 @@ class Engine(Protocol):
     """
 
     name: str
-    queues: bool
-    """It queues gangs by itself: they are handed over at once, and what runs on its hosts is not counted here."""
     elastic: bool
     """Its hosts come and go: a gang that needs more of them than there are waits, and is not refused."""
     images: bool
@@ -323,8 +321,11 @@ class Engine(Protocol):
     address: str | None
     """Address of this machine as its nodes see it, where the bus has to listen; None for loopback."""
 
-    def capacity(self) -> Sequence[Host]:
-        """Every host with all that it has, free or not. Their names begin with the engine's and a slash."""
+    def capacity(self) -> Capacity:
+        """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
+
+        Names of hosts begin with the engine's and a slash.
+        """
         ...
 
     def plan(self, gang: Gang) -> Plan[Any]:

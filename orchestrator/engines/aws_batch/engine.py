@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
 from botocore.parsers import ResponseParserError
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Limit, Queued
+from orchestrator.domain.resources import Resources
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -96,7 +97,6 @@ class AwsBatchEngine:
     """One account's AWS Batch, as ``$MUSTER_HOME/aws.json`` describes it."""
 
     name = "aws-batch"
-    queues = True
     elastic = True
     images = True
     address: str | None = None  # nodes on AWS do not reach this machine
@@ -118,26 +118,28 @@ class AwsBatchEngine:
             self._logs = session.client("logs", endpoint_url=url, config=twice)
         except (BotoCoreError, NoRegionError) as error:
             raise EngineError(f"AWS: {error}; see `aws configure`") from None
-        self._hosts: dict[str, tuple[float, Host]] = {}
+        self._limits: dict[str, tuple[float, int]] = {}
+        """By job queue: when it was asked for (monotonic [s]), and its vCPUs."""
         self._gangs: dict[str, _Watched] = {}
         self._lock = threading.Lock()
         self._check_queue()
 
-    def capacity(self) -> Sequence[Host]:
-        """One host: what the queue's compute environments may grow to.
+    def capacity(self) -> Queued:
+        """What the queue's compute environments may grow to.
 
         AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
         is taken as their number, and what does not exist waits there with AWS's own reason.
         """
         queue = self.config.job_queue
-        asked, host = self._hosts.get(queue, (0.0, self._host(self.config.max_vcpus)))
+        asked, vcpus = self._limits.get(queue, (0.0, self.config.max_vcpus))
         if not asked or time.monotonic() - asked > _CAPACITY_AGE:
             try:
-                host = self._host(self._max_vcpus(queue))
+                vcpus = self._max_vcpus(queue)
             except (ClientError, BotoCoreError, ResponseParserError):
                 pass  # as before
-            self._hosts[queue] = (time.monotonic(), host)
-        return [host]
+            self._limits[queue] = (time.monotonic(), vcpus)
+        name = f"{self.name}/{queue.rpartition('/')[2]}"
+        return Queued(Limit(name, Resources(float(vcpus), vcpus // 4, vcpus * _MEMORY)))
 
     def plan(self, gang: Gang) -> Plan[Requests]:
         """The requests; nodes' addresses are AWS's to give."""
@@ -356,11 +358,6 @@ class AwsBatchEngine:
         return is_mounted_from(Path(store).resolve(), self.config.file_system, Path("/proc/self/mountinfo").read_text())
 
     # -- capacity -----------------------------------------------------------------------------------------------------
-
-    def _host(self, vcpus: int) -> Host:
-        name = self.config.job_queue.rpartition("/")[2]
-        gpus = tuple(str(number) for number in range(vcpus // 4))
-        return Host(f"{self.name}/{name}", float(vcpus), gpus, vcpus * _MEMORY)
 
     def _max_vcpus(self, queue: str) -> int:
         found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]

@@ -30,7 +30,7 @@ from docker.models.images import Image
 from docker.models.networks import Network
 from docker.types import IPAMConfig, IPAMPool
 
-from orchestrator.domain.hosts import HERE, Host
+from orchestrator.domain.hosts import HERE, Host, Hosts
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -71,7 +71,6 @@ class DockerEngine:
     """One machine's Docker Engine."""
 
     name = "docker"
-    queues = False
     elastic = False
     images = True
 
@@ -107,8 +106,8 @@ class DockerEngine:
         self._ended: dict[str, dict[int, NodeStatus]] = {}
         self._away = False
 
-    def capacity(self) -> Sequence[Host]:
-        return [self._host]
+    def capacity(self) -> Hosts:
+        return Hosts([self._host])
 
     def plan(self, gang: Gang) -> Plan[Sequence[ContainerRequest]]:
         """With the addresses of the first subnet that would be tried."""

@@ -20,12 +20,12 @@ import os
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Queued
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -69,7 +69,6 @@ class SlurmEngine:
     """A Slurm cluster, by the commands of this machine."""
 
     name = "slurm"
-    queues = True
     elastic = True
     images = False
 
@@ -83,8 +82,8 @@ class SlurmEngine:
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
 
-    def capacity(self) -> Sequence[Host]:
-        return self._hosts.get()
+    def capacity(self) -> Queued:
+        return Queued(self._hosts.get())
 
     def plan(self, gang: Gang) -> Plan[Submission]:
         """With the whole script; the nodes' addresses are known when Slurm has placed them."""

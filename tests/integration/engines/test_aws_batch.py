@@ -15,7 +15,7 @@ from typing import Any
 import boto3
 import pytest
 
-from orchestrator.domain.hosts import Placement
+from orchestrator.domain.hosts import Limit, Placement
 from orchestrator.engines.api import EngineError, NotYet
 from orchestrator.engines.aws_batch import engine as aws_batch
 from orchestrator.engines.aws_batch.config import is_mounted_from
@@ -288,8 +288,8 @@ def test_a_gang_that_waits_says_why_and_aws_away_changes_nothing(bench: AwsBench
 
     said = wait_for(reason, 10, "the reason")
     assert said.startswith("AWS Batch: ") and "CPUs" in said
-    host = bench.engine.capacity()[0]
-    assert (host.name, host.single) == ("aws-batch/default", False) and host.cpus > 0
+    limit = bench.engine.capacity().limits
+    assert isinstance(limit, Limit) and limit.queue == "aws-batch/default" and limit.resources.cpus > 0
     away = AwsBench(bench.aws, bench.home)
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
     away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start

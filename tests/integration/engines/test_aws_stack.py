@@ -20,7 +20,8 @@ from moto.cloudformation.models import cloudformation_backends
 from moto.ec2.models import ec2_backends
 
 from orchestrator.cli import main
-from orchestrator.domain.hosts import Placement
+from orchestrator.domain.hosts import Limit, Placement, Queued
+from orchestrator.domain.resources import Resources
 from orchestrator.engines.aws_batch.config import load_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
 from orchestrator.engines.aws_batch.stack import Event, first_failure
@@ -222,8 +223,7 @@ def test_the_engine_works_on_what_up_has_written(
     for name, value in account.env.items():
         monkeypatch.setenv(name, value)
     engine = AwsBatchEngine(account.home)
-    [host] = engine.capacity()
-    assert (host.name, host.cpus, len(host.gpus)) == ("aws-batch/muster", 256.0, 64)
+    assert engine.capacity() == Queued(Limit("aws-batch/muster", Resources(256.0, 64, 256 * 32 * 1024)))
     gang = make_gang(
         tmp_path,
         job="11111111-2222-4333-8444-555555555555",

@@ -27,13 +27,13 @@ bench = slurm_bench
 
 
 def test_hosts_have_what_slurm_says_and_those_that_are_drained_are_away(bench: SlurmBench) -> None:
-    hosts = bench.engine.capacity()
+    hosts = bench.engine.capacity().machines
     assert [(h.name, h.cpus, h.gpus, h.memory, h.single) for h in hosts] == [
         (f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES
     ]
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
     try:
-        assert [host.away for host in SlurmEngine().capacity()] == [False, True, False]
+        assert [host.away for host in SlurmEngine().capacity().machines] == [False, True, False]
         handle = bench.launch(bench.gang(nodes=3))
         wait_for(lambda: "nodes that it needs are down" in bench.engine.observe(handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)

@@ -71,17 +71,17 @@ def test_a_supervisor_that_has_not_begun_yet_is_not_taken_for_its_shim(bench: Lo
 
 
 def test_the_machine_is_the_only_host_with_what_it_was_given() -> None:
-    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity()
+    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity().machines
     assert (host.name, host.cpus, host.gpus) == ("localhost", 6, ("2", "5"))
     assert host.memory == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
 
 
 def test_without_a_limit_the_machine_s_own_cpus_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1,3")
-    [host] = LocalEngine(Path("/nowhere")).capacity()
+    [host] = LocalEngine(Path("/nowhere")).capacity().machines
     assert (host.cpus, host.gpus) == (float(os.cpu_count() or 1), ("1", "3"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert LocalEngine(Path("/nowhere")).capacity()[0].gpus == ()
+    assert LocalEngine(Path("/nowhere")).capacity().machines[0].gpus == ()
 
 
 def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: LocalBench) -> None:

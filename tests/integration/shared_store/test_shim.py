@@ -14,7 +14,7 @@ import pytest
 
 from shared_store.cgroups import own_group, remove_abandoned_groups, remove_group
 from shared_store.nodes import NodeProcesses, end_nodes
-from shared_store.processes import end_all, find_process, marked
+from shared_store.processes import await_marks, end_all, find_process, marked
 from shared_store.shim import SCRATCH, STUCK, group_of, shimmed
 from tests.conftest import PATIENCE, wait_for
 from tests.support.processes import alive, await_end, frozen, processes_running, signal_all
@@ -207,6 +207,17 @@ def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pi
 def test_marks_that_would_fit_every_process_are_refused(marks: list[str]) -> None:
     with pytest.raises(ValueError, match="no process can be told by the marks"):
         marked(marks)
+
+
+def test_a_child_that_was_just_started_is_found_by_its_marks() -> None:
+    for number in range(50):  # without the wait about every third would not be
+        mark = f"MUSTER_GANG=just-started/{number}/{os.getpid()}"
+        with subprocess.Popen(["sleep", "600"], env=dict([mark.split("=")])) as child:
+            await_marks(child.pid)
+            found = [process.pid for process in marked([mark])]
+            child.kill()
+        assert found == [child.pid]
+    await_marks(child.pid)  # of one that is gone it returns
 
 
 def test_abandoned_groups_are_removed_and_neither_those_in_use_nor_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
