@@ -171,6 +171,8 @@ class Attempts:
             directory=options.directory or None,
             stall_timeout=options.stall_timeout,
             log_limit=options.log_limit,
+            ranks=[node.ranks for node in nodes],
+            is_native=options.is_native,
             is_gang=job.kind == "multinode",
             isolated=not options.is_native,
             containers=[node.container for node in nodes],

@@ -63,6 +63,10 @@ class Gang:
     """Seconds without an iteration after which a rank counts as stuck."""
     log_limit: int = LIMIT
     """Bytes of each node's log that are kept."""
+    ranks: Sequence[int] = ()
+    """Training processes by node index; empty: one on each."""
+    is_native: bool = False
+    """It came from a job YAML, so that each of its nodes has Muster."""
     is_gang: bool = True
     """False for a single-node job, whose environment has no node variables on AWS."""
     array: tuple[int, int] | None = None
@@ -131,7 +135,7 @@ def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan
             store=gang.store,
             epoch=gang.epoch,
             job_epoch=gang.job_epoch,
-            ranks_per_node=int(gang.environments[index].get("MUSTER_RANKS_PER_NODE", 1)),
+            ranks_per_node=gang.ranks[index] if gang.ranks else 1,
             grace=gang.grace,
             queue=gang.queue,
             compute_environment=gang.compute_environment,

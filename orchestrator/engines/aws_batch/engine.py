@@ -8,7 +8,6 @@ checkpoints stay on the volume.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import threading
 import time
@@ -40,10 +39,8 @@ from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
 from orchestrator.engines.toolkit.endings import ended
-from shared_store.files import DamagedFile
-from shared_store.layout import Store
-from shared_store.log_files import LIMIT
-from shared_store.outcomes import EX_TEMPFAIL, Outcome, read_outcome, write_outcome
+from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from shared_store.outcomes import EX_TEMPFAIL, Outcome
 from shared_store.wording import counted
 
 _OVER = ("SUCCEEDED", "FAILED")
@@ -160,7 +157,8 @@ class AwsBatchEngine:
         except (BotoCoreError, ResponseParserError) as error:
             raise NotYet(f"AWS Batch does not answer: {error}; trying again") from None
         facts = {
-            **{key: getattr(gang, key) for key in ("job", "attempt", "epoch", "run", "store", "main", "log_limit")},
+            **store_facts(gang),
+            "main": gang.main,
             "aws": job,
             "queue": queue,
             "supervised": list(requests.supervised),
@@ -309,24 +307,19 @@ class AwsBatchEngine:
         reason = container.get("reason") or ("" if code == 0 else detail.get("statusReason") or "")
         stopped = float(detail.get("stoppedAt") or time.time() * 1000) / 1000
         asked = bool(watched.main_stopped) and detail.get("stoppedAt", 0) > (watched.main_stopped or 0)
-        seen = Outcome(
-            index, handle.facts["epoch"], code or 0, None, str(reason) or _exited(code), None, stopped, stopped, asked
-        )
-        if code is not None and not self._settled(handle, watched, log, seen):
+        outcome = seen(handle, index, code or 0, str(reason), stopped, asked)
+        if code is not None and not self._settled(handle, watched, log, outcome):
             return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
         return _ended(address, code, str(reason))
 
-    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, seen: Outcome) -> bool:
+    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here where nobody else did."""
-        run = Store(handle.facts["store"]).run(handle.facts["run"])
-        if read_outcome(run, handle.facts["job"], handle.facts["attempt"], seen.node) is not None:
+        if recorded(handle, outcome.node) is not None:
             return True
-        since = time.monotonic() - watched.ended[seen.node]
+        since = time.monotonic() - watched.ended[outcome.node]
         if not (log.whole if log is not None else since > _FIXED):
             return False
-        if run.path.exists():
-            with contextlib.suppress(DamagedFile):  # a link in its place: what AWS says of the node counts then
-                write_outcome(run, handle.facts["job"], handle.facts["attempt"], (log.outcome if log else None) or seen)
+        record(handle, (log.outcome if log else None) or outcome)
         return True
 
     def _follow(self, handle: Handle, watched: _Watched, index: int, stream: str | None, over: bool) -> NodeLog | None:
@@ -338,14 +331,9 @@ class AwsBatchEngine:
 
     def _copies(self, handle: Handle) -> GangLogs:
         """The copies of a gang's logs, begun."""
-        run, shared = Store(handle.facts["store"]).run(handle.facts["run"]), self._is_shared(handle.facts["store"])
+        shared = self._is_shared(handle.facts["store"])
         nodes = [
-            NodeLog(
-                run.log(handle.facts["job"], handle.facts["attempt"], index),
-                supervised,
-                copied=not (supervised and shared),
-                limit=handle.facts.get("log_limit", LIMIT),
-            )
+            NodeLog(*log_of(handle, index), supervised, copied=not (supervised and shared))
             for index, supervised in enumerate(handle.facts["supervised"])
         ]
         logs = GangLogs(self._logs, self.config.log_group, nodes, self.config.poll, self.config.quiet)
@@ -398,10 +386,6 @@ def _ended(address: str, code: int | None, reason: str) -> NodeStatus:
     if code is None and reason and not reason.startswith("Host EC2"):
         return NodeStatus(NodePhase.ENDED, address, reason)  # it never started, or AWS does not say
     return ended(address, code, reason)
-
-
-def _exited(code: int | None) -> str:
-    return f"container exited with code {code}" if code else "done"
 
 
 def _is_transient(error: ClientError) -> bool:

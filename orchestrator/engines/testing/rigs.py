@@ -144,5 +144,6 @@ def make_gang(
         placements=[Placement(host, (), 0.2, 64)] * nodes,
         grace=1.0,
         directory=None,
+        is_native=True,
         containers=containers,
     )

@@ -172,7 +172,7 @@ def test_a_gang_that_can_not_be_started_whole_is_not_started_at_all(bench: Local
 
 
 def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: LocalBench) -> None:
-    gang = bench.gang("echo $RANK of $WORLD_SIZE", environments=[{"MUSTER_RANKS_PER_NODE": "2"}] * 2)
+    gang = bench.gang("echo $RANK of $WORLD_SIZE", ranks=[2, 2])
     bench.ended(bench.launch(gang))
     assert sorted(bench.printed()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
 
