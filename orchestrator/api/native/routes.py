@@ -371,7 +371,7 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
         "spent": attempt.spent,
-        "pool": attempt.compute_environment,
+        "computeEnvironment": attempt.compute_environment,
         "gpuSeconds": attempt.gpu_seconds,
         "cpuSeconds": attempt.cpu_seconds,
         "wastedGpuSeconds": attempt.wasted_gpu_seconds,

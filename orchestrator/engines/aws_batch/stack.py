@@ -153,8 +153,8 @@ class Stack:
         with _said():
             batch = self._session.client("batch")
             queues = batch.describe_job_queues(jobQueues=[outputs["JobQueueArn"]])["jobQueues"]
-            pools = batch.describe_compute_environments(computeEnvironments=[outputs["ComputeEnvironmentArn"]])
-            for key, each in (("queue", queues), ("computeEnvironment", pools["computeEnvironments"])):
+            described = batch.describe_compute_environments(computeEnvironments=[outputs["ComputeEnvironmentArn"]])
+            for key, each in (("queue", queues), ("computeEnvironment", described["computeEnvironments"])):
                 wanted = ("state", "status", "statusReason")
                 told[key] = {name: each[0][name] for name in wanted if each[0].get(name)} if each else {}
             told["jobs"] = self.jobs(outputs["JobQueueArn"])

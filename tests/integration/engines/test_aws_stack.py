@@ -164,11 +164,11 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
     batch = account.client("batch")
     [queue] = batch.describe_job_queues(jobQueues=["muster"])["jobQueues"]
     [order] = queue["computeEnvironmentOrder"]
-    [pool] = batch.describe_compute_environments(computeEnvironments=[order["computeEnvironment"]])[
+    [described] = batch.describe_compute_environments(computeEnvironments=[order["computeEnvironment"]])[
         "computeEnvironments"
     ]
-    resources = pool["computeResources"]
-    assert (pool["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
+    resources = described["computeResources"]
+    assert (described["type"], resources["type"], int(resources["maxvCpus"])) == ("MANAGED", "EC2", 256)
     assert resources["subnets"] == [account.physical("PrivateSubnet1")] and resources["instanceTypes"] == [
         "g6.12xlarge"
     ]
