@@ -306,6 +306,7 @@ class Attempts:
                 record.met = True
             if node.gpus:
                 record.devices = tuple(node.gpus)
+            record.host = node.host or record.host
             record.address = node.address or record.address or ""  # of a node that can't be seen it stays known
         return ends
 

@@ -240,6 +240,8 @@ class NodeStatus:
     """128 + n for signal n; None while it runs, or if the end was not observed."""
     gpus: tuple[str, ...] = ()
     """Ids of those that it has, from an engine that hands them out itself and tells."""
+    host: str = ""
+    """Name of the host that it is on, from an engine that places gangs by itself, once it tells."""
     stale: str = ""
     """Why this is an older status, from an engine that keeps the last one while its scheduler does not answer."""
 

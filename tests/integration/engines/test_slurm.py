@@ -116,6 +116,7 @@ def test_every_node_gets_its_contract_and_the_user_s_environment_to_the_letter(
     addresses = bench.cluster.addresses
     assert [env["MUSTER_ADDRESS"] for env in told] == [addresses[name] for name in ("n2", "n1", "n3")]
     assert [node.address for node in bench.engine.observe(handle)] == [env["MUSTER_ADDRESS"] for env in told]
+    assert [node.host for node in bench.engine.observe(handle)] == ["slurm/n2", "slurm/n1", "slurm/n3"]
     for env in told:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
         assert env["SLURM_JOB_NAME"] == gang.title

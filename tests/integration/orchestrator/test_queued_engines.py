@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -15,8 +16,8 @@ from orchestrator.domain.hosts import Host, Limit, Queued
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.server import Server
-from tests.conftest import submit_gang
-from tests.support.orchestrator.jobs import await_status
+from tests.conftest import submit_gang, wait_for
+from tests.support.orchestrator.jobs import await_status, detail
 
 
 @pytest.fixture
@@ -42,6 +43,16 @@ def test_gangs_are_handed_over_although_others_run_there(client: Client, engine:
         await_status(client, job, "RUNNING")
     hosts = {placement.host for plan in engine.cluster.launched for placement in plan.gang.placements}
     assert len(engine.cluster.launched) == 3 and hosts == {"fake/q"}
+
+
+def test_a_node_is_on_the_host_that_the_engine_tells_later(client: Client, engine: FakeEngine) -> None:
+    job = submit_gang(client, "pass", nodes=2)
+    [attempt] = await_status(client, job, "RUNNING")["attempts"]
+    assert attempt["computeEnvironment"] == "fake" and [node["host"] for node in attempt["nodes"]] == ["fake/q"] * 2
+    [nodes] = engine.cluster.gangs.values()
+    nodes[1] = replace(nodes[1], host="fake/m7")
+    hosts = lambda: [node["host"] for node in detail(client, job)["attempts"][0]["nodes"]]  # noqa: E731
+    wait_for(lambda: hosts() == ["fake/q", "fake/m7"], 20, "the host")
 
 
 def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(client: Client) -> None:
