@@ -25,7 +25,7 @@ from orchestrator.api.context import controller_of, permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.native import league_routes, model_routes, run_routes, runs, webhook_routes
+from orchestrator.api.native import job_list, league_routes, model_routes, run_routes, runs, webhook_routes
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
@@ -46,10 +46,10 @@ from orchestrator.persistence.session import DatabaseError
 from orchestrator.scheduling.placement import needs
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
-from orchestrator.spec.model import KINDS
 from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
+router.include_router(job_list.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
@@ -255,7 +255,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "owner": job.owner,
                 "run": job.run,
                 "runIsReplaced": is_replaced,
-                "kind": next((kind for kind in KINDS if (gang.spec or {}).get(kind)), "command"),
+                "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
                 "statusReason": controller.reason(job) or job.status_reason,
                 "queue": job.queue,
