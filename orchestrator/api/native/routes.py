@@ -35,7 +35,7 @@ from orchestrator.control.snapshot import fit_in_queue, new_nodes
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.hosts import Limit, Queued, engine_of
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
@@ -95,6 +95,8 @@ def _jobs_of_run(session: Session, reference: str) -> str:
 def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone.
 
+    ``queued``: the engines that queue and place gangs by themselves, each with the most that a gang may have there, or null where its
+    hosts tell that.
     ``queues``: those whose jobs the caller may see.
     """
     controller = controller_of(request)
@@ -103,13 +105,20 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
         queues = queue_names(session)
+    capacities = controller.engine.capacity(names, FRESH)
     return {
         "engines": own_queues(controller.engine.names),
-        "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
+        "hosts": [asdict(host) for capacity in capacities.values() for host in capacity.machines],
+        "queued": {name: _limit(each) for name, each in capacities.items() if isinstance(each, Queued)},
         "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
         "queues": queues,
     }
+
+
+def _limit(capacity: Queued) -> dict[str, Any] | None:
+    limits = capacity.limits
+    return {"queue": limits.queue, **asdict(limits.resources)} if isinstance(limits, Limit) else None
 
 
 @router.post("/plan")
@@ -362,7 +371,7 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
         "spent": attempt.spent,
-        "pool": attempt.compute_environment,
+        "computeEnvironment": attempt.compute_environment,
         "gpuSeconds": attempt.gpu_seconds,
         "cpuSeconds": attempt.cpu_seconds,
         "wastedGpuSeconds": attempt.wasted_gpu_seconds,
