@@ -317,7 +317,10 @@ def stop(
     reason: Annotated[str, typer.Option(help="Kept with the job.")] = "stopped by the user",
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return when the job has ended.")] = True,
 ) -> None:
-    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there."""
+    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there.
+
+    A training ends its iteration first. One that does not end within the 30 s that a job has is left, and `muster resume` repeats it.
+    """
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in ("SUCCEEDED", "FAILED"):
@@ -325,18 +328,47 @@ def stop(
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
+        slow = wait and _slow_iteration(detail)
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
                 echo(f"{detail['name']} ({detail['id'][:8]}): {one_line(said)}", err=True)
+            if slow and time.monotonic() > patience:
+                echo(slow, err=True)
+                slow = ""
     if not wait:
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
+    if kept := _kept(detail):
+        echo(kept)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
+
+
+def _slow_iteration(detail: Mapping[str, Any]) -> str:
+    """What may become of the present iteration of a training whose iterations last long; empty for others."""
+    seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
+    if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
+        return ""
+    return (
+        f"an iteration takes about {seconds:.0f} s; one that does not end in the time that the job has to leave (30 s, unless the "
+        f"engine gives less) is left, and resume repeats it; to lose none: muster checkpoint {detail['name']}, then stop"
+    )
+
+
+def _kept(detail: Mapping[str, Any]) -> str:
+    """What is kept of a stopped training, and what is lost; empty for other jobs."""
+    done = (detail["progress"] or {}).get("iteration", 0)
+    if detail["kind"] != "train" or not detail["results"]:
+        return ""
+    if not detail["results"]["checkpoint"]:
+        return "there is no checkpoint: it did not end an iteration" if not done else "there is no checkpoint: all is lost"
+    saved = detail["results"]["iteration"]
+    lost = f"; the {counted(done - saved, 'iteration')} after it, until {done}, are lost" if done > saved else ""
+    return f"last checkpoint: iteration {saved}{lost}"
 
 
 def checkpoint(job: JobArgument) -> None:

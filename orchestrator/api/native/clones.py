@@ -7,6 +7,7 @@ the source does no harm.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import select
@@ -26,11 +27,13 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import first_description, forget_gone_run
 from orchestrator.spec.changes import override
-from orchestrator.spec.model import ALGORITHMS, Spec, validate
+from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
+from orchestrator.spec.settings import task_config
 from shared_store.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.layout import Run
 from shared_store.parent import NewRun, RunExists, TeacherCopy
 from shared_store.settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.wording import Refused
 
 
 def clone(
@@ -165,6 +168,24 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
         raise ClientError(
             f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
         )
+    if name in ALGORITHMS and (misfit := _of_other_size(manifest, spec.train)):
+        key, there, here = misfit
+        raise ClientError(
+            f"{where} was learnt with train.config.{key}: {there}, and the clone would have {here}, for which its network has another "
+            "size; leave the setting as it is, or submit a new training"
+        )
+
+
+def _of_other_size(manifest: Mapping[str, Any], train: Train) -> tuple[str, str, str] | None:
+    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, there, here."""
+    kind, learnt = task_config(train.task), manifest.get("train")
+    if kind is None or not isinstance(learnt, dict) or manifest.get("task") != train.task:
+        return None
+    try:
+        there, here = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
+    except Refused:  # of what another version has written
+        return None
+    return next(((key, there[key], here[key]) for key in there if key in here and there[key] != here[key]), None)
 
 
 _EXISTS = "run {} exists already: give the clone another --name"
