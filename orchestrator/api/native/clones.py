@@ -55,6 +55,21 @@ def clone(
     return with_teacher(controller, lambda teacher: _clone(controller, source, name, changes, idempotency_key, teacher))
 
 
+def check_clone(controller: Controller, source: Run, name: str, changes: Changes) -> dict[str, Any]:
+    """The definition that :func:`clone` would register, its queue and whose weights it would begin with; nothing is submitted.
+
+    Raises ClientError as :func:`clone`.
+    """
+    with controller.database.session() as session:
+        spec, chosen = _checked(Context(session, controller), source, name, changes)
+    definition = _check_submission(controller, spec, changes, name)
+    return {
+        "definition": definition,
+        "queue": spec.queue,
+        "parent": {"run": source.name, "iteration": chosen.iteration},
+    }
+
+
 def _clone(
     controller: Controller,
     source: Run,
@@ -67,14 +82,9 @@ def _clone(
         context = Context(session, controller, idempotency_key)
         if earlier := _answered(context, name):
             return earlier
-        spec = _changed(session, source, name, changes)
+        spec, chosen = _checked(context, source, name, changes)
         new = context.run(name)
-        _check_free(session, new)
-        chosen = _choose(source, changes)
-        _check_weights(source, chosen, spec)
-    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    with controller.database.session() as session:  # before the copy: not for who may not submit it
-        check(Context(session, controller), spec, changes.directory, f"clone {name}")
+    _check_submission(controller, spec, changes, name)  # before the copy: not for who may not submit it
     controller.check_writable(adds=True)
     if shortage := controller.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
@@ -101,6 +111,22 @@ def _clone(
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
     controller.wake()
     return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
+
+
+def _checked(context: Context, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
+    """The spec of the new run, and the checkpoint with its weights. Raises ClientError."""
+    spec = _changed(context.session, source, name, changes)
+    _check_free(context.session, context.run(name))
+    chosen = _choose(source, changes)
+    _check_weights(source, chosen, spec)
+    return spec, chosen
+
+
+def _check_submission(controller: Controller, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
+    """The definition of the job, which may be submitted. Raises ClientError."""
+    controller.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
+    with controller.database.session() as session:
+        return check(Context(session, controller), spec, changes.directory, f"clone {name}")
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:
