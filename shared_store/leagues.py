@@ -352,6 +352,10 @@ def digest_of_track(store: Store, name: str) -> str | None:
     """Digest of a track of the store; None for a preset and for one drawn from a seed. Raises LeagueError if it does not exist."""
     if tracks.is_made(name):
         return None
+    if name.startswith("random:"):
+        raise LeagueError(
+            f"track {shown(name)}: after random: stands a whole number from 0 to {2**63 - 1}, such as random:7"
+        )
     try:
         track = tracks.find(store, name, tracks.PRESETS)
         track.read()

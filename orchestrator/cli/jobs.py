@@ -327,8 +327,8 @@ def stop(
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
-    if kept := _kept(detail):
-        echo(kept)
+    if lost := _lost(detail):
+        echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
 
@@ -344,18 +344,13 @@ def _slow_iteration(detail: Mapping[str, Any]) -> str:
     )
 
 
-def _kept(detail: Mapping[str, Any]) -> str:
-    """What is kept of a stopped training, and what is lost; empty for other jobs."""
+def _lost(detail: Mapping[str, Any]) -> str:
+    """The iterations of a stopped training that no checkpoint has; empty without any, and for other jobs."""
     done = (detail["progress"] or {}).get("iteration", 0)
-    if detail["kind"] != "train" or not detail["results"]:
+    saved = (detail["results"] or {}).get("iteration", 0)
+    if detail["kind"] != "train" or done <= saved:
         return ""
-    if not detail["results"]["checkpoint"]:
-        return (
-            "there is no checkpoint: it did not end an iteration" if not done else "there is no checkpoint: all is lost"
-        )
-    saved = detail["results"]["iteration"]
-    lost = f"; the {counted(done - saved, 'iteration')} after it, until {done}, are lost" if done > saved else ""
-    return f"last checkpoint: iteration {saved}{lost}"
+    return f"lost: {counted(done - saved, 'iteration')}, those after {saved} until {done}"
 
 
 def checkpoint(job: JobArgument) -> None:

@@ -318,7 +318,8 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     verified = cups.muster("verify", "honest", "2", "--rerun")
     assert (
         verified.returncode == 1
-        and "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n" in verified.stdout
+        and "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
+        in verified.stdout
     )
     before = cups.races()
     assert "model fast@2: the content of bundle/policy.onnx was altered" in cups.refused("submit", "honest", "fast@2")

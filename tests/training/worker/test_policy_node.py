@@ -32,6 +32,7 @@ from worker.deploy.simulated_robot import SimulatedRobot, open_robot, play
 from worker.errors import UserError
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.algorithms import find_algorithm
+from worker.learning.setup import spaces_of
 from worker.tasks.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.cartpole_pixels import CartpolePixels
 from worker.tasks.configs.cartpole import CartpolePixelsConfig
@@ -165,9 +166,10 @@ def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
 def test_the_node_drives_a_car_whose_policy_chooses_among_actions(tmp_path: Path) -> None:
     """Its choices of the camera's images are the trained policy's, and what it commands is what reaches the car."""
     space = {"action_space": [{"steering_angle": angle, "speed": 1.0} for angle in (-30, -10, 10, 30)]}
-    config = RacerPixelsConfig(action_space=space, front=FrontCameraConfig(width=24, height=16))
+    config = RacerPixelsConfig(action_space=space, front=FrontCameraConfig(width=64, height=48))
     task = RacerPixels(config, 4, seed=1)
-    policy = find_algorithm("ppo")(config.ppo, setting_of(task, seed=5)).policy()
+    setting = dataclasses.replace(setting_of(task, seed=5), spaces=spaces_of(task))
+    policy = find_algorithm("ppo")(config.ppo, setting).policy()
     facts = {"task": "RacerPixels", "algorithm": "ppo", "train": {"task": "RacerPixels"}, "settings": {}, "files": {}}
     checkpoint: Any = SimpleNamespace(name="00000001-e1", iteration=1, manifest=facts)
     run = Run(tmp_path / "car")
