@@ -182,12 +182,12 @@ def test_the_default_is_the_rough_terrain_of_others() -> None:
     [
         (lambda: Terrain(kinds={}), ["Terrain.kinds is empty"]),
         (lambda: Terrain(kinds={Flat(): 0.0}), ["share of Flat is 0.0", "> 0"]),
-        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is no patch", "Flat()"]),  # type: ignore[dict-item]
+        (lambda: Terrain(kinds={"flat": 1.0}), ["'flat' is not a patch", "Flat()"]),  # type: ignore[dict-item]
         (lambda: Terrain(levels=0), ["Terrain.levels is 0", ">= 1"]),
         (lambda: Terrain(columns=3), ["Terrain.columns is 3", "at least 7"]),
         (lambda: Terrain(resolution=0.0), ["Terrain.resolution is 0.0"]),
         (lambda: Terrain(kinds={Flat(platform=0, border=0): 1}, size=(0.1, 8.0)), ["0.1 m has fewer than 2 cells"]),
-        (lambda: Terrain(size=(8.0, 8.05)), ["8.05 m is no multiple", "use 8"]),
+        (lambda: Terrain(size=(8.0, 8.05)), ["8.05 m is not a multiple", "use 8"]),
         (lambda: Terrain(size=(4.0, 4.0)), ["Stairs", "wider than a patch of 4 m"]),
         (lambda: Terrain(resolution=0.4), ["Stairs.step_width", "0.3 m", "0.4 m"]),
         (lambda: Terrain(kinds={Gaps(widths=(0.1, 0.5)): 1.0}), ["Gaps.widths", "two cells"]),
