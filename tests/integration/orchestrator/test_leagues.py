@@ -138,7 +138,7 @@ REFUSED = {
     ("show", "cup", "7"): "league cup: entry 7 does not exist",
     ("submit", "cup", "fats"): "model fats does not exist; did you mean fast?",
     ("submit", "cup", "fast@9"): "model fast has no version 9; there are: 1, 2, 3, 4",
-    ("submit", "cup", "fast@x"): "fast@x: after @ stands a version, such as fast@1",
+    ("submit", "cup", "fast@x"): "fast@x: expected a version after @, such as fast@1",
     (
         "submit",
         "cup",
@@ -179,7 +179,7 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     job = json.loads(call_muster("list", "--json", home=cups.server.home).stdout)[0]["jobId"]
     assert told.splitlines() == [
         f"submitted the race of fast@2 as {job}",
-        f"enter it when it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
+        f"enter it after it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
     ]
     detail = cups.server.detail(job)
     assert (detail["name"], detail["kind"], detail["queue"]) == ("race-long-fast-2", "race", "default")
@@ -239,7 +239,7 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
     shown = cups.done("show", "spring", "2")
     assert "disqualified: not a car" in shown and "0:12.500" in shown and f"job {fast}" in shown
     assert cups.done("verify", "spring").splitlines() == [
-        f"entry {number}: as it was entered, and so is its model" for number in (1, 2)
+        f"entry {number}: the entry and its model are unchanged" for number in (1, 2)
     ]
 
 

@@ -30,7 +30,7 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
     track = resolve("hills", store)
     assert len(track.center) == round(40 / 0.15)
 
-    assert "hills exists already, and a track is never changed" in refused("make", "hills", "--seed", "8")
+    assert "hills exists already, and tracks are immutable" in refused("make", "hills", "--seed", "8")
     assert "give one of --preset" in refused("make", "both", "--seed", "8", "--preset", "oval")
     assert "--roughness belongs to --seed" in refused("make", "x", "--preset", "oval", "--roughness", "1")
     assert "did you mean hills?" in refused("show", "hils")

@@ -208,7 +208,8 @@ def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: l
 def test_a_field_outside_memory_is_refused_before_it_is_built() -> None:
     terrain = Terrain(resolution=0.0005)
     with pytest.raises(
-        ValueError, match=r"10 x 7 patches at 0\.0005 m have 17,920,\d\d\d,001 heights, .*GiB.* use a resolution from"
+        ValueError,
+        match=r"10 x 7 patches at 0\.0005 m have 17,920,\d\d\d,001 heights, .*GiB.* use a resolution of at least",
     ):
         terrain.check_memory("cpu")
     assert "heights" not in vars(terrain), "nothing was computed"

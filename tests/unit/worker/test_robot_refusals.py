@@ -214,7 +214,7 @@ def test_a_missing_mesh_of_a_urdf_file(tmp_path: Path, mesh: str, words: str):
     (folder / "arm.urdf").write_text(urdf)
     with pytest.raises(ValueError, match=r"arm\.urdf: .*" + words):
         template(Robot(folder / "arm.urdf", actuators=(SERVO,)))
-    with pytest.raises(ValueError, match="give the path of the URDF file"):
+    with pytest.raises(ValueError, match="relative to a URDF file; give the path of that file"):
         template(Robot(urdf, actuators=(SERVO,)))
 
 
