@@ -168,7 +168,7 @@ def test_single_runs_that_played_the_same_episodes_are_compared_pair_by_pair(ful
         pyarrow.parquet.write_table(pyarrow.table(columns), table)
     try:
         done = call_muster("compare", "fast", "sure", "odd", "-o", str(tmp_path / "curves.csv"), home=full.home)
-        assert done.returncode == 2 and "there is nothing to draw" in done.stderr
+        assert done.returncode == 2 and "so nothing can be drawn" in done.stderr
         done = call_muster("compare", "fast", "sure", "odd", home=full.home)
         # the differences are 1, 1.5, 1, 1.5: mean 1.25, s = 0.5 / sqrt(3), and t(3) = 3.182446, so that half is 0.459
         line = "sure@9 against fast@9: return +1.25 (+0.79 to +1.71, paired over 4 episodes): better"

@@ -153,7 +153,7 @@ REFUSED = {
     ("submit", "future", "fast@1"): "league future opens at 2999-01-01 00:00:00 UTC",
     ("disqualify", "cup", "9", "--reason", "x"): "league cup: entry 9 does not exist",
     ("disqualify", "cup", "9"): "--reason is missing",
-    ("table", "cup", "-o", "cup.pdf"): "the ending says what it is to be: .csv, .png",
+    ("table", "cup", "-o", "cup.pdf"): "unknown ending; use one of .csv, .png",
     ("tabel", "cup"): "did you mean table?",
 }
 
@@ -294,7 +294,7 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     assert verified.returncode == 1 and "entry 1: league honest: entry 1 is altered" in verified.stdout
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert "entry 2: as it was entered" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+    assert "entry 2: the entry and its model are unchanged" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
