@@ -310,7 +310,10 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     assert cups.muster("show", "honest", "2").returncode == 0
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert "entry 2: the entry and its model are unchanged" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+    assert (
+        "entry 2: the entry and its model are unchanged" in verified.stdout
+        and cups.muster("verify", "honest", "2").returncode == 0
+    )
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
