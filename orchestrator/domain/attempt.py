@@ -45,7 +45,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class Terms:
-    """What does not change during an attempt."""
+    """What an attempt consists of, and what its job allows."""
 
     number: int
     hosts: Sequence[str]

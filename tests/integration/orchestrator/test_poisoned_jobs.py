@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from orchestrator.control.attempts import Attempts
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Plan
 from orchestrator.engines.testing.fake import FakeEngine
@@ -29,7 +29,7 @@ class PoisonedEngine(FakeEngine):
     poisoned = "bad"
 
     def __init__(self) -> None:
-        super().__init__(hosts=[Host("fake/large", 8.0, (), 8192), Host("fake/small", 4.0, (), 8192)])
+        super().__init__(capacity=Hosts([Host("fake/large", 8.0, (), 8192), Host("fake/small", 4.0, (), 8192)]))
         self.raises: dict[str, BaseException] = {}
         """By name of the call."""
         self.tries = Counter[str]()
