@@ -57,7 +57,7 @@ _SWEEP_INTERVAL = 2.0
 log = logging.getLogger("muster.controller")
 
 
-class Controller:
+class Reconciler:
     """Drives every job of a database to its end."""
 
     def __init__(

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
@@ -46,7 +46,7 @@ class FakeController(Generic[E]):
         with self.database.session() as session:
             ensure_compute_environments(session, engines.names)
             session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
-        self.reconciler = Controller(
+        self.reconciler = Reconciler(
             self.database, engines, self.store, Bus(home), Peers(self.store, home), interval=0.02
         )
         stack.callback(self.reconciler.close)
