@@ -170,7 +170,10 @@ class _Moment(Collector):
             given = held_by(attempt)
             held["gpus"][labels] += given.gpus
             held["cpus"][labels] += given.cpus  # type: ignore[assignment]
-            main = job.gang.main
+            try:
+                main = job.gang.main
+            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+                continue
             told = self._reconciler.bus.progress(job.id, attempt.number, main) or {}
             for key, into in (("steps_per_second", rates), ("iteration", iterations)):
                 if isinstance(value := told.get(key), int | float):

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from orchestrator.control.attempts import Attempts
+from orchestrator.control.monitoring import exposition
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, GangStatus, Handle, Plan
@@ -161,7 +162,7 @@ def test_a_bug_of_the_controller_holds_up_one_job_and_is_logged_once(
 
 
 @pytest.mark.parametrize("damaged", [{}, {"numNodes": 1}, {"numNodes": "x", "mainNode": 0}], ids=str)
-def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_starting(
+def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_starting_and_no_metric_from_being_read(
     bench: Bench, caplog: pytest.LogCaptureFixture, damaged: dict[str, Any]
 ) -> None:
     nodes = [Node(index=0, host="fake/small", cpus=1.0, memory=64)]
@@ -171,5 +172,6 @@ def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_sta
         session.add(row)
     bench.explains("bad", "the controller failed on this job")
     bench.runs_and_ends("good-0", "good-1")
+    assert b'muster_cpus_in_use{engine="fake",queue="default"} 1.0' in exposition(bench.reconciler)
     [failed] = [record.getMessage() for record in caplog.records if record.exc_info]
     assert failed.startswith("job bad: the controller failed on this job")
