@@ -165,6 +165,8 @@ def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_sa
                 assert page.before.verdict is not None or Save() in page.instructions[:index], "a crash would forget it"
             if isinstance(each, Keep):
                 assert Save() in page.instructions[index:], "a crash would forget it"
+            if isinstance(each, Launch | Observe | Stop | WindUp):
+                assert each is page.instructions[-1], "what it leads to is decided on when all else is carried out"
 
 
 @settings(max_examples=80, deadline=None)
