@@ -35,13 +35,13 @@ class Frame(_Part):
     """A frame on a body of the robot in which a vector is measured."""
 
     name: str
-    """Of the site or body."""
+    """Name of the site or body."""
     body: str
     """Its body."""
     position: tuple[float, float, float]
-    """Of its origin in the body's frame [m]."""
+    """Position of its origin in the body's frame [m]."""
     rotation: tuple[float, float, float, float]
-    """From it to the body's frame, a quaternion xyzw."""
+    """Rotation from it to the body's frame, a quaternion xyzw."""
     root: bool
     """Whether the body is the robot's root."""
 
@@ -51,15 +51,15 @@ class Term(_Part):
     """Consecutive numbers of an observation, each ``scale * clip(quantity - offset)``, in this order."""
 
     name: str
-    """Of the term in its task."""
+    """Name of the term in its task."""
     kind: Literal["measured", "command", "previous_action"]
     """Its source: sensors, the operator, or the policy itself (its last actions, clipped)."""
     first: int
     """Index of its first number in the group."""
     names: tuple[str, ...]
-    """Of the numbers of one step."""
+    """Names of the numbers of one step."""
     units: tuple[str, ...]
-    """Of each quantity, before the scale; ``1`` for a ratio. Empty: the task declares only the number's name."""
+    """Unit of each quantity, before the scale; ``1`` for a ratio. Empty: the task declares only the number's name."""
     scale: tuple[float, ...]
     """Factor of each [1/unit]."""
     offset: tuple[float, ...]
@@ -103,7 +103,7 @@ class Image(_Part):
     """Images as bytes, channels first; the present frame comes first."""
 
     channels: tuple[str, ...]
-    """Of one frame, in order."""
+    """Channels of one frame, in order."""
     frames: int
     """Number of frames: the present one and those of the control steps before."""
     camera: Mapping[str, Any]
@@ -117,11 +117,11 @@ class Group(_Part):
     """One input of the policy: numbers by terms, or images."""
 
     name: str
-    """Of the observation group."""
+    """Name of the observation group."""
     input: str
     """Name of the input in the exported file."""
     shape: tuple[int, ...]
-    """Of one observation: one dimension, or channels, height, width."""
+    """Shape of one observation: one dimension, or channels, height, width."""
     dtype: Literal["float32", "uint8"]
     """Of its elements."""
     terms: tuple[Term, ...] = ()
@@ -182,9 +182,9 @@ class Command(_Part):
     """A command of the operator."""
 
     name: str
-    """Of the command in its task."""
+    """Name of the command in its task."""
     names: tuple[str, ...]
-    """Of its numbers, in order."""
+    """Names of its numbers, in order."""
     units: tuple[str, ...]
     """Of each."""
     ranges: tuple[Pair | None, ...]
@@ -204,9 +204,9 @@ class State(_Part):
     name: str
     """Of the input."""
     output: str
-    """Of the output that is the next step's input."""
+    """Name of the output that is the next step's input."""
     shape: tuple[int, ...]
-    """Without the batch, which is the first dimension."""
+    """Shape without the batch, which is the first dimension."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Contract(_Part):
     actions: tuple[Action, ...]
     """Its output ``actions``, in order; with choices, the output is one number, the index of the choice. Empty: not declared."""
     action_names: tuple[str, ...]
-    """Of the actions, or of the choices."""
+    """Names of the actions, or of the choices."""
     commands: tuple[Command, ...] = ()
     """The commands that it follows."""
     states: tuple[State, ...] = ()

@@ -10,7 +10,7 @@ from worker.learning.job import Job, StopRequest, run_command, user_errors
 from worker.telemetry.tracking import Tracking
 
 SWITCH_SECONDS = 0.0005
-"""For how long a thread that reports or saves may keep the interpreter from the training thread, whose device may be idle meanwhile [s]."""
+"""Longest time for which a reporting or saving thread may hold the interpreter, while the training thread's device may be idle [s]."""
 
 
 def main() -> int:

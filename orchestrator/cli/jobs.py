@@ -32,14 +32,14 @@ SpecArgument = Annotated[str, typer.Argument(help="A job YAML, such as job_specs
 JobArgument = Annotated[
     str,
     typer.Argument(
-        help="Job id, the first letters of one (4 or more), or a job name (the newest); of an array's child with :INDEX."
+        help="Job id or its first letters (4 or more), or a job name (its newest job); with :INDEX, an array's child."
     ),
 ]
 
 _EXAMPLES = """Examples:  muster submit job_specs/ant.yaml --set train.iterations=600 -f
 muster submit job_specs/ant.yaml --name ant-2 --set train.seed=2 --dry-run"""
 _PATIENCE = 3.0
-"""Seconds after which a stop that takes its time says why."""
+"""Seconds after which a slow stop explains itself."""
 _OF_RUN = {
     "evaluate": "evaluates",
     "race": "races",
@@ -47,7 +47,7 @@ _OF_RUN = {
     "record": "records",
     "render": "renders",
 }
-"""What a job of each kind does with another run."""
+"""Verb for what a job of each kind does with another run."""
 COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING": "cyan", "RUNNABLE": "yellow"}
 
 
@@ -86,11 +86,12 @@ def submit(
     set_: SetOption = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would start where; --json: with all variables. Nothing starts.")
+        bool,
+        typer.Option("--dry-run", help="Show what would start where, without starting it; --json: with all variables."),
     ] = False,
     engine: Annotated[
         str | None,
-        typer.Option(help=f"What runs it, of the engines that the controller has: {', '.join(ENGINES)}."),
+        typer.Option(help=f"Engine that runs the job, one of the controller's: {', '.join(ENGINES)}."),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Of the job, and of its run, instead of the spec's.")] = None,
     as_json: JsonOption = False,
@@ -116,13 +117,13 @@ def submit(
 
 
 def tell(spec: Spec) -> None:
-    """Say on standard error what a spec has to say."""
+    """Print a spec's warnings on standard error."""
     for note in spec.notes:
         echo(f"note: {one_line(note)}", err=True)
 
 
 def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
-    """The same spec for the queue of that engine. Raises SpecError where the controller does not have it."""
+    """The same spec for the queue of that engine. Raises SpecError if the controller lacks it."""
     queue = engine_queue(client, engine)
     if spec.queue not in ("default", queue):
         raise SpecError(f"{source}: queue: {spec.queue}, but --engine {engine} means {queue}; leave one of them out")
@@ -130,7 +131,7 @@ def on_engine(client: Client, spec: Spec, engine: str, source: str) -> Spec:
 
 
 def engine_queue(client: Client, engine: str) -> str:
-    """The queue of an engine. Raises SpecError where the controller does not have it."""
+    """The queue of an engine. Raises SpecError if the controller lacks it."""
     check_engine(engine)
     queues: dict[str, str] = client.get("/api/capacity")["engines"]
     if engine not in queues:
@@ -142,7 +143,7 @@ def engine_queue(client: Client, engine: str) -> str:
 
 
 def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
-    """The change that sends a job to ``queue``. Raises SpecError where ``changes`` name one, too."""
+    """The change that sends a job to ``queue``. Raises SpecError if ``changes`` name a queue too."""
     if queue is None:
         return []
     for change in changes or ():
@@ -172,7 +173,7 @@ def _counted(summary: dict[str, int]) -> str:
 
 
 def _used(attempt: dict[str, Any], saves: bool) -> str:
-    """GPU time that an attempt held (CPU time where it has no GPUs), and how much of it was lost where that is known: of what ``saves``."""
+    """GPU time of an attempt (CPU time without GPUs), and the lost part if known: only for what ``saves``."""
     kind = "Gpu" if attempt["gpuSeconds"] else "Cpu"
     used, lost = attempt[f"{kind.lower()}Seconds"], attempt[f"wasted{kind}Seconds"]
     if not used:
@@ -181,7 +182,7 @@ def _used(attempt: dict[str, Any], saves: bool) -> str:
 
 
 def _gpus(node: dict[str, Any]) -> str:
-    """Which GPUs a node has; how many, where only its engine knows which."""
+    """The GPUs of a node, or their number if only its engine knows them."""
     if not node["gpus"]:
         return ""
     known = node.get("devices") or (node["gpus"] if engine_of(node["host"]) in ("local", "docker") else None)
@@ -191,7 +192,7 @@ def _gpus(node: dict[str, Any]) -> str:
 
 
 def show(job: JobArgument, as_json: JsonOption = False) -> None:
-    """Show a job: its state and why, its attempts and nodes, its run and results."""
+    """Show a job: its state and the reason, its attempts and nodes, its run and results."""
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         detail["job"] = client.batch("DescribeJobs", jobs=[detail["id"]])["jobs"][0]
@@ -213,7 +214,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
     }
     results = detail["results"] or {}
     array = detail["job"].get("arrayProperties", {})
-    if "statusSummary" in array:  # its children have runs and nodes, the array has none
+    if "statusSummary" in array:  # the children have runs and nodes, not the array
         facts["run"] = None
         facts["children"] = f"{array['size']}: {_counted(array['statusSummary'])}; muster show {detail['id'][:8]}:0"
     if progress := detail["progress"]:
@@ -239,7 +240,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         counted = "" if attempt["spent"] else ", not counted"
         spent += bool(attempt["spent"])
         number = f"{attempt['number']} of {detail['attemptsAllowed']}"
-        if spent < attempt["number"]:  # of those that are allowed, attempts that left on request are none
+        if spent < attempt["number"]:  # attempts that exited on request don't count against the allowed number
             number = f"{attempt['number']} ({spent} of {detail['attemptsAllowed']} spent)"
         reason = f": {one_line(attempt['statusReason'])}" if attempt["statusReason"] and ended != "succeeded" else ""
         lasted = took(attempt["startedAt"], attempt["stoppedAt"])
@@ -257,7 +258,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
 
 
 def _source(detail: Mapping[str, Any]) -> str:
-    """What a job reads of another run, as ``RUN@ITERATION``."""
+    """The checkpoint of another run that a job reads, as ``RUN@ITERATION``."""
     section = (detail["spec"] or {}).get(detail["kind"])
     if not isinstance(section, dict) or "run" not in section:
         return ""
@@ -282,7 +283,7 @@ def _automatic(run: str, told: Mapping[str, Any] | None) -> str:
 
 
 def started_from(parent: Mapping[str, Any] | None) -> str:
-    """Where a clone has its weights from, in one line; nothing of a run that is no clone."""
+    """The source of a clone's weights, in one line; empty for other runs."""
     if not parent:
         return ""
     score = scored(parent.get("score"), parent.get("score_error"))
@@ -291,7 +292,7 @@ def started_from(parent: Mapping[str, Any] | None) -> str:
 
 
 def scored(score: float | None, error: float | None) -> str:
-    """A score with its standard error, where that is known: ``812.30 ± 4.10``."""
+    """A score with its standard error, if known: ``812.30 ± 4.10``."""
     if score is None:
         return "-"
     return f"{score:.2f}" + (f" ± {error:.2f}" if error is not None else "")
@@ -299,8 +300,8 @@ def scored(score: float | None, error: float | None) -> str:
 
 def stop(
     job: JobArgument,
-    reason: Annotated[str, typer.Option(help="Kept with the job.")] = "stopped by the user",
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return when the job has ended.")] = True,
+    reason: Annotated[str, typer.Option(help="Reason, kept with the job.")] = "stopped by the user",
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return only when the job has ended.")] = True,
 ) -> None:
     """Stop a job: it checkpoints and leaves; `muster resume` goes on from there.
 
@@ -354,7 +355,7 @@ def lost_iterations(detail: Mapping[str, Any]) -> str:
 
 
 def checkpoint(job: JobArgument) -> None:
-    """Have a training job save now; returns when the checkpoint is durable."""
+    """Make a training job save now; return when the checkpoint is durable."""
     with Client.connect() as client:
         answer = client.post(f"/api/jobs/{named(job)}/checkpoint", {}, seconds=180)["answer"]
     echo(answer)
@@ -365,7 +366,7 @@ def checkpoint(job: JobArgument) -> None:
 def stacks(job: JobArgument) -> None:
     """Print the Python and native stacks of every rank of a running job.
 
-    They go to the job's log too.
+    The stacks go to the job's log too.
     """
     with Client.connect() as client:
         for node in client.get(f"/api/jobs/{named(job)}/stacks", seconds=180):
@@ -374,10 +375,11 @@ def stacks(job: JobArgument) -> None:
 
 def print_schema(
     contract: Annotated[
-        bool, typer.Option("--contract", help="Of a policy contract (contract.json) instead of a job.")
+        bool,
+        typer.Option("--contract", help="Print the schema of a policy contract (contract.json) instead of a job's."),
     ] = False,
 ) -> None:
-    """Print the JSON Schema of the job YAML, for editors; or that of the policy contract."""
+    """Print the JSON Schema of the job YAML, for editors, or of the policy contract."""
     echo_json(contract_schema() if contract else schema(), indent=2)
 
 
@@ -390,7 +392,7 @@ def took(start: int | None, end: int | None) -> str:
         return "-"
     seconds = (
         max(0, int((end or time.time() * 1000) - start)) // 1000
-    )  # this machine's clock may be behind the controller's
+    )  # this machine's clock may lag behind the controller's
     return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
 
 

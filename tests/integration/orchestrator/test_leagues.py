@@ -146,7 +146,7 @@ REFUSED = {
     ("show", "cup", "7"): "league cup: entry 7 does not exist",
     ("submit", "cup", "fats"): "model fats does not exist; did you mean fast?",
     ("submit", "cup", "fast@9"): "model fast has no version 9; there are: 1, 2, 3, 4",
-    ("submit", "cup", "fast@x"): "fast@x: after @ stands a version, such as fast@1",
+    ("submit", "cup", "fast@x"): "fast@x: expected a version after @, such as fast@1",
     (
         "submit",
         "cup",
@@ -161,7 +161,7 @@ REFUSED = {
     ("submit", "future", "fast@1"): "league future opens at 2999-01-01 00:00:00 UTC",
     ("disqualify", "cup", "9", "--reason", "x"): "league cup: entry 9 does not exist",
     ("disqualify", "cup", "9"): "--reason is missing",
-    ("table", "cup", "-o", "cup.pdf"): "the ending says what it is to be: .csv, .png",
+    ("table", "cup", "-o", "cup.pdf"): "unknown ending; use one of .csv, .png",
     ("tabel", "cup"): "did you mean table?",
 }
 
@@ -188,7 +188,7 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     job = json.loads(call_muster("list", "--json", home=cups.server.home).stdout)[0]["jobId"]
     assert told.splitlines() == [
         f"submitted the race of fast@2 as {job}",
-        f"enter it when it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
+        f"enter it after it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
     ]
     detail = cups.server.detail(job)
     assert (detail["name"], detail["kind"], detail["queue"]) == ("race-long-fast-2", "race", "default")
@@ -248,7 +248,7 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
     shown = cups.done("show", "spring", "2")
     assert "disqualified: not a car" in shown and "0:12.500" in shown and f"job {fast}" in shown
     assert cups.done("verify", "spring").splitlines() == [
-        f"entry {number}: as it was entered, and so is its model" for number in (1, 2)
+        f"entry {number}: the entry and its model are unchanged" for number in (1, 2)
     ]
 
 
@@ -310,7 +310,10 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     assert cups.muster("show", "honest", "2").returncode == 0
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert "entry 2: as it was entered" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+    assert (
+        "entry 2: the entry and its model are unchanged" in verified.stdout
+        and cups.muster("verify", "honest", "2").returncode == 0
+    )
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)

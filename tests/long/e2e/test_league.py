@@ -44,7 +44,7 @@ def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving
     assert order == [(1, 1, rows[0]["time"]), (2, 2, rows[0]["time"])], "the same policy: the earlier entry is ahead"
 
     assert done("league", "verify", "cup", "1", "--rerun").splitlines() == [
-        "entry 1: every lap is the same to the last bit"
+        "entry 1: every lap is the same, bit for bit"
     ]
     path = cup.path / "entries" / "2" / "entry.json"
     path.chmod(0o644)
