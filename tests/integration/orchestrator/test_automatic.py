@@ -288,3 +288,15 @@ def test_evaluations_that_could_never_start_are_refused_with_the_training(
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
     with controller.server.reconciler.database.session() as session:
         assert not session.scalars(select(Job)).all()
+
+
+def test_checkpoints_of_long_iterations_alone_are_not_counted(controller: Controller) -> None:
+    controller.train({"every": 2, "episodes": 8})
+    controller.save(10)
+    for iteration in (11, 12):
+        add_checkpoint(controller.server.store, "taught", iteration, scheduled=False)
+        controller.look()
+    assert controller.evaluations() == []
+    controller.save(20)
+    controller.look()
+    assert [iteration for iteration, _ in controller.evaluations()] == [20]
