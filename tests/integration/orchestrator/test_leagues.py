@@ -280,7 +280,7 @@ def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_close
     )
 
 
-def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
+def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     cups.done("create", "honest", "--track", "oval")
     for job in (0, 1):
         cups.raced(job, race([12.0 + job] * 3), job + 1)
@@ -294,7 +294,10 @@ def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
     assert verified.returncode == 1 and "entry 1: league honest: entry 1 is altered" in verified.stdout
     listed = json.loads(cups.muster("verify", "honest", "--json").stdout)
     assert [(each["entry"], len(each["problems"])) for each in listed] == [(1, 1), (2, 0)]
-    assert "entry 2: the entry and its model are unchanged" in verified.stdout and cups.muster("verify", "honest", "2").returncode == 0
+    assert (
+        "entry 2: the entry and its model are unchanged" in verified.stdout
+        and cups.muster("verify", "honest", "2").returncode == 0
+    )
 
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
