@@ -16,11 +16,13 @@ from typing import Any, cast
 
 import uvicorn
 
+from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
-from orchestrator.api.http.auth import Access, is_loopback
+from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
 from orchestrator.api.native.automatic import AutomaticEvaluations
+from orchestrator.console import add_console
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.deliveries import Deliveries
@@ -34,7 +36,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.gangs import running_gangs
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
-from orchestrator.home import HomeLock
+from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
@@ -97,6 +99,7 @@ class Server:
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home)
             stack.callback(self._lock.release)
+            self.access.console_secret = console_secret(home)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
             nodes = _make_engines(engines, home, cpus, gpus)  # before anything is made in the home directory
@@ -136,6 +139,7 @@ class Server:
             stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
             self.app,

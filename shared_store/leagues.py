@@ -205,6 +205,10 @@ class StoredLeague:
             raise LeagueError(f"{what}: {error}") from None
         return {**found, "digest": digest}
 
+    def problem(self, number: int, error: LeagueError) -> str:
+        """The words of an error of an entry, without the names of league and entry."""
+        return str(error).removeprefix(f"league {self.name}: entry {number}").removeprefix(":").removeprefix(" ")
+
     def ruling(self, number: int) -> dict[str, Any] | None:
         """The ruling that disqualifies an entry; None without one. An altered ruling still disqualifies, and says that it is altered."""
         path = self.path / "disqualified" / str(number)
@@ -224,7 +228,7 @@ class StoredLeague:
             try:
                 entry = self.entry(number)
             except LeagueError as error:
-                found.append(Contender(number, "-", "-", None, reason, str(error)))
+                found.append(Contender(number, "-", "-", None, reason, self.problem(number, error)))
                 continue
             reference = f"{entry['model']['name']}@{entry['model']['version']}"
             found.append(Contender(number, entry["racer"], reference, read_race(entry["race"]), reason))
@@ -293,12 +297,12 @@ class StoredLeague:
             refuse_links(folder, 3)
             manifest = bundles.verify(folder)
             if list(manifest["files"]) != [name]:
-                raise LeagueError(f"{what} is altered: it has other files than {name}")
+                raise LeagueError(f"{what}: it has other files than {name}")
             document = read_json(folder / name)
         except (DamagedBundle, DamagedFile, OSError) as error:
-            raise LeagueError(f"{what} is altered: {error}") from None
+            raise LeagueError(f"{what}: {bundles.reason(error, folder)}") from None
         if document is None:
-            raise LeagueError(f"{what} is altered: {name} is missing")
+            raise LeagueError(f"{what}: {name} is missing")
         return document, str(manifest["digest"])
 
 
@@ -348,6 +352,10 @@ def digest_of_track(store: Store, name: str) -> str | None:
     """Digest of a track of the store; None for a preset and for one drawn from a seed. Raises LeagueError if it does not exist."""
     if tracks.is_made(name):
         return None
+    if name.startswith("random:"):
+        raise LeagueError(
+            f"track {shown(name)}: after random: stands a whole number from 0 to {2**63 - 1}, such as random:7"
+        )
     try:
         track = tracks.find(store, name, tracks.PRESETS)
         track.read()

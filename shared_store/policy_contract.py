@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from shared_store.documents import DocumentError, parse
 
-FORMAT = 2
+FORMAT = 3
 """Version of the document; a newer one is refused."""
 CLOSE = 1e-6
 """Relative difference up to which two numbers count as equal: recompiling a model rounds."""
@@ -131,6 +131,20 @@ class Group(_Part):
 
 
 @dataclass(frozen=True)
+class Target(_Part):
+    """What a choice asks of one joint."""
+
+    joint: str
+    """Name of the joint."""
+    kind: Literal["effort", "position", "velocity"]
+    """Kind of the actuator's input, as of an action."""
+    unit: str
+    """Unit of the input: N, N m, m, rad, m/s or rad/s."""
+    value: float
+    """The input [unit]."""
+
+
+@dataclass(frozen=True)
 class Action(_Part):
     """One number of a policy's output: the actuator's input is ``offset + scale * action``, after clipping the action to ``clip``."""
 
@@ -159,6 +173,8 @@ class Action(_Part):
     """Least and greatest position of the joint [m, rad]; null: not limited, or unknown."""
     rule: str = ""
     """How the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
+    targets: tuple[Target, ...] = ()
+    """What a choice asks of the joints, the same joints for each choice; empty: it is no choice, or the task does not declare it."""
 
 
 @dataclass(frozen=True)
@@ -380,8 +396,8 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]
         old, new = before.get(name), now.get(name)
         if (name in before) != (name in now):
             yield f"{name} {_value(new if name in now else old)} is {'new' if name in now else 'gone'}"
-        elif name == "frame" and None in (old, new):
-            continue  # a contract of format 1 lacks it
+        elif (name == "frame" and None in (old, new)) or (name == "targets" and () in (old, new)):
+            continue  # a contract of format 1, or 2, lacks it
         elif not _same(old, new):
             yield f"{name} {_value(old)} became {_value(new)}"
 

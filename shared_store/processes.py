@@ -104,6 +104,20 @@ def marked(marks: Collection[str]) -> list[Process]:
     return found
 
 
+def await_marks(pid: int, patience: float = 1.0) -> None:
+    """Wait until :func:`marked` can find a child that was just started: the kernel shows its environment a moment after ``exec``.
+
+    Returns after ``patience`` seconds in any case, and at once for a process that has ended.
+    """
+    deadline = time.monotonic() + patience
+    with contextlib.suppress(OSError):
+        while find_process(pid) and time.monotonic() < deadline:
+            with open(f"/proc/{pid}/environ", "rb") as file:
+                if file.read(1):
+                    return
+            time.sleep(0.001)
+
+
 def end_all(
     find: Callable[[], Sequence[Process]],
     patience: float = PATIENCE,

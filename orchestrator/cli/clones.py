@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.jobs import JsonOption, SetOption, engine_queue, on_queue
+from orchestrator.cli.plans import show_plan
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
@@ -15,7 +16,7 @@ from orchestrator.domain.errors import UsageError
 from orchestrator.spec.kept_files import changes_with_files
 
 _EXAMPLES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
-muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2"""
+muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2 --dry-run"""
 
 
 def register(app: typer.Typer) -> None:
@@ -36,6 +37,12 @@ def clone(
     queue: Annotated[str | None, typer.Option(help="Another queue.")] = None,
     engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
     follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Check it and show what would start where; --json: with all variables. Nothing starts."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Start a new run from only the weights of a checkpoint.
@@ -57,8 +64,12 @@ def clone(
                 *on_queue(set_, elsewhere),
             ],
             "directory": os.getcwd(),
+            "dry_run": dry_run,
         }
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)
+        if dry_run:
+            show_plan(client, cloned["definition"], cloned["queue"], as_json)
+            return
         if as_json:
             echo_json(cloned)
         else:

@@ -22,6 +22,7 @@ from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, Unreachable
+from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.toolkit.gpus import visible_gpus
@@ -149,7 +150,10 @@ def _controller() -> Finding:
 
 
 def _engine(name: str) -> str:
-    # a queueing engine launches nothing here, so it writes nothing there
-    hosts = [host for host in make_engine(name, Setting(muster_home())).capacity() if not host.away]
+    # an engine that launches nothing writes nothing there
+    capacity = make_engine(name, Setting(muster_home())).capacity()
+    if isinstance(capacity, Queued) and isinstance(capacity.limits, Limit):
+        return f"queue {capacity.limits.queue}, at most {capacity.limits.resources.cpus:g} CPUs for a gang"
+    hosts = [host for host in capacity.machines if not host.away]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{counted(len(hosts), 'host')}, {cpus:g} CPU{'s' if cpus != 1 else ''}, {counted(gpus, 'GPU')}"

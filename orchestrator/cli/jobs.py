@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from orchestrator.cli.progress import best_told, evaluated, follow, shown_metrics
-from orchestrator.cli.terminal import WHOLE, Console, echo, echo_json, one_line
+from orchestrator.cli.plans import show_plan
+from orchestrator.cli.progress import best_told, follow, shown_metrics
+from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.hosts import engine_of
@@ -23,6 +21,7 @@ from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.json_schema import contract_schema, schema
 from orchestrator.spec.model import Spec
+from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -37,6 +36,8 @@ JobArgument = Annotated[
     ),
 ]
 
+_EXAMPLES = """Examples:  muster submit job_specs/ant.yaml --set train.iterations=600 -f
+muster submit job_specs/ant.yaml --name ant-2 --set train.seed=2 --dry-run"""
 _PATIENCE = 3.0
 """Seconds after which a slow stop explains itself."""
 _OF_RUN = {
@@ -51,7 +52,7 @@ COLOURS = {"SUCCEEDED": "green", "FAILED": "red", "RUNNING": "cyan", "STARTING":
 
 
 def register(app: typer.Typer) -> None:
-    app.command(epilog="Example:  muster submit job_specs/ant.yaml --set train.iterations=600 -f")(submit)
+    app.command(epilog=_EXAMPLES)(submit)
     app.command(epilog="Example:  muster show ant")(show)
     app.command(epilog="Example:  muster stop ant   then   muster resume RUN")(stop)
     app.command(epilog="Example:  muster checkpoint ant")(checkpoint)
@@ -92,16 +93,17 @@ def submit(
         str | None,
         typer.Option(help=f"Engine that runs the job, one of the controller's: {', '.join(ENGINES)}."),
     ] = None,
+    name: Annotated[str | None, typer.Option(help="Of the job, and of its run, instead of the spec's.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Submit a job to a running controller."""
-    loaded = specfile.load(spec, set_)
+    loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)])
     tell(loaded)
     with Client.connect() as client:
         if engine is not None:
             loaded = on_engine(client, loaded, engine, spec)
         if dry_run:
-            _show_plan(client, loaded, as_json)
+            show_plan(client, compile_definition(loaded, os.getcwd()), loaded.queue, as_json)
             return
         submitted = submit_spec(client, loaded, spec)
         if as_json:
@@ -150,36 +152,19 @@ def on_queue(changes: Sequence[str] | None, queue: str | None) -> list[str]:
     return [f"queue={json.dumps(queue)}"]
 
 
+def called(changes: Sequence[str] | None, name: str | None) -> list[str]:
+    """The change that names a job. Raises SpecError where ``changes`` do, too."""
+    if name is None:
+        return []
+    if twice := next((each for each in changes or () if each.partition("=")[0] == "name"), None):
+        raise SpecError(f"--set {twice}: --name {name} names the job; give one of them")
+    return [f"name={json.dumps(name)}"]
+
+
 def check_engine(name: str) -> None:
     """Raises SpecError for a name that no engine has."""
     if name not in ENGINES:
         raise SpecError(f"--engine {name}: there is no such engine; there are {', '.join(ENGINES)}")
-
-
-def _show_plan(client: Client, spec: Spec, as_json: bool) -> None:
-    """Print what the controller's engine would start for ``spec`` if all hosts were free."""
-    definition = compile_definition(spec, os.getcwd())
-    plan = client.post("/api/plan", {"definition": definition, "queue": spec.queue})
-    if as_json:
-        echo_json({**plan, "registerJobDefinition": definition}, indent=1)
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("NODE", "RANK", "HOST", "CPUS", "GPUS", "MEMORY", "ADDRESS", "IMAGE"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("COMMAND", overflow="fold")
-    for node in plan["nodes"]:
-        image = node["image"] if plan["images"] else "-"
-        table.add_row(
-            *(str(node["index"]), str(node["rank"]), node["host"], f"{node['cpus']:g}", ",".join(node["gpus"]) or "-"),
-            *(f"{node['memory']} MiB", node["address"] or "-", image, escape(shlex.join(node["command"]))),
-        )
-    echo(f"{spec.name} on the {plan['engine']} engine, queue {spec.queue}; nothing was started")
-    whole = Console(width=WHOLE, color_system=None)  # shown in full, so a narrow terminal wraps the lines
-    with whole.capture() as printed:
-        whole.print(table)
-    echo("\n".join(line.rstrip() for line in printed.get().splitlines()))
-    if plan["document"]:
-        echo(f"\n{plan['document']}")
 
 
 def _counted(summary: dict[str, int]) -> str:
@@ -239,7 +224,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
             f"iteration {progress['iteration']} of {total}, reward {_number(progress.get('reward'))}{shown}"
         )
     if evaluation := results.get("evaluation"):
-        facts["evaluation"] = evaluated(evaluation)
+        facts["evaluation"] = in_one_line(evaluation)
     facts["best"] = best_told(detail["run"], results.get("best"))
     facts["evaluating"] = _automatic(detail["run"], results.get("automatic"))
     facts |= {name: results.get(name) for name in ("checkpoint", "plot", "picture")} | {
@@ -318,7 +303,10 @@ def stop(
     reason: Annotated[str, typer.Option(help="Reason, kept with the job.")] = "stopped by the user",
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return only when the job has ended.")] = True,
 ) -> None:
-    """Stop a job: it checkpoints and exits; `muster resume` continues from there."""
+    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there.
+
+    A training ends its iteration first. One that does not end within the 30 s that a job has is left, and `muster resume` repeats it.
+    """
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
         if detail["status"] in ("SUCCEEDED", "FAILED"):
@@ -326,18 +314,44 @@ def stop(
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
+        slow = wait and _slow_iteration(detail)
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
                 echo(f"{detail['name']} ({detail['id'][:8]}): {one_line(said)}", err=True)
+            if slow and time.monotonic() > patience:
+                echo(slow, err=True)
+                slow = ""
     if not wait:
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
+    if lost := _lost(detail):
+        echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
+
+
+def _slow_iteration(detail: Mapping[str, Any]) -> str:
+    """What may become of the present iteration of a training whose iterations last long; empty for others."""
+    seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
+    if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
+        return ""
+    return (
+        f"an iteration takes about {seconds:.0f} s; one that does not end in the time that the job has to leave (30 s, unless the "
+        f"engine gives less) is left, and resume repeats it; to lose none: muster checkpoint {detail['name']}, then stop"
+    )
+
+
+def _lost(detail: Mapping[str, Any]) -> str:
+    """The iterations of a stopped training that no checkpoint has; empty without any, and for other jobs."""
+    done = (detail["progress"] or {}).get("iteration", 0)
+    saved = (detail["results"] or {}).get("iteration", 0)
+    if detail["kind"] != "train" or done <= saved:
+        return ""
+    return f"lost: {counted(done - saved, 'iteration')}, those after {saved} until {done}"
 
 
 def checkpoint(job: JobArgument) -> None:

@@ -165,7 +165,7 @@ def _state(league: Mapping[str, Any]) -> str:
 def show(
     league: LeagueArgument, entry: OptionalEntry = None, store: StoreOption = None, as_json: JsonOption = False
 ) -> None:
-    """Show the rules of a league, or an entry's model, evaluation and laps."""
+    """Show the rules of a league; of an entry its model, its evaluation and its laps; exit 1 where it or its model is altered."""
     path = f"/api/leagues/{named(league)}" + ("" if entry is None else f"/entries/{entry}")
     with controller(store, None) as connect:
         found = connect().get(path, seconds=300)
@@ -175,6 +175,8 @@ def show(
         _tell_league(found)
     else:
         _tell_entry(found)
+    if found.get("problem"):
+        raise typer.Exit(1)
 
 
 def _tell_league(league: Mapping[str, Any]) -> None:
@@ -213,7 +215,7 @@ def _tell_entry(entry: Mapping[str, Any]) -> None:
     if ruling := entry.get("ruling"):
         echo(f"  disqualified: {ruling['reason']}")
     if entry.get("problem"):
-        echo(f"  problem:     {entry['problem']}")
+        echo(f"  problem:     {entry['problem']}" if "race" in entry else f"entry {entry['entry']}: {entry['problem']}")
 
 
 def submit(

@@ -14,14 +14,13 @@ from orchestrator.cli.clones import split_reference
 from orchestrator.cli.export import CheckpointArgument
 from orchestrator.cli.jobs import JsonOption, scored
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.progress import evaluated
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
 from shared_store.bundles import POLICY
 from shared_store.documents import DocumentError
-from shared_store.evaluations import flattened
+from shared_store.evaluations import flattened, in_one_line
 from shared_store.policy_contract import differences, read
 from shared_store.wording import counted
 
@@ -107,7 +106,7 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
     for evaluation in found.get("evaluations") or []:
         changed = ", ".join(f"{place} {value}" for place, value in flattened(evaluation.get("config") or {}))
         echo(
-            f"  evaluation:  {evaluated(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
+            f"  evaluation:  {in_one_line(evaluation)}, seed {evaluation.get('seed')}{f', with {changed}' if changed else ''}"
         )
     if judged := found.get("judged"):
         echo(

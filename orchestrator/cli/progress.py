@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client
 from orchestrator.domain.errors import Unreachable
+from shared_store.evaluations import in_one_line
 from shared_store.wording import counted
 
 _TERMINAL = ("SUCCEEDED", "FAILED")
@@ -80,7 +81,7 @@ def summary(client: Client, job_id: str) -> int:
         console.print(f"  first error: node {first['index']}: {one_line(first['error'])}", markup=False)
     evaluation = results.get("evaluation")
     if succeeded and evaluation:
-        console.print(f"  evaluation:  {evaluated(evaluation)}")
+        console.print(f"  evaluation:  {in_one_line(evaluation)}")
     if succeeded and (best := best_told(detail["run"], results.get("best"))):
         console.print(f"  best:        {best}")
     log = (first or attempt["nodes"][0])["log"] if attempt else None
@@ -92,15 +93,6 @@ def summary(client: Client, job_id: str) -> int:
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
         console.print(f"  go on with:  muster resume {detail['run']}", markup=False)
     return 0 if succeeded else 1
-
-
-def evaluated(figures: dict[str, Any]) -> str:
-    """An evaluation in one line."""
-    length, longest = figures["mean_length"], figures["max_length"]
-    return (
-        f"mean episode length {length:.1f} of {longest} ({length / longest:.0%}), "
-        f"mean return {figures['mean_return']:.2f} over {counted(figures['episodes'], 'episode')}"
-    )
 
 
 def best_told(run: str, best: Mapping[str, Any] | None) -> str:

@@ -171,6 +171,8 @@ class Attempts:
             directory=options.directory or None,
             stall_timeout=options.stall_timeout,
             log_limit=options.log_limit,
+            ranks=[node.ranks for node in nodes],
+            is_native=options.is_native,
             is_gang=job.kind == "multinode",
             isolated=not options.is_native,
             containers=[node.container for node in nodes],
@@ -304,6 +306,7 @@ class Attempts:
                 record.met = True
             if node.gpus:
                 record.devices = tuple(node.gpus)
+            record.host = node.host or record.host
             record.address = node.address or record.address or ""  # of a node that can't be seen it stays known
         return ends
 

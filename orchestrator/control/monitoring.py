@@ -192,12 +192,12 @@ class _Moment(Collector):
 
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
         hosts, gpus, cpus = Sums[tuple[str, ...]](), Sums[tuple[str, ...]](), Sums[tuple[str, ...]]()
-        for host in self._controller.engine.capacity():
-            if not host.away:
-                engine = (engine_of(host.name),)
-                hosts[engine] += 1
-                gpus[engine] += len(host.gpus)
-                cpus[engine] += host.cpus  # type: ignore[assignment]
+        for name, capacity in self._controller.engine.capacity().items():
+            for host in [host for host in capacity.places if not host.away]:
+                if not host.queue:
+                    hosts[(name,)] += 1
+                gpus[(name,)] += len(host.gpus)
+                cpus[(name,)] += host.cpus  # type: ignore[assignment]
         for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
             what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
             yield _gauge(f"muster_{name}", what, ["engine"], amounts)

@@ -310,7 +310,6 @@ class Controller:
                 self.work_queue.active(),
                 self._leading,
                 self.engine.names[0],
-                self.engine.queueing,
             )
         decisions = decide(snapshot)
         self._report, self._leading = decisions.report, decisions.leading

@@ -292,8 +292,8 @@ class Attempt(Base):
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     epoch: Mapped[int]
-    compute_environment: Mapped[str | None] = mapped_column("pool", default=None)
-    """Its name; ``pool`` in SQL."""
+    compute_environment: Mapped[str | None] = mapped_column(default=None)
+    """Its name."""
     handle: Mapped[str | None] = mapped_column(default=None)
     """The engine's name for the gang; None until it was launched."""
     ending: Mapped[str | None] = mapped_column(default=None)

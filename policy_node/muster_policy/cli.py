@@ -119,7 +119,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
-    names = [action.name for action in bundle.contract.actions]
+    names = [action.name for action in bundle.contract.actions if action.kind != "choice"]
+    names += [target.joint for action in bundle.contract.actions for target in action.targets]
     for group in bundle.contract.groups:
         names += [name for term in group.terms if term.element == "joint" for name in term.elements]
     return Settings(

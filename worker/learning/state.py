@@ -175,13 +175,14 @@ class TrainingState:
         """Whether the present state has been copied already."""
         return self._copied[0] == self.progress.iteration
 
-    def save(self, reporter: Reporter | None = None, *, wait: bool = True) -> None:
+    def save(self, reporter: Reporter | None = None, *, wait: bool = True, scheduled: bool = True) -> None:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
         Args:
-            reporter: The checkpoint is committed after everything queued in ``reporter``, so that a run resumed from it has all earlier
-                metrics records.
-            wait: Wait for earlier saves that are still being written, however long.
+            reporter: The checkpoint is committed after what ``reporter`` has been given so far: a run that goes on from it has the
+                metrics records before it.
+            wait: For earlier saves that are still being written, as long as they take.
+            scheduled: Whether the job asked for a checkpoint at this iteration.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.
@@ -196,7 +197,7 @@ class TrainingState:
             files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": self.progress.saved()}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
-        facts = self._manifest() if self.gang.is_main else None
+        facts = {**self._manifest(), "scheduled": scheduled} if self.gang.is_main else None
         self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
         self.ordered_at = iteration
 

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
-from pathlib import Path
 
 import newton
 import numpy as np
+import psutil
 import warp as wp
 
 from worker.simulation.terrain_patches import Flat, Patch, PatchGrid, Rough, Slope, Stairs, Waves
@@ -281,9 +281,8 @@ class Terrain:
 
 
 def _free_memory(device: str) -> float:
-    """Free bytes on the host or on the device, whichever has less."""
-    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    free = int(fields["MemAvailable"].split()[0]) * 1024
+    """Bytes that are free on the host, or on the device where it has less."""
+    free = psutil.virtual_memory().available
     target = wp.get_device(device)
     return min(free, target.free_memory) if target.is_cuda else free
 

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from shared_store.layout import Store
+from shared_store.policy_contract import Target
 from worker.racer import resets
 from worker.racer import terms as racing
 from worker.racer.actions import CAMERA, ActionSpace
@@ -299,7 +300,11 @@ def from_workers(task: Racer) -> torch.Tensor:
 def action_terms(space: ActionSpace) -> Mapping[str, Action] | Choice:
     """The actions: one of the choices, or steering and speed between their limits."""
     if space.choices:
-        return Choice(racing.choose, names=space.names)
+        targets = [
+            (Target("steering", "position", "rad", angle), Target("speed", "velocity", "m/s", speed))
+            for angle, speed in space.radians
+        ]
+        return Choice(racing.choose, names=space.names, targets=targets)
     low, high = (math.radians(end) for end in space.steering)
     slow, fast = space.speed
     steering = {"scale": (high - low) / 2, "offset": (high + low) / 2, "kind": "position", "unit": "rad"}

@@ -243,7 +243,7 @@ def _own_resources(context: Context, environment: ComputeEnvironment) -> dict[st
     """``computeResources`` of a built-in environment: the hosts that its engine has now."""
     engine = context.controller.engine
     served = [environment.name] if environment.name in engine.names else []
-    cpus = int(sum(host.cpus for host in engine.capacity(served, FRESH)))
+    cpus = int(sum(host.cpus for each in engine.capacity(served, FRESH).values() for host in each.places))
     return {
         "type": "EC2",
         "allocationStrategy": "BEST_FIT_PROGRESSIVE",

@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from sqlalchemy.exc import DataError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -18,7 +18,8 @@ from orchestrator.api.batch import operations as batch
 from orchestrator.api.context import IDEMPOTENCY_HEADER
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import docs_page
-from orchestrator.api.http.auth import Access, Guard, error_response, kind_of
+from orchestrator.api.http.access import Access
+from orchestrator.api.http.auth import Guard, error_response, kind_of
 from orchestrator.api.http.limits import RateLimit, parse
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
@@ -50,7 +51,8 @@ def create_app(
     app.state.deliveries = deliveries
     app.state.closing = threading.Event()
     app.include_router(native.router)
-    app.add_middleware(Guard, access=access or Access(), limit=limit or RateLimit())
+    app.state.access, app.state.limit = access or Access(), limit or RateLimit()
+    app.add_middleware(Guard, access=app.state.access, limit=app.state.limit)
     app.add_exception_handler(ClientError, _client_error)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http_error)
@@ -100,11 +102,6 @@ def create_app(
         """The native API."""
         page = docs_page.render(app.openapi(), "/api/openapi.json")
         return HTMLResponse(page, headers={"Content-Security-Policy": docs_page.POLICY})
-
-    @app.get("/", include_in_schema=False)
-    def front() -> RedirectResponse:
-        """For browsers: the pages of the API."""
-        return RedirectResponse("/api/docs")
 
     @app.post("/", include_in_schema=False)
     async def cloudwatch_logs(request: Request) -> Response:

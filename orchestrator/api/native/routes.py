@@ -25,8 +25,9 @@ from orchestrator.api.context import controller_of, permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.native import league_routes, model_routes, run_routes, runs, webhook_routes
+from orchestrator.api.native import job_list, league_routes, model_routes, run_routes, runs, webhook_routes
 from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
@@ -35,7 +36,7 @@ from orchestrator.control.snapshot import fit_in_queue, new_nodes
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
-from orchestrator.domain.hosts import engine_of
+from orchestrator.domain.hosts import Limit, Queued, engine_of
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
@@ -46,10 +47,10 @@ from orchestrator.persistence.session import DatabaseError
 from orchestrator.scheduling.placement import needs
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
-from orchestrator.spec.model import KINDS
 from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
+router.include_router(job_list.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
@@ -95,6 +96,8 @@ def _jobs_of_run(session: Session, reference: str) -> str:
 def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     """The engines and their queues, their hosts with all that they have, and the store; of one queue, its hosts alone.
 
+    ``queued``: the engines that queue and place gangs by themselves, each with the most that a gang may have there, or null where its
+    hosts tell that.
     ``queues``: those whose jobs the caller may see.
     """
     controller = controller_of(request)
@@ -103,13 +106,20 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
         queues = queue_names(session)
+    capacities = controller.engine.capacity(names, FRESH)
     return {
         "engines": own_queues(controller.engine.names),
-        "hosts": [asdict(host) for host in controller.engine.capacity(names, FRESH)],
+        "hosts": [asdict(host) for capacity in capacities.values() for host in capacity.machines],
+        "queued": {name: _limit(each) for name, each in capacities.items() if isinstance(each, Queued)},
         "elastic": controller.engine.is_elastic(names),
         "store": str(controller.store.path),
         "queues": queues,
     }
+
+
+def _limit(capacity: Queued) -> dict[str, Any] | None:
+    limits = capacity.limits
+    return {"queue": limits.queue, **asdict(limits.resources)} if isinstance(limits, Limit) else None
 
 
 @router.post("/plan")
@@ -117,10 +127,11 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
     controller = controller_of(request)
     wanted, definition = _gang_of(body), body.definition
+    check_tracks(controller.store, wanted.spec)
     for source in sources_of(wanted):
         run = permitted_run(controller, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
-            check_evaluation(run, wanted.spec or {}, source.key)
+            check_evaluation(controller.store, run, wanted.spec or {}, source.key)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
@@ -178,6 +189,7 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
     controller = controller_of(request)
     wanted = _gang_of(body)
+    check_tracks(controller.store, wanted.spec)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))
@@ -246,7 +258,7 @@ def job_detail(request: Request, reference: str) -> Any:
                 "owner": job.owner,
                 "run": job.run,
                 "runIsReplaced": is_replaced,
-                "kind": next((kind for kind in KINDS if (gang.spec or {}).get(kind)), "command"),
+                "kind": job_list.kind_of(gang.spec),
                 "status": job.status,
                 "statusReason": controller.reason(job) or job.status_reason,
                 "queue": job.queue,
@@ -362,7 +374,7 @@ def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
         "exitCode": attempt.exit_code,
         "statusReason": attempt.status_reason,
         "spent": attempt.spent,
-        "pool": attempt.compute_environment,
+        "computeEnvironment": attempt.compute_environment,
         "gpuSeconds": attempt.gpu_seconds,
         "cpuSeconds": attempt.cpu_seconds,
         "wastedGpuSeconds": attempt.wasted_gpu_seconds,

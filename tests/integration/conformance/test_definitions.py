@@ -22,7 +22,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start: what was submitted can be looked at for as long as it takes."""
-    yield batch.queue("def-parked", batch.pool("def-parked", state="DISABLED"))
+    yield batch.queue("def-parked", batch.compute_environment("def-parked", state="DISABLED"))
     batch.remove(["def-parked"], ["def-parked"])
 
 

@@ -16,7 +16,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from orchestrator.api.http.auth import Access, Guard
+from orchestrator.api.http.access import Access
+from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.limits import RateLimit
 from orchestrator.api.permissions import current_identity
 from orchestrator.domain.errors import ServerError

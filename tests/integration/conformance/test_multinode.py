@@ -26,7 +26,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture
 def queue(batch: Batch) -> Iterator[str]:
     """A queue whose compute environment a test may disable, so that nothing new starts while it looks."""
-    yield batch.queue("mnp-held", batch.pool("mnp-held"))
+    yield batch.queue("mnp-held", batch.compute_environment("mnp-held"))
     batch.remove(["mnp-held"], ["mnp-held"])
 
 

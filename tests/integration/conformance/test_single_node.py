@@ -25,7 +25,7 @@ def batch(shared_server: Serving) -> Batch:
 @pytest.fixture(scope="module")
 def parked(batch: Batch) -> Iterator[str]:
     """A queue whose jobs never start."""
-    yield batch.queue("one-parked", batch.pool("one-parked", state="DISABLED"))
+    yield batch.queue("one-parked", batch.compute_environment("one-parked", state="DISABLED"))
     batch.remove(["one-parked"], ["one-parked"])
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.domain.hosts import Host, Placement
+from orchestrator.domain.hosts import Host, Hosts, Placement
 from orchestrator.engines import runner
 from orchestrator.engines.api import (
     EngineError,
@@ -56,7 +56,7 @@ def gang(directory: Path, name: str = "job", host: str = HOST, script: str = "ex
 class Fake:
     """An engine whose calls do what a test wants, and note on which thread they did."""
 
-    name, queues, elastic, images, address = "engine", False, False, False, None
+    name, elastic, images, address = "engine", False, False, None
 
     def __init__(self) -> None:
         self.free, self.threads, self.closed = threading.Event(), set[str](), 0
@@ -69,9 +69,9 @@ class Fake:
         if self.error is not None:
             raise self.error
 
-    def capacity(self) -> Sequence[Host]:
+    def capacity(self) -> Hosts:
         self._do()
-        return [Host(HOST, 4, (), 1024)]
+        return Hosts([Host(HOST, 4, (), 1024)])
 
     def plan(self, gang: Gang) -> Plan[None]:
         return Plan(gang, [], None)
@@ -146,7 +146,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
 
         said = wait_for(says, 10, "that it does not answer")
         assert said.startswith("the engine engine has not answered since "), said
-        assert several.capacity(patience=60) == [Host(HOST, 4, (), 1024)], "what it told last"
+        assert several.capacity(patience=60) == {"engine": Hosts([Host(HOST, 4, (), 1024)])}, "what it told last"
         with pytest.raises(NotYet, match="has not answered since") as wait:
             several.launch("other/1/1", [HOST], lambda: several.plan(gang(tmp_path, "other")))
         assert wait.value.unknown, "it may have been started"

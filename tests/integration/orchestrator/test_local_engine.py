@@ -71,17 +71,17 @@ def test_a_supervisor_that_has_not_begun_yet_is_not_taken_for_its_shim(bench: Lo
 
 
 def test_the_machine_is_the_only_host_with_its_configured_resources() -> None:
-    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity()
+    [host] = LocalEngine(Path("/nowhere"), cpus=6, gpus=["2", "5"]).capacity().machines
     assert (host.name, host.cpus, host.gpus) == ("localhost", 6, ("2", "5"))
     assert host.memory == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
 
 
 def test_without_a_limit_the_machine_s_own_cpus_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1,3")
-    [host] = LocalEngine(Path("/nowhere")).capacity()
+    [host] = LocalEngine(Path("/nowhere")).capacity().machines
     assert (host.cpus, host.gpus) == (float(os.cpu_count() or 1), ("1", "3"))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert LocalEngine(Path("/nowhere")).capacity()[0].gpus == ()
+    assert LocalEngine(Path("/nowhere")).capacity().machines[0].gpus == ()
 
 
 def test_a_plan_starts_nothing_and_is_the_same_each_time(bench: LocalBench) -> None:
@@ -172,7 +172,7 @@ def test_a_gang_starts_completely_or_not_at_all(bench: LocalBench) -> None:
 
 
 def test_one_rank_is_started_for_each_gpu_of_a_native_job(bench: LocalBench) -> None:
-    gang = bench.gang("echo $RANK of $WORLD_SIZE", environments=[{"MUSTER_RANKS_PER_NODE": "2"}] * 2)
+    gang = bench.gang("echo $RANK of $WORLD_SIZE", ranks=[2, 2])
     bench.ended(bench.launch(gang))
     assert sorted(bench.printed()) == [(0, "0 of 4"), (0, "1 of 4"), (1, "2 of 4"), (1, "3 of 4")]
 

@@ -50,7 +50,7 @@ def test_a_racer_is_trained_registered_raced_ranked_and_verified(server: Serving
     path.chmod(0o644)
     path.write_bytes(path.read_bytes().replace(b'"racer": "bob"', b'"racer": "eve"'))
     altered = server.muster("league", "verify", "cup")
-    assert altered.returncode == 1 and "entry 2: league cup: entry 2 is altered" in altered.stdout
+    assert altered.returncode == 1 and "entry 2: the content of entry.json was altered" in altered.stdout
     assert [row["status"] for row in json.loads(done("league", "table", "cup", "--json")) if row["entry"] == 2] == [
         "altered"
     ]

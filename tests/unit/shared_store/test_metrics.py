@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import tracemalloc
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from shared_store import metrics
 from shared_store.layout import Run
-from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics
+from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics, sampled
 
 
 def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
@@ -199,3 +200,39 @@ def test_a_page_of_a_long_history_is_read_without_the_rest(tmp_path: Path, monke
         page = [record for record in everything if record["iteration"] > after][:200]
         assert history.after(after, 200) == page
     assert len(parsed) < 10_000, "of 42,500 that five looks at everything would parse"
+
+
+def points(run: Run, *arguments: int) -> list[tuple[int, int]]:
+    return [(record["iteration"], record["epoch"]) for record in sampled(run, *arguments)]
+
+
+def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    assert sampled(run) == []
+    attempt(run, 1, 0, 0)
+    assert sampled(run) == []
+    attempt(run, 2, 0, 7)
+    assert points(run) == [(i, 2) for i in range(1, 8)]
+
+
+def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 20_000)
+    found = [iteration for iteration, _ in points(run, 40)]
+    assert len(found) == 40 and found[-1] == 20_000 and found == sorted(set(found))
+    assert max(after - before for before, after in pairwise([0, *found])) < 1500
+    with open(run.metrics / "metrics-e1.jsonl", "a") as file:
+        file.write('{"iteration": 20001, "ep')
+    assert points(run, 40)[-1] == (20_000, 1)
+
+
+def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_is_asked_for(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 3000)
+    attempt(run, 2, 1000, 5000)
+    found = points(run, 60)
+    assert found == sorted(set(found)) and found[-1] == (5000, 2)
+    assert all((iteration > 1000) is (epoch == 2) for iteration, epoch in found)
+    assert {epoch for _, epoch in found} == {1, 2}
+    earlier = points(run, 60, 1)
+    assert earlier[-1] == (3000, 1) and {epoch for _, epoch in earlier} == {1}

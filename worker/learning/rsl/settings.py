@@ -133,6 +133,11 @@ class RslRlConfig:
                     known = ", ".join(groups)
                     raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
 
+    def check_actions(self, chooses: bool) -> None:
+        """Raises ValueError for a task whose policy chooses one of several actions."""
+        if chooses:
+            raise ValueError("its distributions are of numbers, and the actions of this task are choices; use ppo")
+
     def section(self, name: str) -> dict[str, Any]:
         """Section ``name`` in rsl_rl's form, with its ``class_name``. It is a copy."""
         return _changed(DEFAULTS[name], getattr(self, name) or {})

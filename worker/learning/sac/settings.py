@@ -124,6 +124,11 @@ class SACConfig:
         if images := [group for group in ("policy", self.critic_group) if groups[group]]:
             raise ValueError(f"it can't learn from images, and observation group {images[0]!r} is one; use ppo")
 
+    def check_actions(self, chooses: bool) -> None:
+        """Raises ValueError for a task whose policy chooses one of several actions."""
+        if chooses:
+            raise ValueError("its actions are numbers from a range, and this task's are choices; use ppo")
+
     @model_validator(mode="after")
     def _fits(self) -> SACConfig:
         """Check fields against each other."""

@@ -16,7 +16,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from starlette.types import Message, Receive, Scope, Send
 
-from orchestrator.api.http.auth import Access, Guard
+from orchestrator.api.http.access import Access
+from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.limits import RateLimit
 from orchestrator.keys import Key, KeyStore
 

@@ -133,7 +133,7 @@ def test_in_a_queue_that_is_first_in_first_out_nobody_is_preempted() -> None:
     assert decide(snapshot([host()], [job("ant", priority=9)], held)).preempts == ()
 
 
-def test_the_cpus_that_a_pool_may_use_are_preempted_for_too() -> None:
+def test_the_cpus_that_a_compute_environment_may_use_are_preempted_for_too() -> None:
     held = [running("cart", on("a", 2), queue="low", preemptible=True)]
     waiting = [job("ant", gang(node(3)), queue="high")]
     assert (
@@ -227,7 +227,7 @@ def test_the_first_of_a_queue_is_stuck_too_where_an_equal_job_of_another_queue_w
     assert names(each.job for each in decisions.cancels) == "cart"
 
 
-def test_a_queue_without_a_usable_compute_environment_cancels_no_job() -> None:
+def test_a_queue_without_a_usable_compute_environment_cancels_nobody() -> None:
     queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
     decisions = decide(
         snapshot(

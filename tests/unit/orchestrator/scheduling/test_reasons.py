@@ -51,7 +51,7 @@ def test_without_any_host_the_job_says_so() -> None:
     )
 
 
-def test_a_job_with_more_cpus_than_any_pool_may_use_says_so_and_holds_up_nobody() -> None:
+def test_a_job_with_more_cpus_than_any_compute_environment_may_use_says_so_and_holds_up_nobody() -> None:
     waiting = line(job("big", gang(node(2), node(2))), job("small"))
     queues, compute_environments = (
         [queue(compute_environments=("p", "q"))],
@@ -65,7 +65,7 @@ def test_a_job_with_more_cpus_than_any_pool_may_use_says_so_and_holds_up_nobody(
     )
 
 
-def test_the_reasons_of_all_refusing_compute_environments_are_reported() -> None:
+def test_a_job_that_each_compute_environment_refuses_for_another_reason_hears_both() -> None:
     queues, compute_environments = (
         [queue(compute_environments=("p", "q"))],
         [compute_environment("p", max_cpus=1), compute_environment("q", ("b",))],

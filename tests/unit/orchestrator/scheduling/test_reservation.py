@@ -104,7 +104,7 @@ def test_gpus_are_kept_by_number() -> None:
     assert [(names([s.job]), s.placements[0].gpus) for s in decisions.starts] == [("j0", ("a2",))]
 
 
-def test_the_limit_of_a_compute_environment_is_reserved_too() -> None:
+def test_what_a_compute_environment_may_use_is_kept_too() -> None:
     compute_environments = [compute_environment("p", max_cpus=4), compute_environment("q")]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("p",)), queue("three", 0, ("q",))]
     held = [running("cart", on("a", 1), compute_environment="p", timeout=700)]
@@ -208,7 +208,7 @@ def test_a_job_that_waits_holds_up_only_the_hosts_it_could_use() -> None:
     assert reason(decisions, "two-next").startswith("2nd in queue two, behind job two-large (two-larg)")
 
 
-def test_a_job_with_several_pools_is_the_head_of_those_that_are_not_kept_yet() -> None:
+def test_a_job_with_several_compute_environments_is_the_head_of_those_that_are_not_kept_yet() -> None:
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     queues = [queue("one", 3, ("p",)), queue("both", 2, ("p", "q")), queue("two", 1, ("q",))]
     held = [
@@ -265,7 +265,7 @@ def test_a_job_of_a_lower_queue_may_use_hosts_that_the_head_of_a_higher_one_can_
 # -- what is kept for shares that are not active ----------------------------------------------------------------------
 
 
-def test_a_queue_keeps_part_of_its_pool_for_shares_that_are_not_active() -> None:
+def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_active() -> None:
     policy = FairShare(600, 50, {})
     waiting = line(*[job(f"j{i}", gang(node(1, 1)), share="s") for i in range(6)])
     decisions = decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=[queue(policy=policy)]))
@@ -314,7 +314,7 @@ def test_an_elastic_gang_shrinks_to_the_limit_of_its_queue() -> None:
     assert started(decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=queues))) == "ant:a+a+a+a"
 
 
-def test_a_job_may_start_in_the_next_compute_environment_when_the_first_is_reserved() -> None:
+def test_what_is_kept_in_one_compute_environment_may_be_free_in_the_next() -> None:
     queues = [queue(compute_environments=("p", "q"), policy=FairShare(600, 50, {}))]
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     waiting = line(*[job(f"j{i}", share="s") for i in range(5)])
