@@ -220,7 +220,7 @@ def test_a_child_that_was_just_started_is_found_by_its_marks() -> None:
     await_marks(child.pid)  # of one that is gone it returns
 
 
-def test_the_kernel_ends_a_whole_control_group_at_one_word_also_one_that_forks_all_the_time() -> None:
+def test_the_kernel_ends_a_whole_control_group_at_once_even_one_that_keeps_forking() -> None:
     if not (groups := own_group()):
         pytest.skip(
             "this process can't make control groups of version 2: run the test as root, or in a delegated group"

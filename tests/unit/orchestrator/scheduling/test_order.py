@@ -211,7 +211,7 @@ def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
     )
 
 
-def test_an_elastic_gang_shrinks_to_what_the_compute_environment_may_use() -> None:
+def test_an_elastic_gang_shrinks_to_the_limit_of_its_compute_environment() -> None:
     waiting = [job("ant", gang(*[node(2)] * 4, minimum=1))]
     assert (
         started(decide(snapshot([host(cpus=16)], waiting, compute_environments=[compute_environment(max_cpus=5)])))

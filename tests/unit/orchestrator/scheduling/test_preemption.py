@@ -227,7 +227,7 @@ def test_the_first_of_a_queue_is_stuck_too_where_an_equal_job_of_another_queue_w
     assert names(each.job for each in decisions.cancels) == "cart"
 
 
-def test_a_queue_without_a_usable_compute_environment_cancels_nobody() -> None:
+def test_a_queue_without_a_usable_compute_environment_cancels_no_job() -> None:
     queues = [queue(limits=tuple(TimeLimit(code, 600) for code in (CAPACITY, MAXIMUM, REQUIREMENT)))]
     decisions = decide(
         snapshot(

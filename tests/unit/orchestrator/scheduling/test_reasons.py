@@ -65,7 +65,7 @@ def test_a_job_with_more_cpus_than_any_compute_environment_may_use_says_so_and_h
     )
 
 
-def test_a_job_that_each_compute_environment_refuses_for_another_reason_hears_both() -> None:
+def test_the_reasons_of_all_refusing_compute_environments_are_reported() -> None:
     queues, compute_environments = (
         [queue(compute_environments=("p", "q"))],
         [compute_environment("p", max_cpus=1), compute_environment("q", ("b",))],

@@ -104,7 +104,7 @@ def test_gpus_are_kept_by_number() -> None:
     assert [(names([s.job]), s.placements[0].gpus) for s in decisions.starts] == [("j0", ("a2",))]
 
 
-def test_what_a_compute_environment_may_use_is_kept_too() -> None:
+def test_the_limit_of_a_compute_environment_is_reserved_too() -> None:
     compute_environments = [compute_environment("p", max_cpus=4), compute_environment("q")]
     queues = [queue("one", 2, ("p",)), queue("two", 1, ("p",)), queue("three", 0, ("q",))]
     held = [running("cart", on("a", 1), compute_environment="p", timeout=700)]
@@ -314,7 +314,7 @@ def test_an_elastic_gang_shrinks_to_the_limit_of_its_queue() -> None:
     assert started(decide(snapshot([host(cpus=8, gpus=8)], waiting, queues=queues))) == "ant:a+a+a+a"
 
 
-def test_what_is_kept_in_one_compute_environment_may_be_free_in_the_next() -> None:
+def test_a_job_may_start_in_the_next_compute_environment_when_the_first_is_reserved() -> None:
     queues = [queue(compute_environments=("p", "q"), policy=FairShare(600, 50, {}))]
     compute_environments = [compute_environment("p", ("a",)), compute_environment("q", ("b",))]
     waiting = line(*[job(f"j{i}", share="s") for i in range(5)])
