@@ -303,7 +303,7 @@ def stop(
     reason: Annotated[str, typer.Option(help="Reason, kept with the job.")] = "stopped by the user",
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return only when the job has ended.")] = True,
 ) -> None:
-    """Stop a job: it checkpoints and leaves; `muster resume` goes on from there.
+    """Stop a job: it checkpoints and exits; `muster resume` continues from there.
 
     A training ends its iteration first. One that does not end within the 30 s that a job has is left, and `muster resume` repeats it.
     """
