@@ -160,7 +160,7 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate_as_oth
     assert "evaluates: taught@10" in shown and controller.newest()["iteration"] == 20
 
 
-def test_what_is_known_of_a_run_that_is_gone_is_not_told_of_another_one_of_its_name(controller: Controller) -> None:
+def test_facts_of_a_deleted_run_are_not_shown_for_a_new_run_of_the_same_name(controller: Controller) -> None:
     former = controller.train({"every": 1})
     controller.save(10)
     controller.look()
@@ -180,14 +180,14 @@ def test_what_is_known_of_a_run_that_is_gone_is_not_told_of_another_one_of_its_n
     assert not controller.client.get(f"/api/jobs/{training}")["runIsReplaced"]
 
 
-def test_who_shows_a_run_is_told_which_jobs_made_it(controller: Controller) -> None:
+def test_showing_a_run_names_the_jobs_that_made_it(controller: Controller) -> None:
     job = submit_gang(controller.client, "pass", name="short")
     refused = call_muster("show", f"short-{job[:8]}", home=controller.home)
     line = f"muster: short-{job[:8]} is a run, which job short ({job[:8]}) made; see: muster show {job[:8]}\n"
     assert (refused.returncode, refused.stderr) == (2, line)
 
 
-def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_evaluation(
+def test_a_controller_stopped_at_any_moment_neither_loses_nor_repeats_an_evaluation(
     controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(BaseException):
@@ -214,7 +214,7 @@ def test_a_controller_that_stops_at_any_moment_neither_loses_nor_doubles_an_eval
     assert controller.evaluations() == [(10, "RUNNABLE")]
 
 
-def test_a_checkpoint_that_a_killed_controller_kept_for_nobody_is_let_go(controller: Controller) -> None:
+def test_a_checkpoint_kept_by_a_killed_controller_for_no_job_is_released(controller: Controller) -> None:
     controller.train({"every": 1})
     controller.save(10)
     controller.look()

@@ -242,7 +242,7 @@ def test_gangs_of_a_database_that_was_deleted_are_named_at_the_next_start_with_h
     assert sum("has no such job" in record.getMessage() for record in caplog.records) == 1
 
 
-def test_what_was_committed_into_a_deleted_file_is_not_acknowledged(tmp_path: Path) -> None:
+def test_a_commit_to_a_deleted_database_file_is_not_acknowledged(tmp_path: Path) -> None:
     database = Database.at(tmp_path)
     with pytest.raises(DatabaseError, match="was deleted while the controller runs"), database.session() as session:
         session.add(job("lost"))
@@ -308,7 +308,7 @@ def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Pat
     assert stopped, "while the machines were looked at"
 
 
-def test_a_volume_that_does_not_answer_is_named_starts_nothing_and_holds_up_nobody(
+def test_a_hanging_volume_is_named_starts_nothing_and_delays_no_request(
     inside: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look, answers = os.statvfs, threading.Event()
