@@ -88,7 +88,7 @@ def marked(marks: Collection[str]) -> list[Process]:
     """
     wanted = {mark.encode() for mark in marks}
     if not wanted or any(not mark.partition(b"=")[2] for mark in wanted):
-        raise ValueError(f"no process can be told by the marks {sorted(marks)}")
+        raise ValueError(f"no process can be identified by the marks {sorted(marks)}")
     found = []
     for pid in _pids():
         if pid == os.getpid():

@@ -13,6 +13,7 @@ from orchestrator.api.context import Context, find_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.permissions import Operation
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.reconciler import Controller
 from orchestrator.domain.excerpts import shown
 from orchestrator.domain.gang import GangSpec, NodeSpec
@@ -60,6 +61,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     Returns:
         The teacher's weights, where the job's run has to hold a copy of them.
     """
+    check_tracks(context.controller.store, gang.spec)
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
@@ -75,7 +77,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
             nobodys = RunRecord(name=source.run, queue="")
             permissions.check(Operation.SUBMIT_JOB, owner_of(context.session, context.run(source.run)) or nobodys)
         if source.key in ("evaluate", "race") and not is_waiting:
-            check_evaluation(context.run(source.run), gang.spec or {}, source.key)
+            check_evaluation(context.controller.store, context.run(source.run), gang.spec or {}, source.key)
         if is_teacher and not is_waiting:
             needed = TeacherNeeded(source.run, _checkpoint(context, source))
             teacher = needed if source in mains else teacher  # the main node's is the one that all ranks take

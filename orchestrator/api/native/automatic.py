@@ -149,7 +149,7 @@ class AutomaticEvaluations:
         if training is None:
             return
         run, iterations = training.run, int(training.spec["train"]["iterations"])
-        checkpoints = list_checkpoints(run)
+        checkpoints = [each for each in list_checkpoints(run) if each.is_scheduled]
         with self._controller.database.session() as session:
             job, row = session.get(Job, job_id), session.get(AutomaticEvaluation, run.name)
             if job is None or job.is_terminal or job.stop_reason is not None:

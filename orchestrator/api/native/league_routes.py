@@ -113,6 +113,10 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     controller.check_writable(adds=True)
     if body.opens is not None and body.closes is not None and body.opens >= body.closes:
         raise ClientError("opens: the league would close before it opens")
+    if body.closes is not None and body.closes <= time.time():
+        raise ClientError(
+            f"closes: {leagues.moment(body.closes)} is past: no race could ever start; name a later time, or none"
+        )
     given = body.model_dump()
     rules = Rules(**{key: given[key] for key in asdict(Rules())})
     try:
@@ -167,7 +171,9 @@ def read_entry(request: Request, name: str, number: int) -> Any:
         _check_digest(model, found)
     except UnknownLeague as error:
         raise _refused(error) from None
-    except (LeagueError, ClientError) as error:
+    except LeagueError as error:
+        found["problem"] = stored.problem(number, error)
+    except ClientError as error:  # of its model
         found["problem"] = str(error)
     return permissions.shown({**found, "ruling": stored.ruling(number)})
 
@@ -400,7 +406,7 @@ def _verify(model: Model) -> None:
     try:
         model.verify()
     except DamagedBundle as error:
-        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+        raise ClientError(f"model {model.reference}: {bundles.reason(error, model.path)}", CONFLICT) from None
 
 
 def _digest(model: Model) -> str:
@@ -408,7 +414,7 @@ def _digest(model: Model) -> str:
     try:
         return str(bundles.read_manifest(model.path)["digest"])
     except (DamagedBundle, DamagedFile) as error:
-        raise ClientError(f"model {model.reference} was altered: {error}", CONFLICT) from None
+        raise ClientError(f"model {model.reference}: {bundles.reason(error, model.path)}", CONFLICT) from None
 
 
 def _check_digest(model: Model, entry: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.native import job_list, league_routes, model_routes, run_routes, runs, webhook_routes
 from orchestrator.api.permissions import JobsOf, Operation
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
@@ -126,10 +127,11 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """What a job would start and where, if all hosts were free. Nothing is registered and nothing starts."""
     controller = controller_of(request)
     wanted, definition = _gang_of(body), body.definition
+    check_tracks(controller.store, wanted.spec)
     for source in sources_of(wanted):
         run = permitted_run(controller, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
-            check_evaluation(run, wanted.spec or {}, source.key)
+            check_evaluation(controller.store, run, wanted.spec or {}, source.key)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.PLAN, JobsOf(queue.name))
@@ -187,6 +189,7 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
     controller = controller_of(request)
     wanted = _gang_of(body)
+    check_tracks(controller.store, wanted.spec)
     with controller.database.session() as session:
         queue = _queue(session, body.queue)
         permissions.check(Operation.FIT, JobsOf(queue.name))

@@ -45,6 +45,7 @@ class CloneRequest(_ChangesRequest):
     checkpoint: int | Literal["best", "latest"] | None = Field(
         default=None, description="iteration; best: by evaluations, else by score; latest, or absent: the newest"
     )
+    dry_run: bool = Field(default=False, description="check it, and answer the definition that would be registered")
 
 
 @router.get("/runs")
@@ -143,4 +144,6 @@ def clone_run(
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key answers what the first one did."""
     controller = controller_of(request)
     run = permitted_run(controller, name, Operation.CLONE_RUN)
+    if body.dry_run:
+        return clones.check_clone(controller, run, body.name, body.changes())
     return clones.clone(controller, run, body.name, body.changes(), idempotency_key)

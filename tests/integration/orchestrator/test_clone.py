@@ -146,7 +146,7 @@ def test_a_second_call_with_the_same_key_answers_what_the_first_did(full: Servin
             "x",
             (),
             2,
-            ["taught@last: after @ stands an iteration, best or latest", "muster checkpoints taught"],
+            ["taught@last: expected an iteration, best or latest after @", "muster checkpoints taught"],
         ),
         ("taught", "taught", (), 1, ["run taught exists already: give the clone another --name"]),
         ("taught", "a b", (), 2, ["clone of run taught: name: expected letters"]),

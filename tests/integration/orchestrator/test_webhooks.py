@@ -119,7 +119,7 @@ def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serv
     place = f"http://127.0.0.1:{receiver.server_port}"
     accepted, note = sent.stdout.splitlines()
     assert accepted == f"chat: {place} accepted the sample (webhook-id {headers['webhook-id']})", sent.stderr
-    assert note == "a sample is sent once, about no job; it is none of the messages that muster webhooks list counts"
+    assert note == "this sample belongs to no job; muster webhooks list does not count it"
     assert is_signed(headers, body) and json.loads(body)["type"] == "webhook.test"
     receiver.answers = [302]
     refused = command("test", "chat")

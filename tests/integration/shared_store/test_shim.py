@@ -205,7 +205,7 @@ def test_processes_that_replace_themselves_all_the_time_are_ended(group: str, pi
 
 @pytest.mark.parametrize("marks", [[], ["MUSTER_GANG="], ["MUSTER_GANG"], ["MUSTER_GANG=job/1/1", ""]])
 def test_marks_that_would_fit_every_process_are_refused(marks: list[str]) -> None:
-    with pytest.raises(ValueError, match="no process can be told by the marks"):
+    with pytest.raises(ValueError, match="no process can be identified by the marks"):
         marked(marks)
 
 

@@ -164,12 +164,12 @@ def test_commands_of_other_counts_are_refused() -> None:
 
 def test_a_joint_without_limits_is_refused_where_they_are_needed() -> None:
     refused(
-        "actions.f: share_of_range_target needs limits of its position, which the joint second of robot has not",
+        "actions.f: share_of_range_target needs limits of its position, which joint second of robot lacks",
         robot=held(),
         actions={"f": Action(terms.share_of_range_target, kind="position")},
     )
     refused(
-        "metrics.m: joint_effort_excess needs a limit of its force, which the joint first of robot has not",
+        "metrics.m: joint_effort_excess needs a limit of its force, which joint first of robot lacks",
         metrics={"m": Metric(terms.joint_effort_excess)},
     )
 

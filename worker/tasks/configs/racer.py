@@ -232,6 +232,25 @@ class RacerConfig(TaskConfig):
         return plain_settings(train, cls())
 
     @property
+    def chooses(self) -> bool:
+        """As :attr:`TaskConfig.chooses`; False of an action space in a file, which a node reads."""
+        return not isinstance(self.action_space, str) and bool(self.actions().choices)
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """As :attr:`TaskConfig.policy_sizes`."""
+        if isinstance(self.action_space, str):
+            return {}
+        space = self.actions()
+        lidar = self.lidar_of(space)
+        return {
+            "action_space": f"{len(space.choices)} actions to choose from" if space.choices else "ranges of 2 actions",
+            "waypoints": str(self.waypoints),
+            "lidar": f"one of {lidar.size} numbers" if lidar else "none",
+            "obstacles": "some" if self.obstacles else "none",
+        }
+
+    @property
     def tracks(self) -> tuple[str, ...]:
         """The names of all tracks."""
         return (self.track,) if isinstance(self.track, str) else self.track
@@ -269,6 +288,13 @@ class RacerPixelsConfig(RacerConfig):
         )
     )
     """How the task is trained: the critic also sees the numbers."""
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """As :attr:`TaskConfig.policy_sizes`."""
+        front = self.front
+        image = f"{front.frames} {front.kind} images of {front.width} x {front.height}"
+        return {**super().policy_sizes, "front": image}
 
 
 @dataclass(frozen=True, config=STRICT)
