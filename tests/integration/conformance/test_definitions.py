@@ -277,7 +277,7 @@ def listed(batch: Batch, queue: str) -> list[str]:
     return [each["jobId"] for page in pages for each in page["jobSummaryList"]]
 
 
-def test_what_the_model_of_aws_forbids_is_refused_in_the_words_of_aws(shared_server: Serving) -> None:
+def test_violations_of_the_aws_model_are_refused_in_the_words_of_aws(shared_server: Serving) -> None:
     """boto3 would not even send these."""
     for operation, body, parameter in [
         ("registerjobdefinition", {"type": "multinode"}, "jobDefinitionName"),

@@ -94,7 +94,7 @@ def test_every_job_that_waits_says_what_it_needs_and_for_whom_it_waits(
     assert [batch.wait(job)["status"] for job in (head, second, pending)] == ["SUCCEEDED"] * 3
 
 
-def test_a_snapshot_shows_who_is_next_and_what_is_in_use(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
+def test_a_snapshot_shows_the_next_jobs_and_the_resources_in_use(batch: Batch, one_cpu: str, tmp_path: Path) -> None:
     definition = batch.single("q-snapped", UNTIL.format("go"), env={"GATE": str(tmp_path)}, cpus="1")
     running = batch.submit(definition, queue="q-low")
     batch.wait(running, "RUNNING")
@@ -150,7 +150,7 @@ def test_shares_take_turns_by_weight_and_priority_counts_within_one(batch: Batch
     batch.api.delete_scheduling_policy(arn=policy)
 
 
-def test_who_has_used_less_comes_first_and_a_reservation_is_kept_free(batch: Batch, tmp_path: Path) -> None:
+def test_the_share_with_less_use_goes_first_and_a_reservation_is_kept_free(batch: Batch, tmp_path: Path) -> None:
     """Of 4 CPUs a reservation of 50 keeps half for others while one share is active, a quarter while two are."""
     compute_environment = batch.compute_environment("q-used", cpus=4)
     policy = batch.api.create_scheduling_policy(name="q-used", fairsharePolicy={"computeReservation": 50})["arn"]

@@ -219,7 +219,7 @@ def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Se
     assert "races" in shown and "fast-car" in shown
 
 
-def test_a_copy_of_step_logs_replaces_none(full: Serving, tmp_path: Path) -> None:
+def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> None:
     (tmp_path / "sim-trace").mkdir()
     done = call_muster("evaluate", "fast-car", "--race", "-o", str(tmp_path), home=full.home)
     assert done.returncode == 2 and "sim-trace exists; name another directory" in done.stderr

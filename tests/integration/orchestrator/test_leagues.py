@@ -288,7 +288,7 @@ def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_close
     )
 
 
-def test_whatever_is_altered_is_told_and_not_ranked(cups: Paddock) -> None:
+def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     cups.done("create", "honest", "--track", "oval")
     for job in (0, 1):
         cups.raced(job, race([12.0 + job] * 3), job + 1)

@@ -113,7 +113,7 @@ def test_with_a_control_group_a_job_that_kills_the_shim_leaves_nothing_either(pi
     assert not os.path.exists(group)
 
 
-def test_without_one_what_kept_its_marks_is_found_by_them_and_others_are_left_alone(pids: Path) -> None:
+def test_without_a_group_marked_processes_are_found_and_others_are_left_alone(pids: Path) -> None:
     gang = f"shim-{os.getpid()}/1/1"
     script = f"setsid sleep 600 & echo $! >>{pids}; exec sleep 600"
     shim, other = start(script, "", MUSTER_GANG=gang), start(script, "", MUSTER_GANG=f"{gang}1")
@@ -137,7 +137,7 @@ def test_requests_reach_the_supervisor_also_where_a_job_stopped_it(number: int, 
     assert shim.wait(20 * PATIENCE) == 75
 
 
-def test_a_shim_that_a_job_stopped_ends_all_the_same(group: str, pids: Path) -> None:
+def test_a_shim_stopped_by_a_job_still_ends(group: str, pids: Path) -> None:
     shim = start(ESCAPE.format(pids=pids) + "exec sleep 600", group)
     wait_for(lambda: len(read(pids)) == 2, 20, "two processes that escaped")
     shim.send_signal(signal.SIGSTOP)
@@ -220,7 +220,7 @@ def test_a_child_that_was_just_started_is_found_by_its_marks() -> None:
     await_marks(child.pid)  # of one that is gone it returns
 
 
-def test_the_kernel_ends_a_whole_control_group_at_one_word_also_one_that_forks_all_the_time() -> None:
+def test_the_kernel_ends_a_whole_control_group_at_once_even_one_that_keeps_forking() -> None:
     if not (groups := own_group()):
         pytest.skip(
             "this process can't make control groups of version 2: run the test as root, or in a delegated group"
@@ -242,7 +242,7 @@ def test_the_kernel_ends_a_whole_control_group_at_one_word_also_one_that_forks_a
     assert not os.path.exists(group)
 
 
-def test_abandoned_groups_are_removed_and_neither_those_in_use_nor_new_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_abandoned_groups_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     if not (groups := own_group()):
         pytest.skip("this process can't make control groups")
     directory = f"{groups}/muster-test-{os.getpid()}"

@@ -74,7 +74,7 @@ def test_nothing_is_commanded_before_all_inputs_have_come(rig: Rig) -> None:
     assert rig.lines == ["all inputs have arrived: it commands the joints now, in a new episode"]
 
 
-def test_the_policy_sees_its_last_action_as_it_asked_for_it(rig: Rig) -> None:
+def test_the_policy_observes_its_last_action_unclipped(rig: Rig) -> None:
     rig.step(0.0, knee=3.0)
     rig.step(0.02, knee=0.0)
     # asked for 3, clipped to 2 for the joint; then half of the 3 that it asked for

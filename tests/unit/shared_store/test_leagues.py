@@ -162,7 +162,7 @@ def test_an_altered_entry_is_not_ranked_and_the_others_are(
     assert cup.enter(entry("cat", version=3))["entry"] == 3, "its number is not given again"
 
 
-def test_an_altered_league_ranks_nobody_and_takes_no_entries(cup: StoredLeague) -> None:
+def test_an_altered_league_has_no_ranking_and_accepts_no_entries(cup: StoredLeague) -> None:
     cup.enter(entry())
     alter_definition(cup)
     for ask in (cup.definition, cup.digest, lambda: cup.enter(entry(version=2))):
@@ -198,7 +198,7 @@ def test_an_entry_that_is_sealed_but_is_none_is_refused(cup: StoredLeague) -> No
         shutil.rmtree(path)
 
 
-def test_a_ruling_stands_beside_the_entry_and_is_made_once(cup: StoredLeague) -> None:
+def test_a_ruling_is_stored_beside_the_entry_and_made_only_once(cup: StoredLeague) -> None:
     cup.enter(entry())
     before = {path: path.read_bytes() for path in (cup.path / "entries").rglob("*") if path.is_file()}
     assert cup.ruling(1) is None
@@ -217,7 +217,7 @@ def test_a_ruling_stands_beside_the_entry_and_is_made_once(cup: StoredLeague) ->
     )
 
 
-def test_one_has_only_so_many_entries_and_one_s_own_name(store: Store) -> None:
+def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store) -> None:
     cup = leagues.create(store, league(most_entries=2))
     cup.enter(entry("ada", version=1))
     with pytest.raises(LeagueError, match=r"^league cup: entry 1 has this evaluation already$"):
@@ -299,7 +299,7 @@ def test_an_evaluation_of_other_rules_is_not_of_the_league(changes: dict[str, An
     assert league().misfit(summary(race([12.0, 12.5, 13.0])) | changes) == said
 
 
-def test_the_tracks_of_a_league_are_the_same_ones_for_ever(store: Store) -> None:
+def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
     assert leagues.digest_of_track(store, "oval") is None and leagues.digest_of_track(store, "random:7") is None
     with pytest.raises(LeagueError, match=r"^track ovel does not exist; did you mean oval\?$"):
         leagues.digest_of_track(store, "ovel")

@@ -62,7 +62,7 @@ def test_a_smoothed_target_has_two_numbers_for_each_joint() -> None:
     assert torch.equal(task._memory[:, task.plan.commands[0].first], command)
 
 
-def test_a_command_hides_what_its_function_keeps() -> None:
+def test_a_command_has_hidden_numbers_of_its_function() -> None:
     command = Command(terms.heading_velocity_command, **VELOCITIES, heading=(-3.0, 3.0))
     plan = sliders(
         commands={"v": command}, curricula={}, events={}, observations={"v": Observation(terms.command_number)}

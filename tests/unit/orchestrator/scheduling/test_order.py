@@ -30,7 +30,7 @@ from tests.support.orchestrator.scheduling import (
 # -- gangs ------------------------------------------------------------------------------------------------------------
 
 
-def test_where_nothing_waits_nothing_is_decided() -> None:
+def test_without_waiting_jobs_nothing_is_decided() -> None:
     decisions = decide(snapshot([host()], []))
     assert (decisions.starts, decisions.preempts, decisions.cancels) == ((), (), ())
     assert list(decisions.report.order("default")) == []
@@ -74,7 +74,7 @@ def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
     )
 
 
-def test_what_a_vanished_host_held_counts_for_nothing() -> None:
+def test_resources_of_a_vanished_host_are_not_counted() -> None:
     held = [running("lost", on("gone", 4)), running("cart", on("a", 1))]
     assert started(decide(snapshot([host()], [job("ant", gang(node(3)))], held))) == "ant:a"
 
@@ -211,7 +211,7 @@ def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
     )
 
 
-def test_an_elastic_gang_shrinks_to_what_the_compute_environment_may_use() -> None:
+def test_an_elastic_gang_shrinks_to_the_limit_of_its_compute_environment() -> None:
     waiting = [job("ant", gang(*[node(2)] * 4, minimum=1))]
     assert (
         started(decide(snapshot([host(cpus=16)], waiting, compute_environments=[compute_environment(max_cpus=5)])))

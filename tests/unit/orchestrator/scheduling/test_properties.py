@@ -158,7 +158,7 @@ some_timeouts = st.one_of(st.none(), st.sampled_from([60, 100, 200, 300, 1000]))
     jobs("w", some_timeouts, 8),
     st.lists(st.integers(0, 200), min_size=6, max_size=6),
 )
-def test_what_passes_the_head_does_not_delay_it(
+def test_jobs_that_pass_the_head_do_not_delay_it(
     hosts: list[Host], earlier: list[Waiting], waiting: list[Waiting], ages: list[int]
 ) -> None:
     first = decide(snapshot_of(hosts, earlier, [], NOW))
