@@ -7,14 +7,16 @@ import json
 import logging
 import os
 import re
+import secrets
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
 from orchestrator.domain.errors import ServerError
+from shared_store.files import write_atomic
 
 _OURS = re.compile(
-    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
+    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
 )
 """Names in the home directory: database, keys, bus, the engines' directories, and what a volume has of itself."""
 
@@ -39,6 +41,20 @@ def local_url() -> str | None:
         return str(told["url"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def console_secret(home: Path) -> bytes:
+    """What signs the console's sessions: the home directory's own, made where there is none. A new one each time where it can't be kept."""
+    path = home / "console.secret"
+    with suppress(OSError):
+        if len(kept := path.read_bytes()) == 32:
+            return kept
+    made = secrets.token_bytes(32)
+    try:
+        write_atomic(path, made, mode=0o600)
+    except OSError as error:
+        log.warning("%s can't be written (%s): the next start ends the console's sessions", path, error.strerror)
+    return made
 
 
 def make_private(home: Path) -> None:

@@ -16,17 +16,19 @@ from typing import Any, cast
 
 import uvicorn
 
+from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
-from orchestrator.api.http.auth import Access, is_loopback
+from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import BACKLOG, Connection, Connections, Seldom, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
 from orchestrator.api.native.automatic import AutomaticEvaluations
+from orchestrator.console import add_console
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
@@ -34,7 +36,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.gangs import running_gangs
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
-from orchestrator.home import HomeLock
+from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
@@ -97,6 +99,7 @@ class Server:
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home)
             stack.callback(self._lock.release)
+            self.access.console_secret = console_secret(home)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
             nodes = _make_engines(engines, home, cpus, gpus)  # before anything is made in the home directory
@@ -118,13 +121,13 @@ class Server:
             self.peers = Peers(self.store, home)
             stack.callback(self.peers.close)
             try:
-                self.controller = Controller(
+                self.reconciler = Reconciler(
                     found, nodes, self.store, self.bus, self.peers, retention=retention, min_free=min_free
                 )
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
-            stack.callback(self.controller.close)
-            self.evaluations = AutomaticEvaluations(self.controller)
+            stack.callback(self.reconciler.close)
+            self.evaluations = AutomaticEvaluations(self.reconciler)
             stack.callback(self.evaluations.close)
             if "local" in nodes.names:
                 _name_lost_gangs(home, found)
@@ -132,10 +135,11 @@ class Server:
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
             )
-            self.deliveries = Deliveries(self.controller, told, self.url)
+            self.deliveries = Deliveries(self.reconciler, told, self.url)
             stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
-        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        self.app = create_app(self.reconciler, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
             self.app,
@@ -160,7 +164,7 @@ class Server:
         """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
         self.peers.start()
-        self.controller.start()
+        self.reconciler.start()
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()

@@ -96,6 +96,50 @@ def history_of(run: Run) -> MetricsHistory:
     return MetricsHistory(run)
 
 
+def sampled(run: Run, most: int = 60, until_epoch: int | None = None) -> list[dict[str, Any]]:
+    """At most ``most`` records of the run's history, spread evenly over its bytes, in order; the newest is the last. Raises OSError.
+
+    Reads that many lines, however long the history is, and keeps nothing. ``until_epoch``: the last epoch whose records count.
+    """
+    found: dict[int, dict[str, Any]] = {}
+    limit: float = math.inf
+    files = sorted(_files(run), reverse=True)
+    paths = [path for epoch, path in files if until_epoch is None or epoch <= until_epoch]
+    sizes = [path.stat().st_size for path in paths]
+    for path, size in zip(paths, sizes, strict=True):
+        records, resumed_from = _sampled(path, size, max(2, most * size // max(1, sum(sizes))))
+        found = {iteration: each for iteration, each in records.items() if iteration <= limit} | found
+        limit = min(limit, resumed_from)
+    order = sorted(found)
+    step = max(1.0, (len(order) - 1) / max(1, most - 1))
+    chosen = {round(i * step) for i in range(most)} if step > 1 else range(len(order))
+    return [found[order[i]] for i in sorted(chosen) if i < len(order)]
+
+
+def _sampled(path: Path, size: int, most: int) -> tuple[dict[int, dict[str, Any]], float]:
+    """Records of a file by iteration, and the iteration from which it goes on (infinite where it does not say)."""
+    found: dict[int, dict[str, Any]] = {}
+    with open_regular(path) as file:
+        first = file.readline(_LONGEST)
+        begin, tail = len(first), max(0, size - _BLOCK)
+        for place in range(most if tail else 0):  # of a short file all is read below
+            if file.seek(begin + (size - begin) * place // most) > begin:
+                file.readline(_LONGEST)  # the rest of a line
+            _keep(found, file.readline(_LONGEST))
+        if file.seek(max(begin, tail)) > begin:
+            file.readline(_LONGEST)
+        for line in file.read(2 * _BLOCK).splitlines(keepends=True)[-2 if tail else 0 :]:
+            _keep(found, line)
+    before = _record(first).get("resumed_from")
+    return found, before if isinstance(before, int) else math.inf
+
+
+def _keep(found: dict[int, dict[str, Any]], line: bytes) -> None:
+    record = _record(line) if line.endswith(b"\n") else {}
+    if isinstance(iteration := record.get("iteration"), int):
+        found[iteration] = record
+
+
 @dataclass
 class _Section:
     """Records of one file whose iterations rise."""

@@ -24,7 +24,9 @@ REPOSITORY = Path(__file__).parent.parent
 TIERS = ("long", "training", "integration", "unit", "robots", "cluster")
 """The folders of the tests, and the marker of each one's tests; in the order in which they run: what takes long first, so that no
 process is left with a long one at the end."""
-pytest_plugins = [f"tests.support.{area}.fixtures" for area in ("conformance", "engines", "orchestrator", "worker")]
+pytest_plugins = [
+    f"tests.support.{area}.fixtures" for area in ("conformance", "console", "engines", "orchestrator", "worker")
+]
 MUSTER = str(Path(sys.executable).parent / "muster")
 
 # One kernel cache for all tests: compiled once a machine, as a user's home directory would have it.

@@ -29,10 +29,11 @@ LAYERS = {
     "engines": {"domain"},
     "control": {"domain", "spec", "scheduling", "persistence", "engines"},
     "api": {"domain", "spec", "scheduling", "persistence", "engines", "control", "keys"},
+    "console": {"domain", "spec", "scheduling", "persistence", "control", "api", "keys"},
     "home": {"domain"},
     "keys": {"domain"},
     "client": {"domain", "home"},
-    "server": {"domain", "engines", "persistence", "control", "api", "home", "keys"},
+    "server": {"domain", "engines", "persistence", "control", "api", "console", "home", "keys"},
     "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server"},
 }
 """What each room of the orchestrator may import beside itself."""
@@ -100,12 +101,12 @@ def test_a_room_of_the_orchestrator_imports_only_the_layers_below_it(room: str) 
             assert parts[1] in {room, *LAYERS[room]}, (module, ".".join(parts))
 
 
-def test_pure_rooms_import_no_adapter_and_nothing_but_the_api_imports_an_http_server() -> None:
+def test_pure_rooms_import_no_adapter_and_only_api_console_and_server_import_an_http_server() -> None:
     for room in LAYERS:
         for module in modules_of(room):
             if room in PURE:
                 assert not imported(module) & ADAPTERS, module
-            elif room not in ("api", "server"):
+            elif room not in ("api", "console", "server"):
                 assert not imported(module) & HTTP_SERVER, module
 
 

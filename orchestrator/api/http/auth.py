@@ -3,6 +3,9 @@
 With a token or a key in force a request carries ``Authorization: Bearer …`` (the token, or ``ACCESS_KEY_ID:SECRET``) or an AWS
 Signature Version 4 by a key of :mod:`orchestrator.keys`. Without either the server listens on loopback only, takes requests from
 processes of its own user (:mod:`orchestrator.api.http.callers`), and ignores signatures, since AWS clients always sign with something.
+
+A browser has the session of a login to the console (:mod:`orchestrator.console.login`) in a cookie. It counts for the console's pages
+and for reading; what changes something through the API needs one of the above.
 """
 
 from __future__ import annotations
@@ -12,26 +15,25 @@ import hmac
 import ipaddress
 import logging
 import re
-import secrets
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any
 from urllib.parse import SplitResult, quote, urlsplit
 
-from starlette.requests import ClientDisconnect
-from starlette.responses import JSONResponse
+from starlette.requests import ClientDisconnect, cookie_parser
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import elsewhere
+from orchestrator.api.http.access import Access, identity_of
 from orchestrator.api.http.callers import Caller, user_name
 from orchestrator.api.http.limits import Body, RateLimit
-from orchestrator.api.permissions import BY_LOWER_NAME, THIS_PROCESS, Identity, Refusal, current_identity
+from orchestrator.api.permissions import BY_LOWER_NAME, Identity, Refusal, current_identity
 from orchestrator.domain.excerpts import LONGEST_ERROR, excerpt
-from orchestrator.keys import Key, KeyStore
 
 log = logging.getLogger("muster.api")
 
@@ -39,39 +41,9 @@ SKEW = 15 * 60
 """Seconds that a signature's time may differ from the server's."""
 _ALGORITHM = "AWS4-HMAC-SHA256"
 _LOGS_TARGET = "Logs_20140328."
-
-
-@dataclass
-class Access:
-    """What lets a request in: the keys of the home directory, one token that may do everything, or the controller's own user."""
-
-    keys: KeyStore | None = None
-    token: str | None = None
-    exposed: bool = False
-    """Whether other machines can reach the server, or keys have existed: from then on authentication is always required."""
-    user: int | None = None
-    """Uid of the processes whose requests are taken while no key is demanded; None for an application without a socket."""
-    own_token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
-    """Admits this process to its own server (`muster run`), whatever others need."""
-
-    def known(self) -> Mapping[str, Key]:
-        """The keys in force, by access key id."""
-        return self.keys.current() if self.keys else {}
-
-    def demanded(self) -> bool:
-        """Whether requests must be authenticated. Once keys have existed this stays so: deleting or damaging them opens nothing."""
-        if not self.exposed:
-            keys = self.known()
-            self.exposed = bool(self.token or keys or (self.keys and self.keys.unusable))
-        return self.exposed
-
-    def admitted(self) -> str:
-        """Who may send requests now, in one line."""
-        if not self.demanded():
-            name = "anybody" if self.user is None else f"user {user_name(self.user)} of this machine"
-            return f"open to {name}, without a key; `muster keys create NAME` lets others in, and then everybody needs a key"
-        with_token = " or MUSTER_TOKEN" if self.token else ""
-        return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
+LOGIN, LOGOUT, STATIC = "/login", "/logout", "/static/"
+"""Paths of the console that need no key: where one is given, and the files of its pages."""
+_UNKNOWN = ("MissingAuthenticationToken", "UnrecognizedClientException")
 
 
 class Guard:
@@ -117,7 +89,7 @@ class Guard:
             if scope["type"] == "http":
                 # a body that is not even HTTP is answered by uvicorn itself: it then must not see a second answer
                 await asyncio.sleep(0)
-                await error_response(str(refusal), refusal.status, kind_of(refusal))(scope, receive, send)
+                await _refused(request, refusal)(scope, receive, send)
             else:
                 await send({"type": "websocket.close", "code": 1008, "reason": "refused"})  # the server answers 403
             return
@@ -135,9 +107,12 @@ class Guard:
         if request.path == "/healthz":
             return Identity("a health check", frozenset(), read_only=True)
         identity = Identity(f"address {request.client}")
+        if request.path in (LOGIN, LOGOUT) or request.path.startswith(STATIC):
+            self._count(identity, "")
+            return Identity("a visitor", frozenset(), read_only=True)
         if demanded:
             try:
-                identity = await self._authenticate(request, body)
+                identity = self._of_session(request) or await self._authenticate(request, body)
             except ClientError:
                 if reason := self.limit.refusal_of_failures(request.client):
                     raise Refusal("TooManyRequestsException", reason, 429) from None
@@ -171,6 +146,12 @@ class Guard:
             "`muster keys create NAME` makes one",
         )
 
+    def _of_session(self, request: _Request) -> Identity | None:
+        """Who is logged in to the console, where that counts and nothing else is presented."""
+        if "authorization" in request.headers or not (request.method in ("GET", "HEAD") or request.is_of_console):
+            return None
+        return self.access.session(session_of(request.first_of_each(), request.port))
+
     def _count(self, identity: Identity, operation: str) -> None:
         if reason := self.limit.refusal(identity.name, operation):
             raise Refusal("TooManyRequestsException", reason, 429)
@@ -179,7 +160,7 @@ class Guard:
         given = request.single("authorization") or ""
         scheme, _, credentials = given.strip().partition(" ")
         if scheme.lower() == "bearer":
-            return self._bearer(credentials.strip())
+            return self.access.bearer(credentials.strip())
         if scheme == _ALGORITHM:
             claim = Claim.parse(credentials)
             key = self.access.known().get(claim.access_key_id)
@@ -191,25 +172,11 @@ class Guard:
                 )
             claim.check(request, datetime.now(UTC))
             claim.check_signature(request, key.secret, await body.read() if request.has_body else b"")
-            return _identity(key)
+            return identity_of(key)
         raise Refusal(
             "MissingAuthenticationToken",
             "a token is needed: set MUSTER_TOKEN (the server's token, or ACCESS_KEY_ID:SECRET of a key), send it as "
             "'Authorization: Bearer …', or sign with AWS Signature Version 4; `muster keys create NAME` makes a key",
-        )
-
-    def _bearer(self, given: str) -> Identity:
-        for token, identity in ((self.access.token, Identity("MUSTER_TOKEN")), (self.access.own_token, THIS_PROCESS)):
-            if token and hmac.compare_digest(given.encode(), token.encode()):
-                return identity
-        access_key_id, _, secret = given.partition(":")
-        key = self.access.known().get(access_key_id)
-        if key and hmac.compare_digest(secret.encode(), key.secret.encode()):
-            return _identity(key)
-        raise Refusal(
-            "UnrecognizedClientException",
-            "this token is not known here: set MUSTER_TOKEN to the server's token, or to ACCESS_KEY_ID:SECRET of a key that "
-            "`muster keys list` shows",
         )
 
 
@@ -226,6 +193,7 @@ class _Request:
         self.raw_path: bytes = scope["raw_path"]
         self.query: bytes = scope["query_string"]
         self.client: str = scope["client"][0] if scope.get("client") else "unknown"
+        self.port: int | None = scope["server"][1] if scope.get("server") else None
         target = self.first("x-amz-target") or ""
         if self.method == "POST" and self.path == "/" and target.startswith(_LOGS_TARGET):
             name = target.removeprefix(_LOGS_TARGET)
@@ -245,6 +213,11 @@ class _Request:
 
     def first_of_each(self) -> dict[str, str]:
         return {name: values[0].decode("latin-1") for name, values in self.headers.items()}
+
+    @property
+    def is_of_console(self) -> bool:
+        """Whether it is for the console, whose forms carry a token of their own, and not for an API."""
+        return self.path != "/" and not self.path.startswith(("/v1/", "/api/"))
 
     @property
     def foreign_service(self) -> str | None:
@@ -268,6 +241,10 @@ class _Request:
         origin = self.single("origin")
         if origin and _split(origin).netloc.lower() != host.lower():
             raise Refusal("AccessDeniedException", f"requests from other web pages are refused (Origin {origin!r})")
+        # a browser sends no Origin with what it only reads, such as an image; a link that a person follows is no such request
+        site, target = self.single("sec-fetch-site"), (self.first("sec-fetch-mode"), self.first("sec-fetch-dest"))
+        if site in ("cross-site", "same-site") and not (self.method == "GET" and target == ("navigate", "document")):
+            raise Refusal("AccessDeniedException", f"requests from other web pages are refused (Sec-Fetch-Site {site})")
 
 
 def _split(url: str) -> SplitResult:
@@ -284,10 +261,6 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def _identity(key: Key) -> Identity:
-    return Identity(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)
 
 
 @dataclass(frozen=True)
@@ -394,6 +367,25 @@ def _canonical_request(request: _Request, signed: tuple[str, ...], payload: str)
         values = b",".join(b" ".join(value.split()) for value in request.headers[name])
         lines.append(name.encode("latin-1") + b":" + values)
     return b"\n".join([*lines, b"", ";".join(signed).encode("latin-1"), payload.encode("latin-1")])
+
+
+def session_of(headers: Mapping[str, str], port: int | None) -> str:
+    """The console's session in the cookie of a request to this port; empty where there is none."""
+    return cookie_parser(headers.get("cookie", "")).get(cookie_name(port), "")
+
+
+def cookie_name(port: int | None) -> str:
+    """Browsers send a cookie to every port of a host, where other controllers may listen."""
+    return f"muster-session-{port}"
+
+
+def _refused(request: _Request, refusal: ClientError) -> Response:
+    """The refusal; a person's browser without a session is sent to the login instead."""
+    wanted = request.first("accept") or ""
+    if request.method == "GET" and "text/html" in wanted and kind_of(refusal) in _UNKNOWN:
+        there = request.raw_path.decode("latin-1") + ("?" + request.query.decode("latin-1") if request.query else "")
+        return RedirectResponse(f"{LOGIN}?next={quote(there, safe='')}", 303)
+    return error_response(str(refusal), refusal.status, kind_of(refusal))
 
 
 def kind_of(error: ClientError) -> str:

@@ -71,12 +71,12 @@ TABLE = {
     Operation.DESCRIBE_LOG_GROUPS: SHARED_READ,
     Operation.START_LIVE_TAIL: OWN_LIST,
     Operation.READ_HEALTH: SHARED_READ,
-    Operation.READ_FRONT_PAGE: SHARED_READ,
     Operation.READ_DOCUMENTATION: SHARED_READ,
     Operation.READ_MONITORING: ALL_READ,
     Operation.READ_CAPACITY: SHARED_READ,
     Operation.PLAN: OWN_WRITE,
     Operation.FIT: OWN_WRITE,
+    Operation.FIND_JOBS: OWN_LIST,
     Operation.READ_JOB: OWN_READ,
     Operation.READ_JOB_LOGS: OWN_READ,
     Operation.CHECKPOINT_JOB: OWN_WRITE,
@@ -178,12 +178,12 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         aws(of.DESCRIBE_LOG_GROUPS),
         lambda key: live_tail(world, key),
         of_ours(of.READ_HEALTH),
-        of_ours(of.READ_FRONT_PAGE),
         of_ours(of.READ_DOCUMENTATION),
         of_ours(of.READ_MONITORING),
         of_ours(of.READ_CAPACITY),
         of_ours(of.PLAN, {"definition": definition("x"), "queue": "robots"}),
         of_ours(of.FIT, {"definition": definition("x"), "queue": "robots"}),
+        of_ours(of.FIND_JOBS),
         of_ours(of.READ_JOB),
         of_ours(of.READ_JOB_LOGS),
         of_ours(of.CHECKPOINT_JOB),
@@ -386,7 +386,7 @@ def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: Wor
         assert {queue["jobQueueName"] for queue in shown} >= names and ("robots" in str(shown)) is (key == "admin")
 
 
-def test_a_run_without_a_record_belongs_to_whom_its_own_file_names(world: World) -> None:
+def test_a_run_without_a_row_belongs_to_the_owner_in_its_file(world: World) -> None:
     """As after the database was lost, or in a store that came from elsewhere."""
     described = json.loads((world.server.home / "store" / "runs" / world.run / "run.json").read_text())
     assert (described["queue"], described["owner"]) == ("robots", "key robots")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import tracemalloc
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from shared_store import metrics
 from shared_store.layout import Run
-from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics
+from shared_store.metrics import MetricsHistory, MetricsWriter, history_of, read_metrics, sampled
 
 
 def attempt(run: Run, epoch: int, resumed_from: int, last: int) -> None:
@@ -51,7 +52,7 @@ def test_a_resume_drops_records_after_its_checkpoint(tmp_path: Path) -> None:
     assert history(run) == [(1, 1), (2, 1), (3, 1), (4, 1), (5, 2), (6, 2)]
 
 
-def test_an_attempt_that_died_before_its_first_iteration_still_gives_up_the_past(tmp_path: Path) -> None:
+def test_an_attempt_that_died_before_its_first_iteration_still_supersedes_old_records(tmp_path: Path) -> None:
     run = Run(tmp_path)
     attempt(run, 1, 0, 5)
     attempt(run, 2, 3, 3)
@@ -82,7 +83,7 @@ def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(t
     assert history(run) == [(1, 1), (2, 1)]
 
 
-def test_a_number_that_is_not_finite_is_refused_instead_of_written_as_no_json(tmp_path: Path) -> None:
+def test_a_number_that_is_not_finite_is_refused_because_json_lacks_it(tmp_path: Path) -> None:
     with MetricsWriter(Run(tmp_path), 1, 0) as writer, pytest.raises(ValueError):
         writer.write({"iteration": 1, "reward": float("nan")})
     assert read_metrics(Run(tmp_path)) == []
@@ -108,7 +109,7 @@ def test_the_history_is_that_of_a_run_that_went_through_it_without_interruption(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 9), st.booleans()), min_size=1, max_size=6))
-def test_a_history_that_is_kept_says_what_a_fresh_one_does_whatever_was_added(
+def test_a_cached_history_equals_a_newly_read_one_after_any_append(
     attempts: list[tuple[int, int, bool]],
 ) -> None:
     with tempfile.TemporaryDirectory() as directory:
@@ -199,3 +200,39 @@ def test_a_page_of_a_long_history_is_read_without_the_rest(tmp_path: Path, monke
         page = [record for record in everything if record["iteration"] > after][:200]
         assert history.after(after, 200) == page
     assert len(parsed) < 10_000, "of 42,500 that five looks at everything would parse"
+
+
+def points(run: Run, *arguments: int) -> list[tuple[int, int]]:
+    return [(record["iteration"], record["epoch"]) for record in sampled(run, *arguments)]
+
+
+def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    assert sampled(run) == []
+    attempt(run, 1, 0, 0)
+    assert sampled(run) == []
+    attempt(run, 2, 0, 7)
+    assert points(run) == [(i, 2) for i in range(1, 8)]
+
+
+def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 20_000)
+    found = [iteration for iteration, _ in points(run, 40)]
+    assert len(found) == 40 and found[-1] == 20_000 and found == sorted(set(found))
+    assert max(after - before for before, after in pairwise([0, *found])) < 1500
+    with open(run.metrics / "metrics-e1.jsonl", "a") as file:
+        file.write('{"iteration": 20001, "ep')
+    assert points(run, 40)[-1] == (20_000, 1)
+
+
+def test_a_sample_has_nothing_of_an_abandoned_past_and_ends_with_the_epoch_that_is_asked_for(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    attempt(run, 1, 0, 3000)
+    attempt(run, 2, 1000, 5000)
+    found = points(run, 60)
+    assert found == sorted(set(found)) and found[-1] == (5000, 2)
+    assert all((iteration > 1000) is (epoch == 2) for iteration, epoch in found)
+    assert {epoch for _, epoch in found} == {1, 2}
+    earlier = points(run, 60, 1)
+    assert earlier[-1] == (3000, 1) and {epoch for _, epoch in earlier} == {1}

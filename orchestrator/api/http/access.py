@@ -1,0 +1,117 @@
+"""Who is let in: by a token, by a key, by a session of the console, or as the controller's own user."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from hashlib import sha256
+
+from orchestrator.api.http.callers import user_name
+from orchestrator.api.permissions import THIS_PROCESS, Identity, Refusal
+from orchestrator.keys import Key, KeyStore
+
+SESSION = 12 * 3600
+"""Seconds for which a login to the console lasts."""
+_TOKEN = "token"
+"""In a session, in place of an access key id: it was opened with MUSTER_TOKEN."""
+
+
+@dataclass
+class Access:
+    """What lets a request in: the keys of the home directory, one token that may do everything, or the controller's own user."""
+
+    keys: KeyStore | None = None
+    token: str | None = None
+    exposed: bool = False
+    """Whether other machines can reach the server, or keys have existed: from then on authentication is always required."""
+    user: int | None = None
+    """Uid of the processes whose requests are taken while no key is demanded; None for an application without a socket."""
+    own_token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
+    """Admits this process to its own server (`muster run`), whatever others need."""
+    console_secret: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
+    """Signs the console's sessions and forms; the same after a restart, so that open pages go on."""
+    _ended: dict[str, float] = field(default_factory=dict, repr=False)
+    """Sessions that were closed by their users, and when they would have expired."""
+
+    def known(self) -> Mapping[str, Key]:
+        """The keys in force, by access key id."""
+        return self.keys.current() if self.keys else {}
+
+    def demanded(self) -> bool:
+        """Whether requests must be authenticated. Once keys have existed this stays so: deleting or damaging them opens nothing."""
+        if not self.exposed:
+            keys = self.known()
+            self.exposed = bool(self.token or keys or (self.keys and self.keys.unusable))
+        return self.exposed
+
+    def admitted(self) -> str:
+        """Who may send requests now, in one line."""
+        if not self.demanded():
+            name = "anybody" if self.user is None else f"user {user_name(self.user)} of this machine"
+            return f"open to {name}, without a key; `muster keys create NAME` lets others in, and then everybody needs a key"
+        with_token = " or MUSTER_TOKEN" if self.token else ""
+        return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
+
+    def bearer(self, given: str) -> Identity:
+        """Who presents this token, or ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
+        if self.own_token and hmac.compare_digest(given.encode(), self.own_token.encode()):
+            return THIS_PROCESS
+        return self._proven(given)[1]
+
+    def sign_in(self, given: str) -> str:
+        """A session for whoever presents the server's token or a key; what identifies it says nothing of the secret. Raises Refusal."""
+        name, _ = self._proven(given)
+        claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
+        return f"{claim}.{self._seal(name, claim)}"
+
+    def session(self, given: str) -> Identity | None:
+        """Whose session this is; None where it has expired, was closed, or its key is gone."""
+        claim, _, seal = given.rpartition(".")
+        name, _, rest = claim.partition(".")
+        expected = self._seal(name, claim)
+        if expected is None or not hmac.compare_digest(seal.encode(), expected.encode()) or given in self._ended:
+            return None
+        if int(rest.partition(".")[0]) < time.time():
+            return None
+        return Identity("MUSTER_TOKEN") if name == _TOKEN else identity_of(self.known()[name])
+
+    def sign_out(self, given: str) -> None:
+        """Close a session; a restart of the server forgets that, and the session's own end does not."""
+        now = time.time()
+        self._ended = {each: end for each, end in self._ended.items() if end > now}
+        if self.session(given) is not None:
+            self._ended[given] = now + SESSION
+
+    def form_token(self, session: str) -> str:
+        """What a form of the console must send back: other web pages can't know it. ``session``: empty where none is needed."""
+        return hmac.new(self.console_secret, f"form\0{session}".encode(), sha256).hexdigest()
+
+    def _seal(self, name: str, claim: str) -> str | None:
+        """The signature of a session, which depends on its key's secret; None without such a key."""
+        key = self.known().get(name)
+        secret = self.token if name == _TOKEN else key.secret if key else None
+        if not secret:
+            return None
+        return hmac.new(self.console_secret, f"session\0{secret}\0{claim}".encode(), sha256).hexdigest()
+
+    def _proven(self, given: str) -> tuple[str, Identity]:
+        """The credential's name in sessions, and who has it. Raises Refusal."""
+        if self.token and hmac.compare_digest(given.encode(), self.token.encode()):
+            return _TOKEN, Identity("MUSTER_TOKEN")
+        access_key_id, _, secret = given.partition(":")
+        key = self.known().get(access_key_id)
+        if key and hmac.compare_digest(secret.encode(), key.secret.encode()):
+            return access_key_id, identity_of(key)
+        raise Refusal(
+            "UnrecognizedClientException",
+            "this token is not known here: set MUSTER_TOKEN to the server's token, or to ACCESS_KEY_ID:SECRET of a key that "
+            "`muster keys list` shows",
+        )
+
+
+def identity_of(key: Key) -> Identity:
+    """Who uses a key."""
+    return Identity(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)

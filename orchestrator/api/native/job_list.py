@@ -1,0 +1,188 @@
+"""The jobs of all queues that the caller may see: found by state, queue and text, with the progress of each training."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import APIRouter, Query, Request
+from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy.orm import Session, selectinload
+
+from orchestrator.api import permissions
+from orchestrator.api.context import reconciler_of
+from orchestrator.api.damaged import DAMAGED, DamagedRow, reading
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.job import Status
+from orchestrator.persistence.models import Job, RunRecord
+from orchestrator.persistence.ownership import owner_of
+from orchestrator.spec.model import KINDS
+from shared_store.files import DamagedFile
+from shared_store.layout import Run
+from shared_store.metrics import sampled
+
+router = APIRouter()
+
+JOBS_A_PAGE = 100
+REWARDS = 40
+"""Rewards of a job that tell its curve."""
+_FRESH = 1.0
+"""Seconds for which the curve of a job that is not over is not read again."""
+_MOST_CURVES = 4096
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which jobs: those of some states and of a queue whose name, id, run or owner has a text. Empty fields mean all."""
+
+    statuses: tuple[Status, ...] = ()
+    queue: str = ""
+    search: str = ""
+
+    def conditions(self) -> list[ColumnElement[bool]]:
+        """Of the rows, but for the states; jobs that the caller may not see are left out."""
+        found: list[ColumnElement[bool]] = [Job.parent.is_(None)]
+        if (queues := permissions.visible_queues()) is not None:
+            found.append(Job.queue.in_(queues))
+        if self.queue:
+            found.append(Job.queue == self.queue)
+        if text := self.search.strip():
+            places = (Job.name, Job.run, Job.owner)
+            within = [each.icontains(text, autoescape=True) for each in places]
+            found.append(or_(*within, Job.id.istartswith(text, autoescape=True)))
+        return found
+
+    @property
+    def in_states(self) -> list[ColumnElement[bool]]:
+        return [Job.status.in_(self.statuses)] if self.statuses else []
+
+
+@router.get("/jobs")
+def find_jobs(
+    request: Request,
+    status: list[Status] = Query(default=[], description="states; all where absent"),
+    queue: str = Query(default="", max_length=128),
+    search: str = Query(default="", max_length=200, description="part of a name, run or owner, or the start of an id"),
+    offset: int = Query(default=0, ge=0, lt=2**31),
+    most: int = Query(default=JOBS_A_PAGE, ge=1, le=JOBS_A_PAGE, alias="max"),
+) -> dict[str, Any]:
+    """The jobs that the caller may see, the newest first, with the progress of trainings; ``total`` of them, and how many in each state."""
+    wanted = Wanted(tuple(status), queue, search)
+    return page_of_jobs(reconciler_of(request), wanted, offset, most)
+
+
+def page_of_jobs(reconciler: Reconciler, wanted: Wanted, offset: int = 0, most: int = JOBS_A_PAGE) -> dict[str, Any]:
+    """``jobs``, ``total`` and ``counts`` (by state, of all states) of what is wanted."""
+    conditions = wanted.conditions()
+    with reconciler.database.session() as session:
+        grouped = select(Job.status, func.count()).where(*conditions).group_by(Job.status)
+        counts = {str(status): int(count) for status, count in session.execute(grouped)}
+        query = select(Job).where(*conditions, *wanted.in_states).order_by(Job.created_at.desc(), Job.id.desc())
+        query = query.options(selectinload(Job.attempts)).offset(offset).limit(most)
+        jobs = session.scalars(query).all()
+        hidden = _runs_of_others(session, reconciler, jobs)
+        found = [_row(reconciler, job, job.run not in hidden) for job in jobs]
+    states = wanted.statuses or tuple(Status)
+    return {"jobs": found, "total": sum(counts.get(each, 0) for each in states), "counts": counts}
+
+
+def ids_of(session: Session, wanted: Wanted) -> list[str]:
+    """The ids of all jobs that are wanted and not over."""
+    active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
+    query = select(Job.id).where(*wanted.conditions(), Job.status.in_(active)).order_by(Job.created_at, Job.id)
+    return list(session.scalars(query))
+
+
+def kind_of(spec: Mapping[str, Any] | None) -> str:
+    """What a job does, by its spec: one of :data:`orchestrator.spec.model.KINDS`."""
+    return next((kind for kind in KINDS if (spec or {}).get(kind)), "command")
+
+
+def _runs_of_others(session: Session, reconciler: Reconciler, jobs: Sequence[Job]) -> set[str]:
+    """Runs of these jobs that belong to queues that the caller may not see: a job may continue a run of another queue."""
+    if permissions.visible_queues() is None:
+        return set()
+    names = {job.run for job in jobs}
+    _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()  # one query instead of many
+    owners = {name: owner_of(session, reconciler.store.run(name)) for name in names}
+    return {name for name, owner in owners.items() if owner is None or not permissions.is_visible(owner)}
+
+
+def _row(reconciler: Reconciler, job: Job, is_visible: bool) -> dict[str, Any]:
+    row = {
+        "id": job.id,
+        "name": job.name,
+        "status": job.status,
+        "statusReason": reconciler.reason(job) or job.status_reason,
+        "queue": job.queue,
+        "owner": job.owner,
+        "run": job.run,
+        "createdAt": job.created_at,
+        "startedAt": job.started_at,
+        "stoppedAt": job.stopped_at,
+        "attempt": len(job.attempts),
+        "attemptsAllowed": job.attempts_allowed,
+        "arraySize": job.array_size,
+    }
+    try:
+        with reading(job):
+            gang = job.gang
+            spec = gang.spec or {}
+    except DamagedRow:
+        return {**row, "kind": "command", "nodes": 0, "statusReason": DAMAGED, "progress": None}
+    training = spec.get("train")
+    iterations = training.get("iterations") if isinstance(training, Mapping) else None
+    told = _told(reconciler, job, gang.main) if is_visible and iterations else None
+    progress = {**told, "iterations": iterations} if told else None
+    return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes), "progress": progress}
+
+
+def _told(reconciler: Reconciler, job: Job, main: int) -> dict[str, Any] | None:
+    """How far a training is: what its main node said last, and its curve; None before its first iteration."""
+    if not job.attempts:
+        return None
+    curve = curves.of(reconciler.store.run(job.run), job)
+    live = reconciler.bus.progress(job.id, job.attempts[-1].number, main) or {}
+    last = curve[-1] if curve else {}
+    iteration = max(live.get("iteration") or 0, last.get("iteration") or 0)
+    if not iteration:
+        return None
+    rate = live.get("steps_per_second") or last.get("steps_per_second")
+    rewards = [each["reward"] for each in curve if isinstance(each.get("reward"), int | float)]
+    return {"iteration": iteration, "stepsPerSecond": rate, "reward": last.get("reward"), "rewards": rewards}
+
+
+class Curves:
+    """A few records of each run's metrics, read once for a job that is over, and once a second for others. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: OrderedDict[tuple[str, int | None], tuple[float, list[dict[str, Any]]]] = OrderedDict()
+
+    def of(self, run: Run, job: Job) -> list[dict[str, Any]]:
+        """Iteration, reward and rate of about 40 records, in order; none where they can't be read."""
+        key, now = (str(run.path), job.stopped_at), time.monotonic()
+        with self._lock:
+            known = self._known.get(key)
+            if known is not None and (job.is_terminal or now - known[0] < _FRESH):
+                self._known.move_to_end(key)
+                return known[1]
+        try:
+            records = sampled(run, REWARDS, job.attempts[-1].epoch if job.attempts else None)
+        except (DamagedFile, OSError):
+            records = []
+        names = ("iteration", "reward", "steps_per_second")
+        curve = [{name: each.get(name) for name in names} for each in records]
+        with self._lock:
+            self._known[key] = now, curve
+            while len(self._known) > _MOST_CURVES:
+                self._known.popitem(last=False)
+        return curve
+
+
+curves = Curves()
+"""Shared by all requests of this process."""

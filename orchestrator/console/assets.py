@@ -1,0 +1,47 @@
+"""The console's own scripts and styles, served under an address that changes with their content, and so cached for ever."""
+
+from __future__ import annotations
+
+import mimetypes
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+from fastapi import APIRouter, Response
+
+from orchestrator.api.errors import ClientError
+
+router = APIRouter(include_in_schema=False)
+_FOLDER = Path(__file__).parent / "static"
+mimetypes.add_type("text/javascript", ".js")
+
+
+@cache
+def _files() -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(_FOLDER.iterdir()) if path.is_file()}
+
+
+@cache
+def version() -> str:
+    """Of all files together: a module imports its neighbours by their plain names, and gets those of its own version."""
+    whole = sha256()
+    for name, content in _files().items():
+        whole.update(f"{name}\0{len(content)}\0".encode() + content)
+    return whole.hexdigest()[:16]
+
+
+def url(name: str) -> str:
+    """The address of a file in ``static/``. Raises KeyError for one that is not there."""
+    _ = _files()[name]
+    return f"/static/{version()}/{name}"
+
+
+@router.get("/static/{of}/{name}")
+def file(of: str, name: str) -> Response:
+    """A file; of another version than this server's, which an old page may ask for, the present one, which is not kept."""
+    content = _files().get(name)
+    if content is None:
+        raise ClientError(f"there is no file {name[:100]!r}", 404)
+    age = "public, max-age=31536000, immutable" if of == version() else "no-store"
+    headers = {"Cache-Control": age, "Cross-Origin-Resource-Policy": "same-origin"}
+    return Response(content, media_type=mimetypes.guess_type(name)[0] or "application/octet-stream", headers=headers)

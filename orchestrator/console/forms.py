@@ -1,0 +1,95 @@
+"""Forms: their token, questions before something is lost, and what follows a change.
+
+A form works without scripts (a page asks, a page answers); with ``static/forms.js`` the same addresses answer in JSON, and the question
+is a dialog on the page.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from urllib.parse import parse_qs
+
+from fastapi import Request, Response
+from fastapi.responses import JSONResponse, RedirectResponse
+
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Refusal
+from orchestrator.console.pages import form_token, render, wants_page
+
+TOKEN = "form_token"
+"""The field of a form that other web pages can't know."""
+_MOST_FIELDS = 5000
+_OPEN = "/login"
+"""Whoever sends this form has no session yet; browsers say where it comes from."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a person is asked before something is lost."""
+
+    title: str
+    text: str
+    label: str
+    """Of the button that goes on."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """The fields of a form, by name."""
+
+    fields: Mapping[str, list[str]]
+
+    def one(self, name: str, default: str = "") -> str:
+        """The last value of this name."""
+        return self.fields.get(name, [default])[-1]
+
+    def every(self, name: str) -> list[str]:
+        """All values of this name."""
+        return list(self.fields.get(name, []))
+
+    def confirm(self, question: Question) -> None:
+        """Go on only where the person has been asked and said yes."""
+        if self.one("confirmed") != "yes":
+            raise Unconfirmed(question, self)
+
+
+class Unconfirmed(Exception):
+    """The person must be asked first."""
+
+    def __init__(self, question: Question, form: Form) -> None:
+        super().__init__(question.title)
+        self.question, self.form = question, form
+
+    def answer(self, request: Request) -> Response:
+        """The question, as a page or for the dialog."""
+        if not wants_page(request):
+            return JSONResponse({"question": asdict(self.question)}, 409)
+        fields = [(name, value) for name, values in self.form.fields.items() for value in values if name != TOKEN]
+        return render(request, "confirm.html", 409, question=self.question, fields=fields, action=request.url.path)
+
+
+async def sent_form(request: Request) -> Form:
+    """The fields of an ``application/x-www-form-urlencoded`` body. Raises ClientError."""
+    try:
+        text = (await request.body()).decode()
+        return Form(parse_qs(text, keep_blank_values=True, max_num_fields=_MOST_FIELDS, errors="strict"))
+    except ValueError:
+        raise ClientError(f"the form can't be read: it has more than {_MOST_FIELDS} fields, or is not UTF-8") from None
+
+
+async def check_form(request: Request) -> None:
+    """Refuse a change that does not come from a form of this console. Raises Refusal."""
+    if request.method in ("GET", "HEAD") or request.url.path == _OPEN:
+        return
+    given = request.headers.get("x-form-token") or (await sent_form(request)).one(TOKEN)
+    if not hmac.compare_digest(given.encode(), form_token(request).encode()):
+        raise Refusal("AccessDeniedException", "this form is of another session; load the page again and repeat")
+
+
+def done(request: Request, path: str, message: str = "") -> Response:
+    """What follows a change: the page at ``path``, and a message there."""
+    if not wants_page(request):
+        return JSONResponse({"location": path, "message": message})
+    return RedirectResponse(path, 303)

@@ -1,0 +1,180 @@
+"""The page of all jobs: a live table of one window of them, and stopping several at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+from urllib.parse import urlencode
+
+from fastapi import Depends, Query, Request, Response
+
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.context import queue_names, reconciler_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
+from orchestrator.api.permissions import current_identity
+from orchestrator.console import words
+from orchestrator.console.forms import Form, Question, done, sent_form
+from orchestrator.console.live import Event, Recent, Rows, stream
+from orchestrator.console.pages import render
+from orchestrator.console.routing import page_router
+from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.job import Status
+from orchestrator.persistence.queries import short_id
+from shared_store.wording import counted
+
+router = page_router()
+
+ROWS = 50
+"""Jobs of a page."""
+_AT_ONCE = 50
+"""Jobs that TerminateJobs takes."""
+GROUPS: Mapping[str, tuple[Status, ...]] = {
+    "": (),
+    "waiting": (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE),
+    "running": (Status.STARTING, Status.RUNNING),
+    "succeeded": (Status.SUCCEEDED,),
+    "failed": (Status.FAILED,),
+}
+"""States as the page's filter has them."""
+_recent = Recent()
+
+
+@router.get("/")
+def jobs(
+    request: Request,
+    state: str = Query(default="", max_length=20),
+    queue: str = Query(default="", max_length=128),
+    search: str = Query(default="", max_length=200),
+    page: int = Query(default=1, ge=1, le=10**6),
+) -> Response:
+    """The table."""
+    reconciler = reconciler_of(request)
+    wanted = _wanted(state, queue, search)
+    rows, totals = _window(reconciler, wanted, page)
+    with reconciler.database.session() as session:
+        queues = queue_names(session)
+    chosen = {"state": state, "queue": queue, "search": search}
+    return render(
+        request,
+        "jobs.html",
+        rows=list(rows.values()),
+        blank=_row({}),
+        totals=totals,
+        groups=[(name, name or "all", _address(**{**chosen, "state": name})) for name in GROUPS],
+        queues=queues,
+        chosen=chosen,
+        live=f"/jobs/stream?{urlencode({**chosen, 'page': page})}",
+        earlier=_address(**chosen, page=str(page - 1)) if page > 1 else "",
+        later=_address(**chosen, page=str(page + 1)),
+    )
+
+
+@router.get("/jobs/stream")
+def jobs_stream(
+    request: Request,
+    state: str = Query(default="", max_length=20),
+    queue: str = Query(default="", max_length=128),
+    search: str = Query(default="", max_length=200),
+    page: int = Query(default=1, ge=1, le=10**6),
+) -> Response:
+    """What changes in a window of the table."""
+    wanted, table = _wanted(state, queue, search), Rows()
+    look = partial(_window, reconciler_of(request), wanted, page)
+
+    def changes() -> Sequence[Event]:
+        return table.changes(*look())
+
+    return stream(request, changes)
+
+
+@router.post("/jobs/stop")
+def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """Stop the jobs that were chosen, or all that the filter finds."""
+    reconciler = reconciler_of(request)
+    if form.one("all") == "yes":
+        wanted = _wanted(form.one("state"), form.one("queue"), form.one("search"))
+        with reconciler.database.session() as session:
+            ids = ids_of(session, wanted)
+    else:
+        ids = form.every("job")
+    if not ids:
+        raise ClientError("no job that could be stopped is chosen; mark some in the table first")
+    several = counted(len(ids), "job")
+    text = "Trainings save a checkpoint before they leave, and can be resumed. What waits is cancelled."
+    form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
+    errors = []
+    reason = f"stopped in the console by {current_identity.get().name}"
+    for start in range(0, len(ids), _AT_ONCE):
+        answer = batch.call(reconciler, "TerminateJobs", {"jobs": ids[start : start + _AT_ONCE], "reason": reason})
+        errors += answer["errors"]
+    if errors:
+        raise ClientError(f"{len(errors)} of {several} can't be stopped: {errors[0]['message']}", 403)
+    return done(
+        request, _address(*(form.one(each) for each in ("state", "queue", "search"))), f"{several} asked to stop"
+    )
+
+
+def _wanted(state: str, queue: str, search: str) -> Wanted:
+    if state not in GROUPS:
+        raise ClientError(f"state {state!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
+    return Wanted(GROUPS[state], queue, search)
+
+
+def _window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Rows of a page of the table, by id, and the totals; shared by all who look at the same."""
+    key = (id(reconciler), current_identity.get(), wanted, page)
+    return _recent.get(key, partial(_read_window, reconciler, wanted, page))
+
+
+def _read_window(reconciler: Reconciler, wanted: Wanted, page: int) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    start = (page - 1) * ROWS
+    found = page_of_jobs(reconciler, wanted, start, ROWS)
+    rows = {job["id"]: _row(job) for job in found["jobs"]}
+    total, counts = found["total"], found["counts"]
+    totals = {
+        name or "all": str(sum(counts.get(each, 0) for each in states or Status)) for name, states in GROUPS.items()
+    }
+    shown = f"{start + 1}–{start + len(rows)} of {total}" if rows else "none"
+    return rows, {**totals, "shown": shown, "more": "yes" if start + len(rows) < total else ""}
+
+
+def _row(job: Mapping[str, Any]) -> dict[str, Any]:
+    """The texts of a job's row; all empty for the row that scripts copy."""
+    status, progress = job.get("status", ""), job.get("progress") or {}
+    is_over = status in (Status.SUCCEEDED, Status.FAILED)
+    done_of = progress.get("iteration"), progress.get("iterations")
+    attempt = job.get("attempt", 0)
+    size = job.get("arraySize")
+    return {
+        "id": job.get("id", ""),
+        "short": short_id(job.get("id", "")),
+        "link": f"/jobs/{job['id']}" if job else "/",
+        "name": job.get("name", ""),
+        "kind": job.get("kind", ""),
+        "status": status,
+        "reason": (job.get("statusReason") or "") if status != Status.SUCCEEDED else "",
+        "queue": job.get("queue", ""),
+        "owner": job.get("owner") or "",
+        "nodes": f"1 × {size}" if size else str(job.get("nodes", "")),
+        "attempt": f"attempt {attempt} of {job['attemptsAllowed']}" if attempt > 1 else "",
+        "done": done_of[0] or 0,
+        "iterations": done_of[1] or 1,
+        "progress": f"{done_of[0]} of {done_of[1]}" if progress else "",
+        "rate": words.count(progress.get("stepsPerSecond")) if not is_over else "",
+        "reward": words.count(progress.get("reward")),
+        "spark": words.spark(progress.get("rewards") or ()),
+        "created": words.moment(job.get("createdAt")),
+        "took": words.duration((job["stoppedAt"] - job["startedAt"]) / 1000)
+        if is_over and job.get("startedAt")
+        else "",
+        "since": words.moment(job.get("startedAt")) if job and not is_over else "",
+        "open": "" if is_over else "yes",
+    }
+
+
+def _address(state: str = "", queue: str = "", search: str = "", page: str = "") -> str:
+    given = {"state": state, "queue": queue, "search": search, "page": page if page != "1" else ""}
+    query = urlencode({name: value for name, value in given.items() if value})
+    return f"/?{query}" if query else "/"

@@ -1,0 +1,136 @@
+"""Live parts of pages: events from the server (server-sent events), which go on where a browser lost them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from fastapi import Request
+from fastapi.responses import StreamingResponse
+from fastapi.sse import format_sse_event
+from starlette.concurrency import run_in_threadpool
+
+from orchestrator.api.errors import ClientError
+from orchestrator.persistence.session import DatabaseError
+from shared_store.files import DamagedFile
+
+INTERVAL = 0.5
+"""Seconds between two looks."""
+_HEARTBEAT = 10.0
+"""Seconds after which an idle stream says something, which is how a browser that left is noticed."""
+_LONGEST = 300.0
+"""Seconds after which a stream ends; the browser comes back at once, and is admitted again, or not."""
+_MOST_KEPT = 64
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event: its name, its data (JSON), and the id with which a browser that comes back says what it has."""
+
+    name: str
+    data: Any
+    id: str | None = None
+
+
+Look = Callable[[], Sequence[Event] | None]
+"""What is new since the last call; None at the end of the stream. Runs in a thread, where the database may be used."""
+
+
+def last_id(request: Request) -> str:
+    """The id of the last event that the browser has: its own header, or ``last`` in the query of one that paused; else empty."""
+    return request.headers.get("last-event-id") or request.query_params.get("last", "")
+
+
+def stream(request: Request, look: Look, interval: float = INTERVAL) -> StreamingResponse:
+    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends."""
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
+    events = _events(look, interval, request.app.state.closing)
+    return StreamingResponse(events, media_type="text/event-stream", headers=headers)
+
+
+async def _events(look: Look, interval: float, closing: threading.Event) -> AsyncIterator[bytes]:
+    begun = spoken = time.monotonic()
+    yield format_sse_event(retry=1000, comment="Muster")
+    while not closing.is_set() and time.monotonic() - begun < _LONGEST:
+        try:
+            found = await run_in_threadpool(look)
+        except (ClientError, DatabaseError, DamagedFile, OSError) as error:
+            yield _written(Event("trouble", str(error)))
+            await asyncio.sleep(5 * interval)
+            continue
+        if found is None:
+            yield _written(Event("end", None))
+            return
+        if found:
+            yield b"".join(map(_written, found))
+            spoken = time.monotonic()
+        elif time.monotonic() - spoken > _HEARTBEAT:
+            yield format_sse_event(comment="still here")
+            spoken = time.monotonic()
+        await asyncio.sleep(interval)
+
+
+def _written(event: Event) -> bytes:
+    # ASCII: a line separator of Unicode would be one of the protocol's for some readers
+    return format_sse_event(data_str=json.dumps(event.data, separators=(",", ":")), event=event.name, id=event.id)
+
+
+class Rows:
+    """The rows of a live table: what has changed of them since the last look, by key and field."""
+
+    def __init__(self) -> None:
+        self._order: list[str] | None = None
+        self._shown: dict[str, Mapping[str, Any]] = {}
+        self._totals: Mapping[str, Any] = {}
+
+    def changes(self, rows: Mapping[str, Mapping[str, Any]], totals: Mapping[str, Any]) -> list[Event]:
+        """The event ``rows``: the order of the keys, where it changed, and the changed fields of each row; ``totals`` of the whole page.
+
+        Args:
+            rows: Key of each row, in their order, and its fields as texts.
+            totals: Fields that belong to no row.
+        """
+        order = list(rows)
+        data: dict[str, Any] = {}
+        if order != self._order:
+            data["order"] = order
+        changed = {key: _difference(self._shown.get(key), row) for key, row in rows.items()}
+        if found := {key: fields for key, fields in changed.items() if fields}:
+            data["rows"] = found
+        if totals != self._totals:
+            data["totals"] = totals
+        self._order, self._shown, self._totals = order, dict(rows), totals
+        return [Event("rows", data)] if data else []
+
+
+def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> Mapping[str, Any]:
+    return after if before is None else {name: value for name, value in after.items() if before.get(name) != value}
+
+
+class Recent:
+    """Values that many open pages want at once: each is computed at most once in ``seconds``. Any thread may call."""
+
+    def __init__(self, seconds: float = INTERVAL * 0.9) -> None:
+        self._seconds, self._lock = seconds, threading.Lock()
+        self._kept: OrderedDict[Hashable, tuple[threading.Lock, list[tuple[float, Any]]]] = OrderedDict()
+
+    def get(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
+        """The value of ``key``; where it is older, of ``compute``, which one caller runs while others wait."""
+        with self._lock:
+            lock, kept = self._kept.setdefault(key, (threading.Lock(), []))
+            self._kept.move_to_end(key)
+            while len(self._kept) > _MOST_KEPT:
+                self._kept.popitem(last=False)
+        with lock:
+            now = time.monotonic()
+            if not kept or now - kept[0][0] > self._seconds:
+                kept[:] = [(now, compute())]
+            value: _Value = kept[0][1]
+            return value

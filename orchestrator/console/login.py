@@ -1,0 +1,66 @@
+"""Login with a key of the API, and logout."""
+
+from __future__ import annotations
+
+import re
+
+from fastapi import Depends, Request, Response
+from fastapi.responses import RedirectResponse
+
+from orchestrator.api.http.access import SESSION, Access
+from orchestrator.api.http.auth import LOGIN, LOGOUT, cookie_name
+from orchestrator.api.http.limits import RateLimit
+from orchestrator.api.permissions import Refusal
+from orchestrator.console.forms import Form, sent_form
+from orchestrator.console.pages import render, session
+from orchestrator.console.routing import page_router
+
+router = page_router()
+
+
+@router.get(LOGIN)
+def ask(request: Request, next: str = "/") -> Response:
+    """Where a key is given; whoever needs none, or is logged in, is sent on."""
+    access: Access = request.app.state.access
+    if not access.demanded() or session(request):
+        return RedirectResponse(_own(next), 303)
+    return render(request, "login.html", next=_own(next), problem="")
+
+
+@router.post(LOGIN)
+def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
+    """A session for a key; the key itself stays in no cookie and in no page."""
+    access: Access = request.app.state.access
+    limit: RateLimit = request.app.state.limit
+    there = _own(form.one("next", "/"))
+    try:
+        token = access.sign_in(form.one("key").strip())
+    except Refusal:
+        wait = limit.refusal_of_failures(request.client.host if request.client else "unknown")
+        problem = (
+            wait or "this key is not known here; `muster keys list` shows the keys, `muster keys create NAME` makes one"
+        )
+        return render(request, "login.html", 429 if wait else 403, next=there, problem=problem)
+    answer = RedirectResponse(there, 303)
+    secure = request.url.scheme == "https"
+    name = cookie_name(request.scope["server"][1])
+    answer.set_cookie(name, token, max_age=SESSION, httponly=True, samesite="strict", secure=secure, path="/")
+    return answer
+
+
+@router.post(LOGOUT)
+def log_out(request: Request) -> Response:
+    """Close the session."""
+    access: Access = request.app.state.access
+    access.sign_out(session(request))
+    answer = RedirectResponse(LOGIN, 303)
+    answer.delete_cookie(cookie_name(request.scope["server"][1]), httponly=True, samesite="strict", path="/")
+    return answer
+
+
+def _own(address: str) -> str:
+    """The address where it is a path of this server, else ``/``: a login must not lead elsewhere."""
+    is_own = (
+        re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address) is not None
+    )  # no other host, no backslash, no control character
+    return address if is_own and not address.startswith(LOGIN) else "/"

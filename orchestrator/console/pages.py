@@ -1,0 +1,122 @@
+"""Pages: templates, headers, what all pages show, and errors that a person can read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from orchestrator.api.http.access import Access
+from orchestrator.api.http.auth import error_response, session_of
+from orchestrator.api.permissions import current_identity
+from orchestrator.console import assets, words
+from shared_store import __version__
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types 'none'"
+)
+"""Content-Security-Policy of every page: its own files and nothing else, nothing inline, and no text that becomes markup by a script."""
+_HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=(), usb=()",
+}
+THEME = "muster-theme"
+"""Cookie with ``light`` or ``dark``, where a person chose one."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of the navigation; shown once its page exists."""
+
+    label: str
+    path: str
+
+
+NAVIGATION = (
+    Entry("Jobs", "/"),
+    Entry("Runs", "/runs"),
+    Entry("Models", "/models"),
+    Entry("League", "/leagues"),
+    Entry("Tracks", "/tracks"),
+    Entry("Queues & compute", "/queues"),
+    Entry("Keys", "/keys"),
+    Entry("Submit", "/submit"),
+)
+
+templates = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=select_autoescape(default=True, default_for_string=True),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    auto_reload=False,
+)
+templates.globals |= {"asset": assets.url, "version": __version__, "bound": words.bound}
+templates.filters |= {
+    "ago": words.ago,
+    "count": words.count,
+    "moment": words.moment,
+    "since": words.since,
+    "duration": words.duration,
+}
+
+
+def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
+    """A page of ``templates/``, with what all pages show: who is looking, the navigation, the theme, the form's token."""
+    theme = request.cookies.get(THEME)
+    shared: dict[str, Any] = {
+        "identity": current_identity.get(),
+        "may_change": may_change(),
+        "navigation": _navigation(request),
+        "here": request.url.path,
+        "theme": theme if theme in ("light", "dark") else "",
+        "form_token": form_token(request),
+        "has_session": bool(session(request)),
+    }
+    text = templates.get_template(template).render(shared | values)
+    return HTMLResponse(text, status, dict(_HEADERS))
+
+
+def may_change() -> bool:
+    """Whether the caller may change anything at all: a read-only key sees no buttons that would be refused."""
+    return not current_identity.get().read_only
+
+
+def form_token(request: Request) -> str:
+    """What forms send back; see :mod:`orchestrator.console.forms`."""
+    access: Access = request.app.state.access
+    return access.form_token(session(request))
+
+
+def session(request: Request) -> str:
+    """The session that the request came with, where it is one."""
+    access: Access = request.app.state.access
+    given = session_of(request.headers, request.scope["server"][1])
+    return given if access.session(given) is not None else ""
+
+
+def _navigation(request: Request) -> list[Entry]:
+    there: set[str] = request.app.state.console_paths
+    return [entry for entry in NAVIGATION if entry.path in there]
+
+
+def wants_page(request: Request) -> bool:
+    """Whether a person's browser asks, and not one of the console's scripts."""
+    return "text/html" in request.headers.get("accept", "")
+
+
+def failure(request: Request, message: str, status: int, kind: str = "ClientException") -> Response:
+    """An error, as a page or for a script."""
+    if not wants_page(request):
+        return error_response(message, status, kind)
+    title = HTTPStatus(status).phrase if status in set(HTTPStatus) else "Error"
+    return render(request, "error.html", status, title=title, message=message)

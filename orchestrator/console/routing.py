@@ -1,0 +1,70 @@
+"""Routers of pages: their errors are pages too, and no change passes without the form's token."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
+from starlette.routing import Match
+
+from orchestrator.api.errors import ClientError
+from orchestrator.api.http.auth import kind_of
+from orchestrator.console.forms import Unconfirmed, check_form
+from orchestrator.console.pages import NAVIGATION, failure, wants_page
+from orchestrator.persistence.session import DatabaseError
+from shared_store.files import DamagedFile
+
+
+class PageRoute(APIRoute):
+    """A route whose errors are pages."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def answer(request: Request) -> Response:
+            try:
+                return await handler(request)
+            except Unconfirmed as asked:
+                return asked.answer(request)
+            except ClientError as error:
+                return failure(request, str(error), error.status, kind_of(error))
+            except RequestValidationError as error:
+                first = error.errors()[0]
+                return failure(request, f"{'.'.join(map(str, first['loc']))}: {first['msg']}", 400)
+            except DatabaseError as error:
+                return failure(request, str(error), 503, "ServerException")
+            except DamagedFile as error:
+                return failure(request, f"the store holds a damaged file: {error}", 409)
+
+        return answer
+
+
+def page_router() -> APIRouter:
+    """A router for pages of the console."""
+    return APIRouter(route_class=PageRoute, include_in_schema=False, dependencies=[Depends(check_form)])
+
+
+def finish(app: FastAPI) -> None:
+    """After the last page: the navigation learns which pages there are, and an address that leads nowhere is a page for browsers."""
+    app.state.console_paths = {
+        each.path for each in NAVIGATION if any(_leads(route, each.path) for route in app.routes)
+    }
+    before: Any = app.exception_handlers[HTTPException]
+
+    async def not_found(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if wants_page(request):
+            return failure(request, f"{request.url.path[:200]}: {error.detail}", error.status_code)
+        answer: Response = await before(request, error)
+        return answer
+
+    app.add_exception_handler(HTTPException, not_found)
+
+
+def _leads(route: Any, path: str) -> bool:
+    scope = {"type": "http", "method": "GET", "path": path, "root_path": "", "path_params": {}, "headers": []}
+    return bool(route.matches(scope)[0] is Match.FULL)

@@ -1,0 +1,11 @@
+// What every page has: live parts, times, forms, the theme.
+import { startForms, showKept } from "./forms.js";
+import { startTables } from "./live.js";
+import { startTheme } from "./theme.js";
+import { startTimes } from "./times.js";
+
+startTheme();
+startTimes();
+startForms();
+showKept();
+startTables();

@@ -1,0 +1,81 @@
+"""Numbers, times and attributes as the pages show them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from markupsafe import Markup
+
+_UNITS = ((86400, "d"), (3600, "h"), (60, "min"))
+_SPARK = (100.0, 24.0)
+"""Width and height of a sparkline."""
+
+
+def duration(seconds: float | None) -> str:
+    """``4 s``, ``12 min``, ``3 h 5 min``, ``2 d 4 h``; empty for None."""
+    if seconds is None:
+        return ""
+    left = max(0, int(seconds))
+    if left < 60:
+        return f"{left} s"
+    parts: list[str] = []
+    for size, unit in _UNITS:
+        amount, left = divmod(left, size)
+        if amount or parts:
+            parts.append(f"{amount} {unit}")
+    return " ".join(part for part in parts[:2] if not part.startswith("0 "))
+
+
+def ago(moment: int | None) -> str:
+    """For how long something is past, from Unix time [ms]; empty for None."""
+    return "" if moment is None else duration(time.time() - moment / 1000)
+
+
+def moment(when: int | float | None) -> str:
+    """Unix time [ms] for the attribute ``datetime`` of a ``<time>``; empty for None."""
+    return "" if when is None else datetime.fromtimestamp(when / 1000, UTC).isoformat(timespec="seconds")
+
+
+def since(iso: str) -> str:
+    """:func:`ago` for what :func:`moment` wrote."""
+    return ago(int(datetime.fromisoformat(iso).timestamp() * 1000)) if iso else ""
+
+
+def count(value: float | None) -> str:
+    """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for None."""
+    if value is None:
+        return ""
+    for size, unit in ((1e9, " G"), (1e6, " M"), (1e4, " k")):
+        if abs(value) >= size:
+            scaled = value / (1e3 if size == 1e4 else size)
+            return f"{scaled:.{2 if abs(scaled) < 10 else 1 if abs(scaled) < 100 else 0}f}{unit}"
+    return f"{value:.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.3g}"
+
+
+def spark(values: Sequence[float]) -> str:
+    """Points of a ``<polyline>`` in a box of 100 × 24, the least value at its bottom; empty for fewer than two values."""
+    if len(values) < 2:
+        return ""
+    low, high = min(values), max(values)
+    width, height = _SPARK[0] / (len(values) - 1), (_SPARK[1] - 4) / ((high - low) or 1)
+    return " ".join(f"{i * width:.1f},{_SPARK[1] - 2 - (each - low) * height:.1f}" for i, each in enumerate(values))
+
+
+def bound(row: Mapping[str, Any], **targets: str) -> Markup:
+    """Attributes of an element that shows fields of a row: their present values, and which ones a script renews.
+
+    ``bound(row, href="link", text="name")``: the attribute ``href`` has the field ``link``; the text, which the template writes itself,
+    is the field ``name``. ``hidden`` hides the element while its field is empty; ``state`` is ``data-state``.
+    """
+    names = " ".join(f"{target}:{field}" for target, field in targets.items())
+    found = Markup('data-bind="{}"').format(names)
+    for target, field in targets.items():
+        value = row.get(field)
+        if target == "hidden":
+            found += Markup("" if value else " hidden")
+        elif target != "text" and value not in (None, ""):
+            found += Markup(' {}="{}"').format({"state": "data-state"}.get(target, target), value)
+    return found

@@ -1,0 +1,166 @@
+"""Who gets into the console, what a browser may be made to do, and what other web pages can't."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import pytest
+
+from orchestrator.keys import KeyStore
+from tests.conftest import Serving
+from tests.support.console.fixtures import Console, secret_of
+from tests.support.console.visitor import Page, Visitor
+
+
+def test_a_browser_without_a_session_is_sent_to_the_login_and_back(console: Console) -> None:
+    http = httpx.Client(base_url=console.url, headers={"Accept": "text/html"}, trust_env=False)
+    sent = http.get("/?search=a%26b")
+    assert sent.status_code == 303 and sent.headers["location"] == "/login?next=%2F%3Fsearch%3Da%2526b"
+    asked = Page(http.get(sent.headers["location"]).text)
+    (kept,) = asked.all("input", name="next")
+    answer = http.post("/login", data={"next": str(kept["value"]), "key": console.secrets["admin"]})
+    assert answer.status_code == 303 and answer.headers["location"] == "/?search=a%26b"
+    assert http.get("/?search=a%26b").status_code == 200
+
+
+def test_a_program_without_a_key_still_gets_an_error_that_it_can_read(console: Console) -> None:
+    answer = httpx.get(f"{console.url}/", trust_env=False)
+    assert (answer.status_code, answer.headers["x-amzn-errortype"]) == (403, "MissingAuthenticationToken")
+
+
+def test_a_wrong_key_is_told_and_opens_nothing(console: Console) -> None:
+    name = console.secrets["admin"].partition(":")[0]
+    for given in ("", "x", name, f"{name}:x", "MSTRAAAAAAAAAAAAAAAA:x", "ä\N{SNOWMAN}"):
+        answer = httpx.post(f"{console.url}/login", data={"key": given}, trust_env=False)
+        assert answer.status_code == 403 and "not known here" in answer.text and "set-cookie" not in answer.headers
+
+
+def test_the_cookie_is_not_the_key_and_no_script_or_other_site_gets_it(console: Console) -> None:
+    secret = console.secrets["admin"]
+    answer = httpx.post(f"{console.url}/login", data={"key": secret}, trust_env=False)
+    cookie = answer.headers["set-cookie"]
+    assert secret.partition(":")[2] not in cookie
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
+
+
+@pytest.mark.parametrize(
+    "elsewhere",
+    ["//evil.example", "https://evil.example/", "/\\evil.example", "\\evil", "javascript:x", "/ x", "/\tx", "//[", ""],
+)
+def test_a_login_leads_nowhere_else(console: Console, elsewhere: str) -> None:
+    given = {"next": elsewhere, "key": console.secrets["admin"]}
+    answer = httpx.post(f"{console.url}/login", data=given, trust_env=False)
+    assert answer.status_code == 303 and answer.headers["location"] == "/"
+
+
+def test_a_logged_out_session_is_over_wherever_it_was_copied_to(console: Console) -> None:
+    visitor, thief = console.visitor(), httpx.Client(base_url=console.url, headers={"Accept": "text/html"})
+    thief.cookies = visitor.http.cookies.__class__(visitor.http.cookies)
+    assert thief.get("/").status_code == 200
+    assert visitor.submit("/logout").status_code == 200
+    assert thief.get("/").status_code == 303
+    thief.close()
+
+
+def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_path: Path) -> None:
+    keys = KeyStore(tmp_path)
+    keys.create("other")
+    key = keys.create("mine")
+    server = Serving(tmp_path, "--cpus", "1")
+    visitor = Visitor(server.url, secret_of(key))
+    try:
+        token = visitor.page("/").form_token
+        server.kill()
+        server.options = (*server.options, "--port", server.url.rpartition(":")[2])
+        server.start()
+        assert visitor.page("/").form_token == token, "forms of open pages go on"
+        keys.delete("mine")
+        assert visitor.http.get("/", follow_redirects=False).headers["location"].startswith("/login")
+    finally:
+        visitor.close()
+        server.close()
+
+
+def test_a_session_reads_the_api_and_changes_nothing_through_it(console: Console) -> None:
+    visitor = console.visitor()
+    assert visitor.http.get("/api/jobs").json()["jobs"] == []
+    assert "GET /api/jobs" in visitor.page("/api/docs").text
+    for path in ("/v1/createjobqueue", "/api/leagues", "/"):
+        answer = visitor.http.post(
+            path, json={}, headers={"Accept": "*/*", "X-Amz-Target": "Logs_20140328.DescribeLogGroups"}
+        )
+        assert answer.status_code == 403 and answer.headers["x-amzn-errortype"] == "MissingAuthenticationToken", path
+
+
+def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console) -> None:
+    visitor, other = console.visitor(), console.visitor("lab")
+    token = visitor.page("/").form_token
+    for given in ("", "x", "ä", other.page("/").form_token):
+        answer = visitor.http.post("/jobs/stop", data={"form_token": given, "job": "x", "confirmed": "yes"})
+        assert answer.status_code == 403 and "load the page again" in answer.text
+    answer = visitor.http.post("/jobs/stop", data={"form_token": token}, headers={"X-Form-Token": "x"})
+    assert answer.status_code == 403
+    answer = visitor.http.post("/jobs/stop", data={"form_token": token})
+    assert answer.status_code == 400 and "no job" in answer.text
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"},
+        {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "iframe"},
+        {"Host": "evil.example"},
+    ],
+)
+def test_on_loopback_without_keys_another_web_page_can_neither_read_nor_change(
+    shared_server: Serving, headers: dict[str, str]
+) -> None:
+    visitor = Visitor(shared_server.url)
+    token = visitor.page("/").form_token
+    for path in ("/", "/jobs/stream", "/api/jobs", "/login", "/static/x/console.js"):
+        answer = visitor.http.get(path, headers=headers)
+        assert answer.status_code == 403 and "AccessDenied" in answer.text, path
+    changed = visitor.http.post(
+        "/jobs/stop", data={"form_token": token, "job": "x", "confirmed": "yes"}, headers=headers
+    )
+    assert changed.status_code == 403
+    link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+    assert visitor.http.get("/", headers=link).status_code == 200, "a link that a person follows"
+    visitor.close()
+
+
+def test_every_page_loads_its_own_files_alone_and_has_the_strict_policy(console: Console) -> None:
+    visitor = console.visitor()
+    pages = [visitor.http.get(path) for path in ("/", "/?search=x", "/nowhere", "/?state=x")]
+    pages.append(httpx.get(f"{console.url}/login", trust_env=False))
+    for answer in pages:
+        policies = answer.headers.get_list("content-security-policy")
+        assert any("default-src 'none'; script-src 'self'; style-src 'self'" in each for each in policies), answer.url
+        assert "unsafe" not in "".join(policies) and "frame-ancestors 'none'" in "".join(policies)
+        assert answer.headers["cache-control"] == "no-store"
+        assert Page(answer.text).is_inert, answer.text
+
+
+def test_files_are_kept_for_ever_under_the_address_of_their_content_and_no_other_is_given_out(console: Console) -> None:
+    visitor = console.visitor()
+    (script,) = visitor.page("/").all("script")
+    answer = httpx.get(f"{console.url}{script['src']}", trust_env=False)
+    assert "immutable" in answer.headers["cache-control"] and answer.headers["content-type"].startswith(
+        "text/javascript"
+    )
+    old = httpx.get(f"{console.url}/static/0/console.js", trust_env=False)
+    assert old.text == answer.text and old.headers["cache-control"] == "no-store"
+    for name in ("../__init__.py", "..%2f__init__.py", "nothing.js"):
+        assert httpx.get(f"{console.url}/static/0/{name}", trust_env=False).status_code in (403, 404)
+
+
+def test_an_address_that_leads_nowhere_is_a_page_for_browsers_and_json_for_programs(console: Console) -> None:
+    visitor = console.visitor()
+    assert "Not Found" in visitor.page("/nowhere", 404).text
+    told = visitor.http.get("/nowhere", headers={"Accept": "*/*"})
+    assert told.status_code == 404 and told.json()["message"] == "GET /nowhere: Not Found"

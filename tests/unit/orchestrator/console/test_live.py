@@ -1,0 +1,92 @@
+"""Streams of the console: what is sent of a table, how a stream begins and ends, and values that many pages share."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+from fastapi import Request
+
+from orchestrator.api.errors import ClientError
+from orchestrator.console.live import Event, Recent, Rows, last_id, stream
+
+
+def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
+    state = SimpleNamespace(closing=threading.Event())
+    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state))
+    return cast(Request, told)
+
+
+def written(looks: Sequence[Callable[[], Sequence[Event] | None]]) -> list[str]:
+    """The blocks of a stream whose looks find these."""
+    left: Iterator[Callable[[], Any]] = iter(looks)
+
+    async def read() -> str:
+        answer = stream(request_of(), lambda: next(left)(), interval=0)
+        return "".join([bytes(cast(bytes, each)).decode() async for each in answer.body_iterator])
+
+    return asyncio.run(read()).split("\n\n")[:-1]
+
+
+def test_of_a_table_only_what_changed_is_sent() -> None:
+    table = Rows()
+    (first,) = table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"})
+    assert first.data["order"] == ["a", "b"] and first.data["rows"]["b"] == {"x": "3", "y": "4"}
+    assert table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"}) == []
+    (second,) = table.changes({"b": {"x": "3", "y": "5"}, "a": {"x": "1", "y": "2"}}, {"shown": "2"})
+    assert second.data == {"order": ["b", "a"], "rows": {"b": {"y": "5"}}}
+    (third,) = table.changes({"c": {"x": "6"}}, {"shown": "1"})
+    assert third.data == {"order": ["c"], "rows": {"c": {"x": "6"}}, "totals": {"shown": "1"}}
+
+
+def test_no_text_can_end_an_event_or_begin_another() -> None:
+    event = Event("rows", {"x": "a\n\ndata: b\r\nevent: c\u2028\x00"}, "7")
+    (_, block) = written([lambda: [event], lambda: None])[:2]
+    lines = block.split("\n")
+    assert lines[0] == "event: rows" and lines[2] == "id: 7" and len(lines) == 3
+    assert json.loads(lines[1].removeprefix("data: ")) == event.data
+
+
+def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
+    def failing() -> Sequence[Event]:
+        raise ClientError("the run is gone")
+
+    blocks = written([failing, lambda: [Event("a", 1)], lambda: None])
+    assert [block.split("\n")[0] for block in blocks[1:]] == ["event: trouble", "event: a", "event: end"]
+    assert "the run is gone" in blocks[1]
+
+
+def test_a_browser_says_what_it_has_in_a_header_or_in_the_address() -> None:
+    assert last_id(request_of({"last": "3"})) == "3" and last_id(request_of()) == ""
+    assert last_id(request_of({"last": "3"}, **{"last-event-id": "5"})) == "5"
+
+
+def test_a_value_that_many_want_at_once_is_computed_once() -> None:
+    recent, computed, gate = Recent(60), list[int](), threading.Event()
+
+    def compute() -> int:
+        gate.wait(10)
+        computed.append(1)
+        return len(computed)
+
+    found = list[int]()
+    threads = [threading.Thread(target=lambda: found.append(recent.get("key", compute))) for _ in range(8)]
+    for each in threads:
+        each.start()
+    gate.set()
+    for each in threads:
+        each.join()
+    assert found == [1] * 8 and computed == [1]
+    assert recent.get("other", compute) == 2
+    assert Recent(0).get("key", compute) == 3
+
+
+def test_values_that_nobody_asks_for_any_more_are_dropped() -> None:
+    recent = Recent(60)
+    for key in range(200):
+        recent.get(key, lambda: None)
+    assert recent.get(0, lambda: "again") == "again" and recent.get(0, lambda: "kept") == "again"
