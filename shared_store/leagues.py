@@ -37,6 +37,7 @@ CAR: Mapping[str, Any] = {
     "speed_factor": [1.0, 1.0],
     "steering_factor": [1.0, 1.0],
     "steering_offset": [0.0, 0.0],
+    "friction": [0.0, 0.0],
     "stuck_steps": 15,
     "put_back": 1.0,
 }

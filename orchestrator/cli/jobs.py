@@ -314,7 +314,7 @@ def stop(
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
-        slow = wait and _slow_iteration(detail)
+        slow = wait and slow_iteration(detail)
         while wait and detail["status"] not in ("SUCCEEDED", "FAILED"):
             time.sleep(0.2)
             detail = client.get(f"/api/jobs/{detail['id']}")
@@ -328,13 +328,13 @@ def stop(
         echo(f"{detail['name']} ({detail['id'][:8]}) is asked to stop")
         return
     echo(f"{detail['name']} ({detail['id'][:8]}) ended: {one_line(detail['statusReason'])}")
-    if lost := _lost(detail):
+    if lost := lost_iterations(detail):
         echo(lost)
     if (detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]):
         echo(f"go on with: muster resume {detail['run']}")
 
 
-def _slow_iteration(detail: Mapping[str, Any]) -> str:
+def slow_iteration(detail: Mapping[str, Any]) -> str:
     """What may become of the present iteration of a training whose iterations last long; empty for others."""
     seconds = (detail["progress"] or {}).get("iteration_seconds") or 0.0
     if detail["kind"] != "train" or detail["status"] != "RUNNING" or seconds < _PATIENCE:
@@ -345,7 +345,7 @@ def _slow_iteration(detail: Mapping[str, Any]) -> str:
     )
 
 
-def _lost(detail: Mapping[str, Any]) -> str:
+def lost_iterations(detail: Mapping[str, Any]) -> str:
     """The iterations of a stopped training that no checkpoint has; empty without any, and for other jobs."""
     done = (detail["progress"] or {}).get("iteration", 0)
     saved = (detail["results"] or {}).get("iteration", 0)

@@ -148,8 +148,10 @@ def new_nodes(placements: Sequence[Placement]) -> list[Node]:
 
 
 def _running(job: Job, attempt: Attempt) -> Running:
-    # empty where the row is damaged, which the controller says of the job
-    options = job.gang.options if job.node_properties else NativeOptions()
+    try:
+        options = job.gang.options
+    except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+        options = NativeOptions()
     return Running(
         job=job.id,
         name=job.name,

@@ -123,7 +123,12 @@ class Runner:
         if launch is None:
             if self._backoff.waits(("launch", gang)):
                 raise self._refused[gang]
-            planned = plan()
+            try:
+                planned = plan()
+            except Transient as error:
+                self._refused[gang] = error
+                self._failed(("launch", gang), error)
+                raise
             launch = self._launches[gang] = self._submit(lambda: self._start(planned))
             launch.add_done_callback(lambda _: self._changed())
         if not launch.done():
@@ -205,7 +210,7 @@ class Runner:
             raise
         except OSError as error:
             raise Transient(f"the {name} engine can't {what} now ({error}); trying again") from error
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a library that wants to end the process must not end a thread
             said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
             raise EngineFault(
                 f"the {name} engine failed to {what} ({said}); the controller's log has the details; trying again"

@@ -187,7 +187,7 @@ class Job(Base):
 
     @validates("status_reason", "stop_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
     @property
     def gang(self) -> GangSpec:
@@ -251,7 +251,7 @@ class AutomaticEvaluation(Base):
 
     @validates("problem")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
 
 class WebhookDelivery(Base):
@@ -320,7 +320,7 @@ class Attempt(Base):
 
     @validates("status_reason")
     def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(reason, LONGEST_REASON)
+        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
 
     def node(self, index: int) -> Node | None:
         """Its node of this index; None if it has none, because it was started with fewer nodes."""

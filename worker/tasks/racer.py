@@ -152,6 +152,7 @@ class Racer(DeclaredTask):
                     speed_factor=config.speed_factor,
                     steering_factor=config.steering_factor,
                     steering_offset=config.steering_offset,
+                    friction=config.friction,
                 ),
                 **resetting(config),
             },

@@ -20,7 +20,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native.continuing import Changes, answered, check, submit
 from orchestrator.api.native.runs import spec_of
 from orchestrator.api.sources import with_teacher
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import shown
 from orchestrator.engines.registry import FRESH
@@ -37,7 +37,7 @@ from shared_store.wording import Refused
 
 
 def clone(
-    controller: Controller, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+    reconciler: Reconciler, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; what can be refused is refused before a job exists.
 
@@ -52,17 +52,17 @@ def clone(
         ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
-    return with_teacher(controller, lambda teacher: _clone(controller, source, name, changes, idempotency_key, teacher))
+    return with_teacher(reconciler, lambda teacher: _clone(reconciler, source, name, changes, idempotency_key, teacher))
 
 
-def check_clone(controller: Controller, source: Run, name: str, changes: Changes) -> dict[str, Any]:
+def check_clone(reconciler: Reconciler, source: Run, name: str, changes: Changes) -> dict[str, Any]:
     """The definition that :func:`clone` would register, its queue and whose weights it would begin with; nothing is submitted.
 
     Raises ClientError as :func:`clone`.
     """
-    with controller.database.session() as session:
-        spec, chosen = _checked(Context(session, controller), source, name, changes)
-    definition = _check_submission(controller, spec, changes, name)
+    with reconciler.database.session() as session:
+        spec, chosen = _checked(Context(session, reconciler), source, name, changes)
+    definition = _check_submission(reconciler, spec, changes, name)
     return {
         "definition": definition,
         "queue": spec.queue,
@@ -71,24 +71,24 @@ def check_clone(controller: Controller, source: Run, name: str, changes: Changes
 
 
 def _clone(
-    controller: Controller,
+    reconciler: Reconciler,
     source: Run,
     name: str,
     changes: Changes,
     idempotency_key: str | None,
     teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
-    with controller.database.session() as session:
-        context = Context(session, controller, idempotency_key)
+    with reconciler.database.session() as session:
+        context = Context(session, reconciler, idempotency_key)
         if earlier := _answered(context, name):
             return earlier
         spec, chosen = _checked(context, source, name, changes)
         new = context.run(name)
-    _check_submission(controller, spec, changes, name)  # before the copy: not for who may not submit it
-    controller.check_writable(adds=True)
-    if shortage := controller.disk.shortage("store"):
+    _check_submission(reconciler, spec, changes, name)  # before the copy: not for who may not submit it
+    reconciler.check_writable(adds=True)
+    if shortage := reconciler.disk.shortage("store"):
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
-    making = NewRun(controller.store, controller.peers.id, source.name, chosen)
+    making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)
     environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
     try:
         with making:
@@ -96,8 +96,8 @@ def _clone(
                 making.copy()
             except DamagedCheckpoint as error:
                 raise refusal(source, chosen, error) from None
-            with controller.writing, controller.database.session() as session:
-                context = Context(session, controller, idempotency_key, making, teacher)
+            with reconciler.writing, reconciler.database.session() as session:
+                context = Context(session, reconciler, idempotency_key, making, teacher)
                 if earlier := _answered(context, name):
                     return earlier
                 _check_free(session, new)
@@ -109,7 +109,7 @@ def _clone(
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
-    controller.wake()
+    reconciler.wake()
     return {**answer, "run": new.name, "parent": making.lineage, "kind": spec.kind}
 
 
@@ -122,11 +122,11 @@ def _checked(context: Context, source: Run, name: str, changes: Changes) -> tupl
     return spec, chosen
 
 
-def _check_submission(controller: Controller, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
+def _check_submission(reconciler: Reconciler, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
     """The definition of the job, which may be submitted. Raises ClientError."""
-    controller.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
-    with controller.database.session() as session:
-        return check(Context(session, controller), spec, changes.directory, f"clone {name}")
+    reconciler.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
+    with reconciler.database.session() as session:
+        return check(Context(session, reconciler), spec, changes.directory, f"clone {name}")
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:

@@ -139,6 +139,9 @@ class RacerConfig(TaskConfig):
     """Factor on the requested steering, uniform, drawn in every episode."""
     steering_offset: Range = (0.0, 0.0)
     """Offset of the requested steering [rad], uniform, drawn in every episode."""
+    friction: Range = (0.0, 0.0)
+    """Coefficient of friction between tyres and road, uniform, drawn in every episode: the car turns no faster than a lateral
+    acceleration of 9.81 m/s² times this allows; [0, 0]: it never slides."""
     start: Literal["round_robin", "random", "line"] = "round_robin"
     """Start of an episode: ``start_step`` of the track farther than the previous one, anywhere, or at the start line."""
     start_step: Annotated[float, Field(ge=0, le=1)] = 0.05
@@ -192,8 +195,13 @@ class RacerConfig(TaskConfig):
         super().__post_init__()
         for name in FACTORS:
             if getattr(self.randomize, name) != (1.0, 1.0):
-                instead = "use speed_factor, steering_factor and steering_offset"
-                raise Refused(("randomize", name), f"the car moves as a kinematic bicycle, which has none; {instead}")
+                instead = "friction" if name == "friction" else "speed_factor, steering_factor and steering_offset"
+                words = (
+                    f"the car moves as a kinematic bicycle, without an engine's contacts; use train.config.{instead}"
+                )
+                raise Refused(("randomize", name), words)
+        if self.friction != (0.0, 0.0) and self.friction[0] <= 0.0:
+            raise Refused(("friction",), f"expected two numbers above 0, or [0, 0], found {list(self.friction)}")
         if self.randomize.push_interval:
             raise Refused(("randomize", "push_interval"), "nothing can push a car that moves as a kinematic bicycle")
         if not isinstance(self.action_space, str):
