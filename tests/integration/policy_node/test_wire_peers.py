@@ -263,7 +263,7 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undecl
 
         wait_for(lambda: diagnosed(False), 20, "the end of what the tests before sent")
         wait_for(lambda: diagnosed(True), 20, "a diagnosis of the acting node")
-        wait_for(lambda: any("all inputs are there" in line for line in said), 20, "the line on /rosout")
+        wait_for(lambda: any("all inputs have arrived" in line for line in said), 20, "the line on /rosout")
         reset.publish(MESSAGES.make(EMPTY, structure_needs_at_least_one_member=0))
 
         def told(sample: zenoh.Sample) -> None:
