@@ -92,8 +92,8 @@ def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schem
     ("change", "said"),
     [
         (
-            lambda found: found.update(format=3),
-            "contract.json: has format 3, this Muster reads up to 2; upgrade Muster",
+            lambda found: found.update(format=4),
+            "contract.json: has format 4, this Muster reads up to 3; upgrade Muster",
         ),
         (lambda found: found.pop("task"), "contract.json: task is missing"),
         (
