@@ -25,7 +25,7 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import reconciler_of, permitted_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Recent
@@ -53,7 +53,7 @@ def run_curves(
     points: int = Query(default=POINTS, ge=2, le=_MOST_POINTS),
 ) -> dict[str, Any]:
     """A window of a run's metrics."""
-    run = permitted_run(controller_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(reconciler_of(request), name, Operation.READ_METRICS)
     key = (str(run.path), tuple(names), begin, end, points)
     try:
         return _recent.get(key, partial(curves_of, run, names, begin, end, points))

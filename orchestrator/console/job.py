@@ -12,7 +12,7 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.context import reconciler_of, permitted_run
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.routes import job_detail
 from orchestrator.api.permissions import Operation, current_identity
@@ -24,7 +24,7 @@ from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.persistence.queries import short_id
 from shared_store.files import DamagedFile
 from shared_store.layout import Run
@@ -42,17 +42,17 @@ _CHILDREN = 100
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
     """The page; by a name or the start of an id, the way to it."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
-    described = batch.call(controller, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    described = batch.call(reconciler, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
     array = described.get("arrayProperties", {})
-    before = before_it(controller, detail)
+    before = before_it(reconciler, detail)
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
-    files = _files(controller, detail["run"]) if is_visible else []
-    rows = _rows(controller, detail)
+    files = _files(reconciler, detail["run"]) if is_visible else []
+    rows = _rows(reconciler, detail)
     return render(
         request,
         "job.html",
@@ -82,8 +82,8 @@ def job(request: Request, reference: str) -> Response:
 @router.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     """What changes of the page, and what its log has anew. The id of an event is what the page has then, of both."""
-    controller = controller_of(request)
-    key = (id(controller), current_identity.get(), chosen.job)
+    reconciler = reconciler_of(request)
+    key = (id(reconciler), current_identity.get(), chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
     log = LiveLog(chosen, chosen.end() if places is None else places)
@@ -93,11 +93,11 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
 def _look(request: Request, job_id: str) -> dict[str, Any]:
     """The parts of the page that change; shared by all who look at it."""
     detail = job_detail(request, job_id)
-    return {"facts": facts_of(detail), **_rows(controller_of(request), detail)}
+    return {"facts": facts_of(detail), **_rows(reconciler_of(request), detail)}
 
 
-def _rows(controller: Controller, detail: Mapping[str, Any]) -> dict[str, Any]:
-    found = checkpoints_of(controller, detail["run"]) if detail["results"] is not None else {}
+def _rows(reconciler: Reconciler, detail: Mapping[str, Any]) -> dict[str, Any]:
+    found = checkpoints_of(reconciler, detail["run"]) if detail["results"] is not None else {}
     return {"attempts": attempts_of(detail), "checkpoints": found}
 
 
@@ -159,9 +159,9 @@ def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
     return None, None
 
 
-def _files(controller: Controller, name: str) -> list[File]:
+def _files(reconciler: Reconciler, name: str) -> list[File]:
     try:
-        return files_of(permitted_run(controller, name, Operation.READ_RUN))
+        return files_of(permitted_run(reconciler, name, Operation.READ_RUN))
     except (ClientError, DamagedFile, OSError):
         return []
 

@@ -12,7 +12,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.native import runs
 from orchestrator.api.permissions import Operation
 from orchestrator.console import words
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
 from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
@@ -148,10 +148,10 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     return "; ".join([*parts, *([told["problem"]] if told["problem"] else [])])
 
 
-def checkpoints_of(controller: Controller, run: str) -> dict[str, dict[str, Any]]:
+def checkpoints_of(reconciler: Reconciler, run: str) -> dict[str, dict[str, Any]]:
     """The rows of a run's newest checkpoints and its best one, by name, the newest first; none where they can't be seen."""
     try:
-        found = permitted_run(controller, run, Operation.READ_CHECKPOINTS)
+        found = permitted_run(reconciler, run, Operation.READ_CHECKPOINTS)
         return _checkpoints(found)
     except (ClientError, OSError):
         return {}
