@@ -25,7 +25,7 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.context import reconciler_of, permitted_run
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
 from orchestrator.console.live import Recent
@@ -77,12 +77,12 @@ def curves_of(
     until = last if end is None else min(end, last)
     count = until - begin + 1
     if count <= 0:
-        records = []
+        found = []
     elif count <= _MOST_READ and (begin > 1 or count < points):
-        records = history_of(run).after(begin - 1, count)
+        found = history_of(run).after(begin - 1, count)
     else:
-        records = sampled(run, min(_MOST_READ, points * math.ceil(last / count)))
-    records = thinned([each for each in records if begin <= each["iteration"] <= until], points)
+        found = sampled(run, min(_MOST_READ, points * math.ceil(last / count)))
+    records = thinned([each for each in found if begin <= each["iteration"] <= until], points)
     return {"first": begin, "last": last, **columns(records, names or ["*"])}
 
 

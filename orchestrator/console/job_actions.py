@@ -10,7 +10,7 @@ from fastapi import Depends, Request, Response
 from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.checkpoints import choose
-from orchestrator.api.context import Context, reconciler_of, permitted_run
+from orchestrator.api.context import Context, permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import clones, continuing, routes, runs
 from orchestrator.api.native.continuing import Changes

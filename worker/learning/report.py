@@ -188,9 +188,9 @@ def _slow(record: dict[str, float | int | None]) -> str:
 
 _SLOW = 0.1
 _NOTICED = 0.1
+"""Seconds of an iteration."""
 _MOST_RANKS = 32
 """Ranks of which each is told by itself in a record."""
-"""Seconds of an iteration."""
 
 
 def _text(value: float | None, form: str) -> str:
