@@ -9,8 +9,8 @@ from fastapi import Depends, Request, Response
 
 from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.checkpoints import choose
-from orchestrator.api.context import Context, permitted_run, reconciler_of
+from orchestrator.api.checkpoints import CONFLICT, choose
+from orchestrator.api.context import permitted_run, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import clones, continuing, routes, runs
 from orchestrator.api.native.continuing import Changes
@@ -21,7 +21,6 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import SpecError
-from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import short_id
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
@@ -47,7 +46,10 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
 def save(request: Request, reference: str) -> Response:
     """Have a training save a checkpoint now."""
     job, _, _, _ = _job(request, reference, Operation.CHECKPOINT_JOB)
-    return done(request, f"/jobs/{job}", routes.save_now(request, job)["answer"])
+    answer = routes.save_now(request, job)["answer"]
+    if not answer.startswith("checkpoint "):
+        raise ClientError(answer, CONFLICT)
+    return done(request, f"/jobs/{job}", answer)
 
 
 @router.post("/jobs/{reference}/resume")
@@ -124,16 +126,11 @@ def _beside(request: Request, reference: str, form: Form, kind: str) -> Response
 
 def _submitted(request: Request, document: Mapping[str, Any], directory: str, what: str) -> Response:
     """Submit a job and go to its page. Raises ClientError."""
-    reconciler = reconciler_of(request)
     try:
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    reconciler.check_writable(adds=True)
-    with reconciler.writing, reconciler.database.session() as session:
-        answer, _ = continuing.submit(Context(session, reconciler), spec, directory, what, {})
-    reconciler.wake()
+    answer = continuing.submit_alone(reconciler_of(request), spec, directory, what)
     return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']}")
 
 
