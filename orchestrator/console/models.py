@@ -73,7 +73,7 @@ def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | N
     """Another version of the model; None of one that the caller may not see or that is damaged."""
     try:
         found: Mapping[str, Any] = read_model(request, name, version, False)
-        return None if found.get("problem") else found
+        return found if found.get("run") else None
     except (ClientError, DamagedFile):
         return None
 

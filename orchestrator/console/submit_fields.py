@@ -221,7 +221,7 @@ def bounds(about: Mapping[str, Any]) -> str:
         "maximum": "up to {}",
         "exclusiveMaximum": "below {}",
     }
-    told = [text.format(f"{about[key]:g}") for key, text in limits.items() if key in about]
+    told = [text.format(str(about[key])) for key, text in limits.items() if key in about]
     return " ".join(filter(None, (words.get(str(about.get("type")), ""), *told)))
 
 
