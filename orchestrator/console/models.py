@@ -59,6 +59,7 @@ def model(
         facts=list(facts.items()),
         graph=graph,
         evaluations=evaluations,
+        problem=found.get("problem", ""),
         verified=found.get("verified", False),
         spec=written(found["spec"]) if isinstance(found.get("spec"), dict) else "",
         contract=_contract(found.get("contract")),
@@ -119,9 +120,22 @@ def _contract(contract: Any) -> list[tuple[str, str]]:
     """What goes in and out of the policy, in a few words."""
     if not isinstance(contract, Mapping):
         return []
-    simple = {key: value for key, value in contract.items() if isinstance(value, str | int | float)}
-    lists = {key: f"{len(value)}" for key, value in contract.items() if isinstance(value, list) and value}
-    return [(key.replace("_", " "), str(value)) for key, value in {**simple, **lists}.items()]
+    seen = {
+        f"Observations: {group['name']}": _named(group.get("terms")) or " × ".join(map(str, group["shape"]))
+        for group in contract.get("groups") or ()
+    }
+    facts = {
+        "Control rate": f"{contract.get('control_hz'):g} Hz",
+        **seen,
+        "Actions": ", ".join(map(str, contract.get("action_names") or ())),
+        "Commands": _named(contract.get("commands")),
+        "Recurrent state": _named(contract.get("states")),
+    }
+    return list(facts.items())
+
+
+def _named(parts: Any) -> str:
+    return ", ".join(str(each["name"]) for each in parts or ())
 
 
 def _number(value: Any) -> str:

@@ -63,13 +63,11 @@ def help_at(text: str, line: int) -> dict[str, Any]:
     """
     document, path = _place(text, line)
     about = _about(path, document)
-    has_keys = bool(about and about.get("properties"))
-    section = path if has_keys else path[:-1]
-    inside = _about(section, document) or job_schema()
+    section = next(path[:end] for end in range(len(path), -1, -1) if _keys(_about(path[:end], document)))
     given = _value(document, section)
     keys = [
         {"name": name, "about": told(each), "given": isinstance(given, Mapping) and name in given}
-        for name, each in (inside.get("properties") or {}).items()
+        for name, each in _keys(_about(section, document)).items()
     ]
     key = {"name": ".".join(map(str, path)), "about": told(about), "given": True} if path and about else None
     return {"section": ".".join(map(str, section)), "key": key, "keys": keys}
@@ -97,10 +95,19 @@ def _about(path: tuple[str | int, ...], document: Any) -> Mapping[str, Any] | No
         elif isinstance(key, int):
             about = plain(about).get("items") or {}
         else:
-            about = (plain(about).get("properties") or {}).get(key) or {}
+            about = _keys(plain(about)).get(key) or {}
         if not about:
             return None
     return plain(about)
+
+
+def _keys(about: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The keys of a section, also of one in whose place something else may stand."""
+    for each in (about or {}, *(about or {}).get("anyOf", ())):
+        if found := plain(each).get("properties"):
+            keys: Mapping[str, Any] = found
+            return keys
+    return {}
 
 
 def _value(document: Any, path: tuple[str | int, ...]) -> Any:

@@ -152,7 +152,7 @@ def _content(path: str, how: KeptFile) -> Any:
         if isinstance(value, str):
             raise SpecError(f"{path}: it holds a text alone")
     _check_size(path, value)
-    _check(path, how, path)
+    _check(path, how)
     return value
 
 
@@ -163,12 +163,12 @@ def _check_size(name: str, value: Any) -> None:
         raise SpecError(f"{name}: it takes {size:,} bytes of the job's definition, and may take {MOST:,}; shorten it")
 
 
-def _check(path: str, how: KeptFile, name: str) -> None:
-    """Have another process check the file: what tasks are made of is the worker's. Raises SpecError, which calls the file ``name``."""
+def _check(path: str, how: KeptFile, name: str = "") -> None:
+    """Have another process check the file: what tasks are made of is the worker's. Raises SpecError, in which ``name`` stands for the path."""
     if not how.check or any(find_spec(each) is None for each in how.needs):
         return
     command = [sys.executable, "-P", "-m", how.check, path]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode:
         said = checked.stderr.strip().splitlines() or [f"{how.check} ended with exit code {checked.returncode}"]
-        raise SpecError(said[-1].replace(path, name, 1))
+        raise SpecError(said[-1].replace(path, name or path, 1))
