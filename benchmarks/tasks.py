@@ -1,11 +1,11 @@
-"""What a declared task is made of and what each part costs on this device: kernels, sensors, terms, and compiling it.
+"""Cost of the parts of a declared task on this device: kernels, sensors, terms, and compilation.
 
     python -m benchmarks.tasks [--tasks Ant Quadruped] [--worlds 4096] [--no-compile] [--out DIRECTORY]
 
-A part is recorded many times over in one graph, and its share is that of one control step of the same task; all graphs take turns, so that
-what else happens on the machine happens to all of them. A sensor that the task does not have is added to it, and nothing reads it. A term
-is measured with and without: in a task with sixteen more of them. Compiling is done in processes of its own, with a kernel cache that is
-empty (cold) and then full (warm). Writes ``tasks.md`` on a GPU and ``tasks_cpu.md`` without one.
+A part is captured many times in one graph, and its share is relative to one control step of the same task. All graphs take turns, so that
+other load on the machine affects all of them. A sensor that the task lacks is added, and nothing reads it. A term's cost is the
+difference to a task with sixteen more of them. Compilation runs in separate processes, with a kernel cache that is empty (cold) and then
+full (warm). Writes ``tasks.md`` on a GPU and ``tasks_cpu.md`` without one.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ from worker.tasks.declared import DeclaredTask
 WORLDS, WORLDS_CPU = 4096, 32
 TASKS = ("Ant", "Quadruped")
 FEET = {"Ant": "*_foot", "Quadruped": "*_shank", "LiftCube": "?f_down"}
-"""Bodies that sensors are put on."""
+"""Bodies that carry the sensors."""
 TRUNKS = {"Ant": "torso", "Quadruped": "trunk", "LiftCube": "link_6"}
 ROUNDS, SECONDS, COPIES = 9, 0.15, 20
 MORE = 16
-"""So many more terms."""
+"""Number of additional terms."""
 DEVICE = "cuda:0" if CUDA else "cpu"
 LOADED = re.compile(r"^Module (\S+) \S+ load on device '.*' took ([\d.]+) ms", re.M)
 
 
 def sensors(task: str) -> dict[str, Any]:
-    """One of each kind, by what the table calls it."""
+    """One of each kind, by its name in the table."""
     feet, trunk = FEET[task], TRUNKS[task]
     return {
         "contacts": ContactSensor(bodies=feet),
@@ -74,7 +74,7 @@ def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[Decl
 
 
 def made(kind: Any, worlds: int) -> DeclaredTask:
-    """A task that acts at random; what Warp says of its modules is not shown."""
+    """A task with random actions; Warp's messages about its modules are not shown."""
     with contextlib.redirect_stdout(io.StringIO()):
         task: DeclaredTask = kind(kind.config_type(), worlds, seed=1, device=DEVICE)
     task.actions.uniform_(-1.0, 1.0)
@@ -82,7 +82,7 @@ def made(kind: Any, worlds: int) -> DeclaredTask:
 
 
 def parts(task: DeclaredTask) -> dict[str, Callable[[], None]]:
-    """What a control step is made of besides the physics, as launches."""
+    """The launches of a control step besides the physics."""
     rows = [array for group in further(task.plan) for array in task._rows[group]]
     common = [int(STEP), task.max_episode_length, *rows, *task._common]
 
@@ -109,7 +109,7 @@ def measured(sensor: Any) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
-    """Within it, a task measures only what the plain one does."""
+    """In this context, a task runs only the sensors of the plain one."""
     sensors, needs = sensed.sensors, sensed._needs
     sensed.sensors, sensed._needs = {key: sensors[key] for key in plain.sensors}, plain._needs
     try:
@@ -119,7 +119,7 @@ def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
 
 
 def seconds(graphs: Mapping[str, Callable[[], None]]) -> dict[str, list[float]]:
-    """Time of one replay of each graph, of each round: they take turns."""
+    """Time of one replay of each graph in each round; the graphs take turns."""
     counts, found = {}, dict[str, list[float]]()
     for name, launch in graphs.items():
         launch()
@@ -168,7 +168,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     added = {key: each for key, each in sensors(name).items()}
     sensed = made(varied(name, lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})), worlds)
     graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._whole, DEVICE).launch}
-    # both of the same worlds, since what the solver has to do depends on what they are in
+    # both on the same worlds, since the solver's work depends on their state
     graphs["step, sensed"] = CapturedStep(sensed._whole, DEVICE).launch
     with unmeasured(sensed, plain):
         graphs["step, unmeasured"] = CapturedStep(sensed._whole, DEVICE).launch
@@ -195,7 +195,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
 
 
 def compiled(name: str, worlds: int) -> dict[str, Any]:
-    """Seconds until a task is there in a new process, and of them those for its own kernels and for all, cold and warm."""
+    """Seconds until a task is built in a new process, and those for its own kernels and for all kernels, cold and warm."""
     found = {}
     with tempfile.TemporaryDirectory() as cache:
         for state in ("cold", "warm"):
@@ -212,7 +212,7 @@ def compiled(name: str, worlds: int) -> dict[str, Any]:
 
 
 def build(name: str, worlds: int) -> None:
-    """Build a task, and print in the last line how long it took."""
+    """Build a task, and print the time it took in the last line."""
     kind: Any = find_task(name)
     started = time.perf_counter()
     kind(kind.config_type(), worlds, seed=1, device=DEVICE)
@@ -279,7 +279,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def compilation(rows: list[dict[str, Any]]) -> list[str]:
-    """The part of the table that is about compiling."""
+    """The part of the table about compilation."""
     if not rows:
         return []
     lines = [

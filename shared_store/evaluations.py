@@ -19,6 +19,9 @@ from shared_store.wording import counted
 TERMS_SHOWN = 6
 """Number of reward terms in a printed table: the largest ones."""
 
+BY_CLOCK = "the clock ended the episode"
+"""What a success is of a task that does not declare it: its length tells as much."""
+
 _NAME = re.compile(r"([0-9]{8}-e[0-9]{1,18})(-[A-Za-z0-9-]{1,40})?")
 _NUMBERS = ("mean_return", "mean_length", "max_length", "episodes", "time")
 
@@ -97,6 +100,22 @@ def kept_checkpoints(run: Run) -> set[str]:
         if summary is None or summary.get("keep", True):  # also if it can't be read: keeping is safe
             kept.add(checkpoint_of(path.stem) or path.stem)
     return kept
+
+
+def in_one_line(summary: Mapping[str, Any]) -> str:
+    """An evaluation in one line: the share of successes where the task declares what a success is, else how long its episodes lasted."""
+    episodes, length, longest = (summary[key] for key in ("episodes", "mean_length", "max_length"))
+    success, meant = _mapping(summary, "success"), summary.get("success_is")
+    mean = f"mean return {summary['mean_return']:.2f}"
+    if not success or not isinstance(meant, str) or meant == BY_CLOCK:
+        share = f"{100 * length / longest:.0f} %"
+        return f"mean episode length {length:.1f} of {longest} ({share}), {mean} over {counted(episodes, 'episode')}"
+    shown = "".join(f"{name} {text}, " for name, text in _mapping(summary, "shown").items())
+    count = success.get("count")
+    return (
+        f"{count} of {counted(episodes, 'episode')} succeeded ({_percent(success.get('share'))}: {meant}), {shown}"
+        f"mean length {length:.1f} steps, {mean}"
+    )
 
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:

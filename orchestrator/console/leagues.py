@@ -10,7 +10,7 @@ from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ValidationError
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import league_routes as api
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
@@ -200,12 +200,12 @@ def _rules(league: Mapping[str, Any]) -> dict[str, Any]:
 
 def _races(request: Request, name: str) -> list[dict[str, Any]]:
     """The newest races of a league that the caller may see, without those that are entered."""
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(controller, Wanted(search=begins), 0, _RACES)["jobs"]
+    jobs = page_of_jobs(reconciler, Wanted(search=begins), 0, _RACES)["jobs"]
     if not jobs:
         return []
-    described = batch.call(controller, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
+    described = batch.call(reconciler, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = api.entered_jobs(request, name)
     return [

@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 
 from orchestrator.api import permissions
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.context import controller_of, queue_names
+from orchestrator.api.context import queue_names, reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native import routes
 from orchestrator.api.native.routes import PlanRequest
@@ -134,12 +134,12 @@ def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     definition = compile_definition(spec, "")
     if unfit := _unfit(request, spec, PlanRequest(definition=definition, queue=spec.queue)):
         raise ClientError(unfit.message)
-    registered = batch.call(controller, "RegisterJobDefinition", definition)
-    answer = batch.call(controller, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
+    registered = batch.call(reconciler, "RegisterJobDefinition", definition)
+    answer = batch.call(reconciler, "SubmitJob", compile_submission(spec, registered["jobDefinitionArn"]))
     return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']} as {answer['jobId'][:8]}")
 
 
@@ -190,7 +190,7 @@ def _groups(request: Request, task: str) -> list[Group]:
     permissions.check(Operation.SUBMIT_JOB)
     if task not in tasks():
         raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
-    with controller_of(request).database.session() as session:
+    with reconciler_of(request).database.session() as session:
         return groups(task, queue_names(session))
 
 

@@ -10,7 +10,7 @@ from urllib.parse import quote
 from fastapi import Query, Request, Response
 
 from orchestrator.api import permissions
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.native.track_routes import list_tracks, picture
 from orchestrator.api.permissions import Operation
@@ -60,15 +60,15 @@ def outline(request: Request, name: str) -> Response:
 def large(request: Request, name: str) -> Response:
     """The picture that ``muster tracks show`` draws."""
     permissions.check(Operation.LIST_TRACKS)
-    controller = controller_of(request)
-    key = ("picture", str(controller.store.path), name)
-    return _picture(_recent.get(key, partial(picture, controller, name)), "image/png")
+    reconciler = reconciler_of(request)
+    key = ("picture", str(reconciler.store.path), name)
+    return _picture(_recent.get(key, partial(picture, reconciler, name)), "image/png")
 
 
 def known(request: Request) -> Sequence[Mapping[str, Any]]:
     """All tracks with their measures and borders. Raises ClientError."""
     permissions.check(Operation.LIST_TRACKS)
-    store = controller_of(request).store
+    store = reconciler_of(request).store
     try:
         names = tuple(stored.names(store))
     except stored.TrackError as error:
@@ -93,7 +93,7 @@ def _one(request: Request, name: str) -> Mapping[str, Any]:
         return found[name]
     if not stored.is_made(name):
         raise ClientError(f"track {name[:130]!r} does not exist; {nearest(name, [*found, 'random:7'])}", 404)
-    store = controller_of(request).store
+    store = reconciler_of(request).store
     drawn_one: Mapping[str, Any] = _recent.get(
         ("track", str(store.path), name), partial(list_tracks, request, name, True)
     )[0]

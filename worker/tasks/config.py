@@ -245,6 +245,18 @@ class TaskConfig(_Common):
         """The task's observation groups, and whether each holds images."""
         return {"policy": getattr(self, "camera", None) is not None, "critic": False, **self.further_groups}
 
+    @property
+    def chooses(self) -> bool:
+        """Whether the policy chooses one of several actions, instead of giving numbers; False where only the task knows."""
+        return False
+
+    @property
+    def policy_sizes(self) -> Mapping[str, str]:
+        """What decides the sizes of the policy's inputs and outputs, by key of the configuration, in words; a clone can't change it.
+        Empty where only the task knows.
+        """
+        return {}
+
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         """JSON Schema of ``train.config``: the names of the terms, without the fields that have sections of their own."""

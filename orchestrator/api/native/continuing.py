@@ -13,6 +13,7 @@ from orchestrator.api.checkpoints import CONFLICT
 from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
+from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import gang_needs
@@ -61,8 +62,9 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
     definition = compile_definition(spec, directory)
     queue = context.queue(spec.queue)
     permissions.check(permissions.Operation.SUBMIT_JOB, permissions.JobsOf(queue.name))
+    check_tracks(context.reconciler.store, spec.model_dump(mode="json", exclude_none=True))
     shape = gang_needs(definition["nodeProperties"]).shape
-    if problem := fit_in_queue(context.session, context.controller.engine, queue, shape).problem:
+    if problem := fit_in_queue(context.session, context.reconciler.engine, queue, shape).problem:
         raise ClientError(f"{what}: {problem}")
     limits.check_document("RegisterJobDefinition", definition)
     return definition

@@ -10,10 +10,10 @@ from typing import Any
 from fastapi import APIRouter, Query, Request
 
 from orchestrator.api import permissions
-from orchestrator.api.context import controller_of
+from orchestrator.api.context import reconciler_of
 from orchestrator.api.errors import ClientError
 from orchestrator.api.permissions import Operation
-from orchestrator.control.reconciler import Controller
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.tracks import ask
 
@@ -28,24 +28,24 @@ def list_tracks(
 ) -> list[dict[str, Any]]:
     """The presets and the tracks of the store with their measures [m]; one that is damaged has a ``problem`` instead."""
     permissions.check(Operation.LIST_TRACKS)
-    controller = controller_of(request)
+    reconciler = reconciler_of(request)
     if name is None:
-        found: list[dict[str, Any]] = _ask(controller, {"action": "list", "rings": rings})
+        found: list[dict[str, Any]] = _ask(reconciler, {"action": "list", "rings": rings})
         return found
-    return [_ask(controller, {"action": "show", "name": name, "rings": rings})]
+    return [_ask(reconciler, {"action": "show", "name": name, "rings": rings})]
 
 
-def picture(controller: Controller, name: str) -> bytes:
+def picture(reconciler: Reconciler, name: str) -> bytes:
     """The PNG of a track. Raises ClientError."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "track.png"
-        _ask(controller, {"action": "show", "name": name, "output": str(path)})
+        _ask(reconciler, {"action": "show", "name": name, "output": str(path)})
         return path.read_bytes()
 
 
-def _ask(controller: Controller, order: Mapping[str, Any]) -> Any:
+def _ask(reconciler: Reconciler, order: Mapping[str, Any]) -> Any:
     try:
-        return ask({**order, "store": str(controller.store.path)})
+        return ask({**order, "store": str(reconciler.store.path)})
     except UsageError as error:
         raise ClientError(str(error), 404) from None
     except ServerError as error:

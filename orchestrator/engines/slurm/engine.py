@@ -20,12 +20,12 @@ import os
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from orchestrator.domain.hosts import Host
+from orchestrator.domain.hosts import Queued
 from orchestrator.engines.api import (
     Cause,
     EngineError,
@@ -69,7 +69,6 @@ class SlurmEngine:
     """A Slurm cluster, by the commands of this machine."""
 
     name = "slurm"
-    queues = True
     elastic = True
     images = False
 
@@ -83,8 +82,8 @@ class SlurmEngine:
         self._pending: dict[str, Future[str]] = {}
         """Submissions that are not answered, by gang."""
 
-    def capacity(self) -> Sequence[Host]:
-        return self._hosts.get()
+    def capacity(self) -> Queued:
+        return Queued(self._hosts.get())
 
     def plan(self, gang: Gang) -> Plan[Submission]:
         """With the whole script; the nodes' addresses are known when Slurm has placed them."""
@@ -132,7 +131,13 @@ class SlurmEngine:
         ends = _outcomes(run, facts, count)
         output = _said(facts)
         nodes = [_node(facts, job, output, index, ends.get(index)) for index in range(count)]
-        return [dataclasses.replace(node, stale=trouble) if node.running else node for node in nodes]
+        found = _MEETING.search(output)
+        names = json.loads(found[1])["nodes"] if found else []
+        hosts = [f"slurm/{names[_task(facts, index)]}" if names else "" for index in range(count)]
+        return [
+            dataclasses.replace(node, host=host, stale=trouble if node.running else "")
+            for node, host in zip(nodes, hosts, strict=True)
+        ]
 
     def stop(self, handle: Handle, grace: float) -> None:
         number, deadline, asked, killed = handle.facts["slurm"], time.monotonic() + grace, False, 0.0
@@ -259,7 +264,7 @@ def _queued(job: SlurmJob, trouble: str) -> NodeStatus:
 
 def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int, outcome: Outcome | None) -> NodeStatus:
     """How one node is, by its outcome, else by what srun says of its task, else by its job."""
-    task = 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
+    task = _task(facts, index)
     meeting = _MEETING.search(said)
     address = json.loads(meeting[1])["addresses"][task] if meeting else ""
     if outcome is not None:
@@ -284,6 +289,11 @@ def _node(facts: Mapping[str, Any], job: SlurmJob | None, said: str, index: int,
         return NodeStatus(NodePhase.ENDED, address, "Slurm has forgotten the job, and the node left no outcome")
     cause, exit_code, words = ending(job, facts["output"])
     return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code)
+
+
+def _task(facts: Mapping[str, Any], index: int) -> int:
+    """Number of a node's task: the main node is the first, the others follow by their index."""
+    return 0 if index == facts["main"] else index + (1 if index < facts["main"] else 0)
 
 
 def _among(task: int, tasks: str) -> bool:

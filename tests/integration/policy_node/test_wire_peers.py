@@ -138,7 +138,9 @@ def test_another_implementation_of_the_wire_drives_the_node_and_hears_it(running
         ZenohSession.get_instance().close()
 
 
-def test_what_the_node_says_is_read_by_another_cdr_reader_and_has_rmw_zenoh_s_attachment(running: Running) -> None:
+def test_messages_of_the_node_are_readable_by_another_cdr_reader_and_have_rmw_zenohs_attachment(
+    running: Running,
+) -> None:
     got: list[zenoh.Sample] = []
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="sensors")
@@ -202,7 +204,7 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
     assert running.process.poll() is None
 
 
-def test_a_silent_robot_is_told_and_a_reset_begins_a_fresh_episode_and_the_end_undeclares_everything(
+def test_a_silent_robot_is_reported_a_reset_starts_an_episode_and_the_end_undeclares_everything(
     running: Running,
 ) -> None:
     wait_for(lambda: "/joint_states is silent for" in running.said(), 20, "the watchdog")

@@ -66,7 +66,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
             lambda path: (path / "manifest.json").unlink(),
             "manifest.json is missing; name a bundle that `muster export` made",
         ),
-        (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is no manifest of a bundle"),
+        (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is not a bundle's manifest"),
         (
             lambda path: (path / "manifest.json").write_text(
                 (path / "manifest.json").read_text().replace("by-hand", "by-tool")

@@ -238,7 +238,7 @@ def test_the_weights_are_those_of_rsl_rls_own_runner(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_run_that_goes_on_from_its_checkpoint_ends_with_the_same_bits(name: str) -> None:
+def test_a_run_resumed_from_its_checkpoint_ends_bit_identical(name: str) -> None:
     algorithm, task = made(name)
     train(algorithm, task, 2)
     saved = save(algorithm, task)
@@ -252,7 +252,7 @@ def test_a_run_that_goes_on_from_its_checkpoint_ends_with_the_same_bits(name: st
     assert_same(fresh.state_dict(), task.state_dict())
 
 
-def test_what_is_kept_of_worlds_begins_with_their_index() -> None:
+def test_saved_state_of_worlds_has_their_index_as_its_first_dimension() -> None:
     kept = {
         "nothing": {},
         "GRU": {"actor.0": (8, 1, 8), "critic.0": (8, 1, 8)},
@@ -280,7 +280,7 @@ def test_the_recurrent_state_of_a_world_is_forgotten_where_its_episode_ended() -
     assert ended
 
 
-def test_weights_alone_leave_the_optimizer_as_it_was() -> None:
+def test_loading_only_weights_leaves_the_optimizer_unchanged() -> None:
     trained, task = made("RND")
     train(trained, task, 3)
     state = copy.deepcopy(dict(trained.state_dict()))

@@ -77,13 +77,13 @@ def test_a_change_of_a_run_has_the_text_of_the_file_whatever_is_in_it() -> None:
 
 
 @pytest.mark.parametrize("train", [_train() | {"task": "elsewhere.mine:Task"}, {"config": 3}, None])
-def test_where_no_field_is_known_to_name_a_file_nothing_is_read(train: Any) -> None:
+def test_no_file_is_read_for_fields_that_name_none(train: Any) -> None:
     if isinstance(train, dict) and "task" in train:
         train["config"] = {"reward_function": "missing.py"}
     assert with_files({"name": "other", "train": train}, "job.yaml") == {"name": "other", "train": train}
 
 
-def test_what_is_wrong_with_a_file_is_told_at_the_line_that_names_it(directory: Path) -> None:
+def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Path) -> None:
     (directory / "mine.py").write_text("import os\n" + GOOD)
     with pytest.raises(SpecError) as refused:
         specfile.load("job.yaml")
