@@ -114,6 +114,7 @@ def _sentence(text: str) -> str:
     return line.partition(" Rewards: see")[0]
 
 
+@cache
 def races(task: str) -> bool:
     """Whether a task drives on tracks."""
     kind = task_config(task)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +19,8 @@ from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.tracks import ask
 
 router = APIRouter()
+_AT_ONCE, _PATIENCE = threading.BoundedSemaphore(2), 20.0
+"""Processes that answer at once, and seconds for which the others wait."""
 
 
 @router.get("/tracks")
@@ -44,9 +47,13 @@ def picture(reconciler: Reconciler, name: str) -> bytes:
 
 
 def _ask(reconciler: Reconciler, order: Mapping[str, Any]) -> Any:
+    if not _AT_ONCE.acquire(timeout=_PATIENCE):
+        raise ClientError("other tracks are being drawn; try again in a moment", 429)
     try:
         return ask({**order, "store": str(reconciler.store.path)})
     except UsageError as error:
         raise ClientError(str(error), 404) from None
     except ServerError as error:
         raise ClientError(str(error), 503) from None
+    finally:
+        _AT_ONCE.release()
