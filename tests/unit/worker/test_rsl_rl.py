@@ -324,7 +324,7 @@ def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:
     pupil.load_teacher(teaching.state_dict())
     pupil.begin(0)
     assert_same(pupil.algorithm.teacher.state_dict(), dict(teaching.policy().state_dict()))
-    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; give .*") as refusal:
+    with pytest.raises(ValueError, match=r"^rsl_rl\.teacher: the weights do not fit; set .*") as refusal:
         build(task, section).load_teacher(teaching.state_dict())
     assert "\n" not in str(refusal.value)
     with pytest.raises(ValueError, match=r"^rsl_rl\.teacher_checkpoint: only Distillation has a teacher"):
