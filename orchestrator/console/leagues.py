@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import Depends, Query, Request, Response
@@ -16,11 +17,14 @@ from orchestrator.api.native import league_routes as api
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.league_routes import LEAGUE_TAG, MODEL_TAG
 from orchestrator.api.native.model_routes import list_models
+from orchestrator.api.permissions import current_identity
 from orchestrator.console.forms import Form, Question, done, sent_form
+from orchestrator.console.live import Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import races as races_of
 from orchestrator.console.tracks import track_names
+from orchestrator.domain.job import Status
 from shared_store.leagues import moment
 from shared_store.races import clock
 from shared_store.standings import RANKINGS
@@ -30,6 +34,9 @@ router = page_router()
 
 _RACES = 20
 """Races under way, or over and not entered, that a league's page shows."""
+_INTERVAL = 2.0
+"""Seconds between two looks at them; each reads all entries."""
+_recent = Recent(_INTERVAL * 0.9)
 _Body = TypeVar("_Body", bound=BaseModel)
 
 
@@ -75,8 +82,18 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
         rows=rows,
         every=every,
         models=models,
-        races=_races(request, name),
+        races=list(_races(request, name).values()),
+        blank=_race({}, ""),
     )
+
+
+@router.get("/leagues/{name}/stream")
+def race_stream(request: Request, name: str) -> Response:
+    """What changes in the list of races."""
+    rows = Rows()
+    look = partial(_races, request, name)
+    api.read_league(request, name)
+    return stream(request, lambda: rows.changes(_recent.get((current_identity.get(), name), look), {}), _INTERVAL)
 
 
 @router.post("/leagues/{name}/races")
@@ -198,18 +215,29 @@ def _rules(league: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _races(request: Request, name: str) -> list[dict[str, Any]]:
-    """The newest races of a league that the caller may see, without those that are entered."""
+def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
+    """The newest races of a league that the caller may see, by job, without those that are entered."""
     reconciler = reconciler_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
     jobs = page_of_jobs(reconciler, Wanted(search=begins), 0, _RACES)["jobs"]
     if not jobs:
-        return []
+        return {}
     described = batch.call(reconciler, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = api.entered_jobs(request, name)
-    return [
-        {**job, "model": tags[job["id"]][MODEL_TAG], "reason": job.get("statusReason") or ""}
-        for job in jobs
-        if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered
-    ]
+    ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]
+    return {job["id"]: _race(job, str(tags[job["id"]].get(MODEL_TAG))) for job in ours}
+
+
+def _race(job: Mapping[str, Any], model: str) -> dict[str, Any]:
+    """The texts of a race's row; all empty for the row that scripts copy."""
+    status = job.get("status", "")
+    return {
+        "id": job.get("id", ""),
+        "short": job.get("id", "")[:8],
+        "link": f"/jobs/{job['id']}" if job else "/",
+        "model": model,
+        "status": status,
+        "reason": (job.get("statusReason") or "") if status != Status.SUCCEEDED else "",
+        "driven": "yes" if status == Status.SUCCEEDED else "",
+    }

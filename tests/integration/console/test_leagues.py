@@ -26,6 +26,13 @@ def store(console: Console) -> Store:
     return store
 
 
+def driven(page: Page) -> list[str]:
+    """The jobs of the races that can be entered."""
+    forms = page.all("form", action="/leagues/cup/entries")
+    jobs = [str(each.get("value", "")) for each in page.all("input", name="job")]
+    return [job for form, job in zip(forms, jobs, strict=True) if "hidden" not in form]
+
+
 def test_leagues_are_listed_with_their_rules_and_their_table(console: Console, store: Store) -> None:
     visitor = console.visitor("reader")
     page = visitor.page("/leagues")
@@ -73,13 +80,25 @@ def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Consol
     started = visitor.submit("/leagues/cup/races", model="fast@2", racer="O'Neil").json()
     assert started["location"] == "/leagues/cup" and "submitted the race of fast@2" in started["message"]
     page = visitor.page("/leagues/cup")
-    (link,) = [str(each["href"]) for each in page.all("a") if str(each.get("href")).startswith("/jobs/")]
+    (link,) = [
+        str(each["href"])
+        for each in page.all("a")
+        if str(each.get("href")).startswith("/jobs/") and each["href"] != "/jobs/"
+    ]
     job = link.removeprefix("/jobs/")
     assert "Races that are not entered" in page.text and "fast@2" in page.text
-    assert page.all("form", action="/leagues/cup/entries") == [], "it has not ended"
+    assert driven(page) == [], "it has not ended"
     early = visitor.submit("/leagues/cup/entries", model="fast@2", job=job)
     assert early.status_code == 409 and "only a race that has SUCCEEDED is entered" in early.json()["message"]
+    stream = visitor.events("/leagues/cup/stream")
+    _, first, _ = next(stream)
+    assert first["order"] == [job] and first["rows"][job]["driven"] == ""
     console.client.batch("TerminateJob", jobId=job, reason=HOSTILE)
+    changed: dict[str, str] = {}
+    while changed.get("status") != "FAILED":
+        changed |= next(stream)[1].get("rows", {}).get(job, {})
+    assert changed["reason"] == HOSTILE
+    stream.close()
     wait_for(lambda: console.client.get(f"/api/jobs/{job}")["status"] == "FAILED", 30, "the job's end")
     page = visitor.page("/leagues/cup")
     assert HOSTILE in page.text and page.is_inert
@@ -102,11 +121,11 @@ def test_what_has_succeeded_is_entered_for_good(console: Console, store: Store) 
         run.evaluations / f"{evaluation_name('00000007-e1', job)}.json", summary(race([11.0, 11.5, 12.0]), job=job)
     )
     page = visitor.page("/leagues/cup")
-    assert [each["value"] for each in page.all("input", name="job")] == [job]
+    assert driven(page) == [job]
     entered = visitor.submit("/leagues/cup/entries", model="fast@2", job=job, racer="O'Neil")
     assert entered.json() == {"location": "/leagues/cup/entries/3", "message": "entry 3 of cup"}
     page = visitor.page("/leagues/cup")
-    assert "1 3 O'Neil fast@2 0:34.500" in page.text and page.all("input", name="job") == []
+    assert "1 3 O'Neil fast@2 0:34.500" in page.text and driven(page) == []
     shown = visitor.page("/leagues/cup/entries/3")
     assert "are as they were entered" in shown.text and f"/jobs/{job}" in [each.get("href") for each in shown.all("a")]
 
