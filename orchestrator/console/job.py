@@ -32,7 +32,7 @@ from shared_store.metrics import history_of, sampled
 
 router = page_router()
 
-_recent = Recent(1.0)
+_recent = Recent()
 _RECORDS = 200
 """Iterations that one event brings; a page that has missed more reads its curves again."""
 _CHILDREN = 100
