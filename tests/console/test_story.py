@@ -41,8 +41,8 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     page = person.page
     job = submit(person, "Cartpole", SMALL)
     watches_the_curve_grow(person)
-    reads_the_log(person)
     person.picture("job")
+    reads_the_log(person)
     saves_and_stops(person)
     resumed = resumes(person)
     server.client.batch("TerminateJob", jobId=resumed, reason="seen")
@@ -67,6 +67,9 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     person.click("Verify")
     expect(page.locator("main")).to_contain_text("Every file is as it was registered.")
     person.picture("model")
+    page.goto("/")
+    expect(page.locator("tr[data-key]")).to_have_count(5)
+    person.picture("jobs")
 
 
 def watches_the_curve_grow(person: Person) -> None:
