@@ -33,11 +33,13 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, device_name, wait
 from worker.simulation.capture import CapturedStep
 from worker.simulation.episodes import STEP
+from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan
 from worker.simulation.sensors.imu import Imu
 from worker.simulation.sensors.momentum import AngularMomentum
+from worker.simulation.sensors.rays import LidarPattern, RayCaster
 from worker.tasks import find_task, terms
 from worker.tasks.compiler import Kernels, further
 from worker.tasks.declaration import Declaration, Metric, Observation
@@ -64,6 +66,16 @@ def sensors(task: str) -> dict[str, Any]:
         "imu": Imu(body=trunk),
         "momentum": AngularMomentum(),
         "heights": HeightScan(bodies=trunk),
+    }
+
+
+def eyes(task: str) -> dict[str, Any]:
+    """What follows rays, which costs so much more that it is measured by itself alone."""
+    trunk, pixels = TRUNKS[task], {"width": 64, "height": 64}
+    return {
+        "rays_64": RayCaster(body=trunk, pattern=LidarPattern(count=64), start=0.5),
+        "depth_64x64": CameraSensor(body=trunk, kind="depth", **pixels),
+        "colour_64x64": CameraSensor(body=trunk, **pixels),
     }
 
 
@@ -165,8 +177,13 @@ TERMS = ("reward of the root", "reward of each joint", "observation of each join
 def measure(name: str, worlds: int) -> dict[str, Any]:
     """Seconds of a control step and of its parts, of each sensor, of a term."""
     plain = made(find_task(name), worlds)
-    added = {key: each for key, each in sensors(name).items()}
-    sensed = made(varied(name, lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})), worlds)
+
+    def with_sensors(added: dict[str, Any]) -> DeclaredTask:
+        change = lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})  # noqa: E731
+        return made(varied(name, change), worlds)
+
+    added, looking = sensors(name), eyes(name)
+    sensed, seeing = with_sensors(added), with_sensors(looking)
     graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._whole, DEVICE).launch}
     # both on the same worlds, since the solver's work depends on their state
     graphs["step, sensed"] = CapturedStep(sensed._whole, DEVICE).launch
@@ -174,6 +191,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
         graphs["step, unmeasured"] = CapturedStep(sensed._whole, DEVICE).launch
     graphs |= {part: copies(launch) for part, launch in parts(plain).items()}
     graphs |= {f"sensor {key}": copies(measured(sensed.sensors[key])) for key in added}
+    graphs |= {f"sensor {key}": copies(measured(seeing.sensors[key])) for key in looking}
     for term in TERMS:
         crowd = parts(made(varied(name, lambda given, term=term: more(term, given)), worlds))  # type: ignore[misc]
         graphs[f"term {term}"] = copies(lambda crowd=crowd: (crowd["judge"](), crowd["observe"]()))  # type: ignore[misc]
@@ -191,7 +209,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     started = time.perf_counter()
     Kernels(name, plain.plan, plain._needs.apart)
     columns = {key: len(sensed.sensors[key].names) for key in added}
-    return {"times": times, "text": time.perf_counter() - started, "columns": columns}
+    return {"times": times, "text": time.perf_counter() - started, "columns": columns, "eyes": [*looking]}
 
 
 def compiled(name: str, worlds: int) -> dict[str, Any]:
@@ -247,7 +265,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         "## Sensors",
         "",
         "Each by itself, measured once a control step; a contact sensor that is `fine` takes its cost in every physics step. Those that "
-        "look at bodies need their poses as well. All of them: the step with them, poses included, less the step without.",
+        "look at bodies need their poses as well. All of them: the step with them, poses included, less the step without. Those that "
+        "follow rays come after them, and are not among them.",
         "",
         "| task | sensor | columns | [µs] | of a step |",
         "|---|---|--:|--:|--:|",
@@ -261,6 +280,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         lines.append(
             f"| {row['task']} | all of them | {sum(row['columns'].values())} | {1e6 * took:.1f} | {took / step:+.2%} |"
         )
+        for key in row["eyes"]:
+            took = times[f"sensor {key}"]
+            lines.append(f"| {row['task']} | {key} | | {1e6 * took:.1f} | {took / step:.2%} |")
     lines += [
         "",
         "## A term",

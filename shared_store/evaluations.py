@@ -127,20 +127,20 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
     for place, value in flattened(_mapping(summary, "config")):
         yield f"  with config.{place}: {value}"
-    yield f"{'':20} {'mean':>10} {'95 % interval':>24} {'std':>10}"
+    rewards, metrics = _mapping(summary, "rewards"), _mapping(summary, "metrics")
+    largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
+    terms = {f"reward {name}": _mapping(rewards, name) for name in largest[:TERMS_SHOWN]}
+    terms |= {f"metric {name}": _mapping(metrics, name) for name in metrics}
+    width = max(map(len, [*terms, 20 * " "]))
+    yield f"{'':{width}} {'mean':>10} {'95 % interval':>24} {'std':>10}"
     success = _mapping(summary, "success")
     if success:
         ends = f"{_percent(success.get('low'))} to {_percent(success.get('high'))}"
-        yield f"{'success':20} {_percent(success.get('share')):>10} {ends:>24} {'':10}  {summary.get('success_is', '')}"
-    yield _row("return", _mapping(summary, "return"))
-    yield f"{_row('length', _mapping(summary, 'length'))}  of at most {summary['max_length']}"
-    rewards = _mapping(summary, "rewards")
-    largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
-    for name in largest[:TERMS_SHOWN]:
-        yield _row(f"reward {name}", _mapping(rewards, name))
-    metrics = _mapping(summary, "metrics")
-    for name in metrics:
-        yield _row(f"metric {name}", _mapping(metrics, name))
+        yield f"{'success':{width}} {_percent(success.get('share')):>10} {ends:>24} {'':10}  {summary.get('success_is', '')}"
+    yield _row("return", _mapping(summary, "return"), width)
+    yield f"{_row('length', _mapping(summary, 'length'), width)}  of at most {summary['max_length']}"
+    for name, figures in terms.items():
+        yield _row(name, figures, width)
     causes = _mapping(summary, "causes")
     ends = ", ".join(f"{name} {_mapping(causes, name).get('count')}" for name in causes)
     yield f"ended by: {ends}"
@@ -170,9 +170,9 @@ def _comparison(compared: Mapping[str, Any]) -> str:
     )
 
 
-def _row(name: str, figures: Mapping[str, Any]) -> str:
+def _row(name: str, figures: Mapping[str, Any], width: int) -> str:
     ends = f"{_number(figures.get('low'))} to {_number(figures.get('high'))}" if figures.get("low") is not None else "-"
-    return f"{name:20} {_number(figures.get('mean')):>10} {ends:>24} {_number(figures.get('std')):>10}"
+    return f"{name:{width}} {_number(figures.get('mean')):>10} {ends:>24} {_number(figures.get('std')):>10}"
 
 
 def _mapping(found: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 import threading
 import time
@@ -42,8 +41,9 @@ from orchestrator.engines.slurm.commands import Hosts, Jobs, SlurmJob, Unreachab
 from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import OUT_OF_MEMORY, ended
-from shared_store.layout import Run, Store
-from shared_store.outcomes import Outcome, read_outcome
+from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
+from shared_store.layout import Store
+from shared_store.outcomes import Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """What sbatch says where it would take the job later."""
@@ -93,14 +93,7 @@ class SlurmEngine:
 
     def launch(self, plan: Plan[Submission]) -> Handle:
         gang = plan.gang
-        facts = {
-            "job": gang.job,
-            "attempt": gang.attempt,
-            "run": gang.run,
-            "store": gang.store,
-            "main": gang.main,
-            "output": plan.request.output,
-        }
+        facts = {**store_facts(gang), "main": gang.main, "output": plan.request.output}
         patience = 0.0 if self._pending else _PATIENCE
         if gang.name not in self._pending:
             if trouble := self._jobs.away():
@@ -127,8 +120,7 @@ class SlurmEngine:
         trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
         if job is not None and job.state in QUEUED:
             return [_queued(job, trouble)] * count
-        run = Store(facts["store"]).run(facts["run"])
-        ends = _outcomes(run, facts, count)
+        ends = all_recorded(handle)
         output = _said(facts)
         nodes = [_node(facts, job, output, index, ends.get(index)) for index in range(count)]
         found = _MEETING.search(output)
@@ -239,21 +231,6 @@ def _said(facts: Mapping[str, Any]) -> str:
         return Path(facts["output"]).read_text(errors="replace")
     except FileNotFoundError:
         return ""
-
-
-def _outcomes(run: Run, facts: Mapping[str, Any], nodes: int) -> dict[int, Outcome]:
-    """By node index; one look at the folder, however many nodes there are."""
-    try:
-        names = set(os.listdir(run.outcome(facts["job"], facts["attempt"], 0).parent))
-    except FileNotFoundError:
-        return {}
-    found = {}
-    for index in range(nodes):
-        if run.outcome(facts["job"], facts["attempt"], index).name in names:
-            outcome = read_outcome(run, facts["job"], facts["attempt"], index)
-            if outcome is not None:
-                found[index] = outcome
-    return found
 
 
 def _queued(job: SlurmJob, trouble: str) -> NodeStatus:

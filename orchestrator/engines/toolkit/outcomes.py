@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,17 @@ def store_facts(gang: Gang) -> dict[str, Any]:
 def recorded(handle: Handle, index: int) -> Outcome | None:
     """The outcome of a node; None if the store has none yet. Raises OSError."""
     return read_outcome(_run(handle), handle.facts["job"], handle.facts["attempt"], index)
+
+
+def all_recorded(handle: Handle) -> dict[int, Outcome]:
+    """Those of a gang by node index, with one look at their folder however many nodes there are. Raises OSError."""
+    run, job, attempt = _run(handle), handle.facts["job"], handle.facts["attempt"]
+    try:
+        names = set(os.listdir(run.outcome(job, attempt, 0).parent))
+    except FileNotFoundError:
+        return {}
+    there = [index for index in range(handle.nodes) if run.outcome(job, attempt, index).name in names]
+    return {index: outcome for index in there if (outcome := recorded(handle, index)) is not None}
 
 
 def seen(handle: Handle, index: int, code: int, reason: str, at: float, asked: bool = False) -> Outcome:

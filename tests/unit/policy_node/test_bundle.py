@@ -108,7 +108,7 @@ def test_a_policy_that_acts_otherwise_than_it_was_trained_is_refused(tmp_path: P
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda found: found.update(format=9), "has format 9, this node reads up to 2; upgrade muster-policy"),
+        (lambda found: found.update(format=9), "has format 9, this node reads up to 3; upgrade muster-policy"),
         (lambda found: found.pop("actions"), "actions is missing; export the policy again"),
         (lambda found: found.update(control_hz=0), "control_hz is 0; export the policy again"),
         (lambda found: found.update(groups=7), "it is no policy contract"),

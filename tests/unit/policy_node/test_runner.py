@@ -174,7 +174,7 @@ def test_each_kind_of_command_is_a_message_of_its_own_with_the_robot_s_names() -
     [
         (
             {"discrete": True, "actions": (), "action_names": ("left", "right")},
-            "the policy chooses among left, right",
+            "the policy does not say what its actions are: left, right",
         ),
         ({"actions": (), "action_names": ("knee",)}, "the policy does not say what its actions are: knee"),
         (

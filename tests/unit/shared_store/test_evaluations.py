@@ -143,6 +143,12 @@ def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> Non
     told = "\n".join(lines({**FIGURES, **whole}))
     assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
     assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
+    term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
+    rows = list(lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}}))
+    heading = next(row for row in rows if row.endswith("std"))
+    assert {len(row) for row in rows if row.startswith(("reward", "metric", "return"))} == {len(heading)}, (
+        "columns stand"
+    )
 
 
 def test_changes_reach_into_sections_and_an_empty_section_replaces_one() -> None:

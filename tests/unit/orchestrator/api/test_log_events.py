@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orchestrator.api.logs import events as log_events
@@ -87,6 +87,7 @@ _BRANCHES = st.tuples(
 ).map("".join)
 
 
+@settings(max_examples=200, deadline=None)
 @given(st.lists(_BRANCHES, min_size=1, max_size=3).map("|".join).filter(bool), st.text("ab1-.] _", max_size=8))
 def test_a_regex_means_what_it_means_in_python(regex: str, line: str) -> None:
     assert parse(f"%{regex}%")(line) == (re.search(regex, line, re.ASCII | re.DOTALL) is not None)

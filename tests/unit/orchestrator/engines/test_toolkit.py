@@ -12,7 +12,7 @@ from orchestrator.engines.testing.rigs import make_gang
 from orchestrator.engines.toolkit import log_copy
 from orchestrator.engines.toolkit.environment import PRIVATE, inherited
 from orchestrator.engines.toolkit.log_copy import LogCopy
-from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from orchestrator.engines.toolkit.outcomes import all_recorded, log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.layout import Store
 from shared_store.log_files import LIMIT, LogWriter
@@ -43,11 +43,11 @@ def handle(tmp_path: Path) -> Handle:
 
 
 def test_the_outcome_of_a_node_is_written_once_and_not_over_a_supervisor_s(handle: Handle) -> None:
-    assert recorded(handle, 1) is None
+    assert recorded(handle, 1) is None and all_recorded(handle) == {}
     record(handle, seen(handle, 1, 3, "", 1e9))
     record(handle, seen(handle, 1, 0, "later", 2e9))
     found = recorded(handle, 1)
-    assert found is not None
+    assert found is not None and all_recorded(handle) == {1: found}
     assert (found.exit_code, found.reason, found.ended) == (3, "container exited with code 3", 1e9)
     assert seen(handle, 0, 0, "", 1e9).reason == "done" and seen(handle, 0, 137, "OOM", 1e9).reason == "OOM"
 

@@ -80,6 +80,9 @@ MISSING = {
     f"{COMMAND}{TRAIN}\n": (
         "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
     ),
+    f"{COMMAND}train: {{task: Ant}}\n": (
+        "job.yaml: expected exactly one of train, evaluate, race, export, record, render, command; found train and command"
+    ),
     "name: a\ntrain: {worlds: 4, iterations: 2}\n": "job.yaml:2: train.task: is required",
     "name: a\nevaluate: {}\n": "job.yaml:2: evaluate.run: is required",
     "name: a\nrace: {laps: 3}\n": "job.yaml:2: race.laps: unknown key; valid here: "
