@@ -14,9 +14,11 @@ from orchestrator.api.context import Context
 from orchestrator.api.errors import ClientError
 from orchestrator.api.http import limits
 from orchestrator.api.racing_tracks import check_tracks
+from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import gang_needs
+from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import Spec
@@ -96,3 +98,13 @@ def submit(
     job = context.session.get(Job, answer["jobId"])
     assert job is not None
     return answer, job
+
+
+def submit_alone(reconciler: Reconciler, spec: Spec, directory: str, what: str) -> dict[str, Any]:
+    """:func:`submit` of a job that neither continues nor begins a run, and its commit. Raises ClientError."""
+    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    reconciler.check_writable(adds=True)
+    with reconciler.writing, reconciler.database.session() as session:
+        answer, _ = submit(Context(session, reconciler), spec, directory, what, {})
+    reconciler.wake()
+    return answer
