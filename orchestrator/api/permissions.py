@@ -106,6 +106,7 @@ class Operation(StrEnum):
     READ_DOCUMENTATION = "GET /api/docs"
     READ_MONITORING = "GET /metrics"
     READ_CAPACITY = "GET /api/capacity"
+    READ_QUEUES = "GET /api/queues"
     PLAN = "POST /api/plan"
     FIT = "POST /api/fit"
     FIND_JOBS = "GET /api/jobs"

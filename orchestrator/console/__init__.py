@@ -40,7 +40,7 @@ from fastapi import FastAPI
 
 from orchestrator.console import assets, routing
 
-PAGES = ("login", "jobs")
+PAGES = ("login", "jobs", "queues")
 """Modules of this package, each with a ``router``."""
 
 

@@ -20,7 +20,7 @@ from orchestrator.engines.api import (
     Plan,
     read_handle,
 )
-from orchestrator.engines.runner import Runner
+from orchestrator.engines.runner import Health, Runner
 from orchestrator.engines.secrets import Secrets, SecretsError
 
 FRESH = 2.0
@@ -86,6 +86,10 @@ class EngineSet:
             if runner := self._runners.get(name):
                 hosts += runner.capacity(max(0.0, deadline - time.monotonic()))
         return hosts
+
+    def health(self) -> Mapping[str, Health]:
+        """How each engine answers, by its name."""
+        return {name: runner.health for name, runner in self._runners.items()}
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""

@@ -25,7 +25,15 @@ from orchestrator.api.context import controller_of, permitted_run, queue_names
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.native import job_list, league_routes, model_routes, run_routes, runs, webhook_routes
+from orchestrator.api.native import (
+    job_list,
+    league_routes,
+    model_routes,
+    queue_overview,
+    run_routes,
+    runs,
+    webhook_routes,
+)
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.sources import sources_of
 from orchestrator.control.bus import BusError
@@ -50,6 +58,7 @@ from shared_store.logs import LogFollower, LogLine, timestamp
 
 router = APIRouter(prefix="/api")
 router.include_router(job_list.router)
+router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
