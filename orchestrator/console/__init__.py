@@ -40,7 +40,7 @@ from fastapi import FastAPI
 
 from orchestrator.console import assets, routing
 
-PAGES = ("login", "jobs", "queues")
+PAGES = ("login", "jobs", "curves", "queues", "runs", "compare")
 """Modules of this package, each with a ``router``."""
 
 

@@ -1,0 +1,114 @@
+"""The curves of a run as pages draw them: a window of its metrics, thinned here, however long the history is.
+
+``GET /runs/{name}/curves`` answers ``{"iterations": [...], "series": {name: [...]}, "last": n, "first": n}``: the series have a value
+(or null) for each of the iterations, which rise. ``from`` and ``to`` are a window of iterations, ``points`` the most of them that are
+wanted, and each ``name`` a metric, or a group of them with a ``*`` at its end (``reward_*``); all numbers where no name is given.
+``env_steps``, ``total_seconds`` and ``time`` are metrics too, and serve as the other axis.
+
+``static/curves.js`` draws them::
+
+    import { Chart, read } from "./curves.js";
+    const chart = new Chart(figure, { label: "Reward", isStacked: false });    // figure: an empty <figure>
+    chart.draw({ x: [1, 2], xLabel: "iteration", lines: [{ name: "seed 1", y: [0.1, null], low: [0, 0], high: [1, 1] }] });
+    figure.addEventListener("window", (event) => event.detail);                // {from, to} of x that a person chose; null: everything
+    const curves = await read("/runs/NAME/curves", { names: ["reward"], from: 1, to: 900, points: 400 });
+
+The first six lines differ in colour, further ones in their dashes as well; a line with ``low`` and ``high`` has a band between them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from fastapi import Query, Request
+
+from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.console.live import Recent
+from orchestrator.console.routing import page_router
+from shared_store.layout import Run
+from shared_store.metrics import history_of, sampled
+
+router = page_router()
+
+POINTS = 300
+"""Of a curve, by default; a chart is seldom wider than that many points two pixels apart."""
+_MOST_POINTS = 1000
+_MOST_READ = 4000
+"""Records that are read for an answer."""
+_recent = Recent()
+
+
+@router.get("/runs/{name}/curves")
+def run_curves(
+    request: Request,
+    name: str,
+    names: list[str] = Query(default=[], alias="name", max_length=100),
+    begin: int = Query(default=0, alias="from", ge=0, lt=2**53),
+    end: int | None = Query(default=None, alias="to", ge=0, lt=2**53),
+    points: int = Query(default=POINTS, ge=2, le=_MOST_POINTS),
+) -> dict[str, Any]:
+    """A window of a run's metrics."""
+    run = permitted_run(controller_of(request), name, Operation.READ_METRICS)
+    key = (str(run.path), tuple(names), begin, end, points)
+    try:
+        return _recent.get(key, partial(curves_of, run, names, begin, end, points))
+    except OSError as error:
+        raise ClientError(f"the metrics of run {run.name} can't be read now: {error.strerror or error}", 503) from None
+
+
+def curves_of(
+    run: Run, names: Sequence[str] = (), begin: int = 0, end: int | None = None, points: int = POINTS
+) -> dict[str, Any]:
+    """What the route answers; reads at most 4000 records. Raises OSError.
+
+    Args:
+        run: The run.
+        names: Metrics, or groups ending on ``*``; all where empty.
+        begin: First iteration.
+        end: Last iteration; the newest where None.
+        points: Iterations that are answered at most; the first and the last of the window are among them.
+    """
+    newest = history_of(run).last() or {}
+    last = int(newest.get("iteration") or 0)
+    until = last if end is None else min(end, last)
+    count = until - begin + 1
+    if count <= 0:
+        records = []
+    elif count <= _MOST_READ and (begin > 1 or count < points):
+        records = history_of(run).after(begin - 1, count)
+    else:
+        records = sampled(run, min(_MOST_READ, points * math.ceil(last / count)))
+    records = thinned([each for each in records if begin <= each["iteration"] <= until], points)
+    wanted = names or sorted({name for each in records for name in each if name != "iteration"})
+    return {"first": begin, "last": last, **columns(records, wanted)}
+
+
+def thinned(records: Sequence[Mapping[str, Any]], points: int) -> list[Mapping[str, Any]]:
+    """At most so many of the records, evenly spread, the first and the last among them."""
+    if len(records) <= points:
+        return list(records)
+    return [records[round(i * (len(records) - 1) / (points - 1))] for i in range(points)]
+
+
+def columns(records: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, Any]:
+    """``iterations``, and of each metric that has numbers its values in ``series``; a group's name ends on ``*``."""
+    known = {name for each in records for name in each if name != "iteration"}
+    wanted: dict[str, None] = {}
+    for name in names:
+        fitting = sorted(each for each in known if each.startswith(name[:-1])) if name.endswith("*") else [name]
+        wanted |= dict.fromkeys(fitting)
+    series = {name: [number(each.get(name)) for each in records] for name in wanted if name in known}
+    there = {name: values for name, values in series.items() if any(value is not None for value in values)}
+    return {"iterations": [each["iteration"] for each in records], "series": there}
+
+
+def number(value: Any) -> float | None:
+    """The value in six digits, where it is a finite number, and no truth value."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return value if isinstance(value, int) or abs(value) > 1e6 else float(f"{value:.6g}")
