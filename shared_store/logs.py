@@ -21,8 +21,10 @@ from shared_store.layout import Run
 from shared_store.log_files import Chunk, Segment, left_out, log_segments, read_log
 
 _LINE = re.compile(r"(\S+) (-|\d{1,9}) ([oe]) (.*)", re.DOTALL)
-_LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
-_HEAD = re.compile(r"node-([0-9]{1,9})\.log")
+LINES = re.compile(rb"^(\S+) (-|\d{1,9}) ([oe]) (.*)\n", re.MULTILINE)
+"""Whole lines of a file: time, rank, stream, text."""
+HEAD = re.compile(r"node-([0-9]{1,9})\.log")
+"""Name of a log's first file."""
 _ATTEMPT = re.compile(r"[0-9]{1,9}")
 _CHUNK = 1 << 20
 """Bytes that a poll reads of a log; fewer with many nodes."""
@@ -128,9 +130,9 @@ class _Source:
         if self.inside:
             whole = len(chunk.data)
         if chunk.left_out or chunk.replaced:
-            first = _LINES.search(chunk.data, 0, whole)
+            first = LINES.search(chunk.data, 0, whole)
             self._explain(chunk, first[1].decode(errors="replace") if first else timestamp(time.time()))
-        for match in _LINES.finditer(chunk.data, 0, whole):
+        for match in LINES.finditer(chunk.data, 0, whole):
             written, number, stream, text = match.groups()
             stamp = written.decode(errors="replace")
             if stamp > self.newest:
@@ -180,7 +182,7 @@ class LogFollower:
         """The whole lines since the last call, or the first few MiB of them, in the order of their times."""
         lines: list[LogLine] = []
         self.behind = False
-        for attempt in [self.attempt] if self.attempt is not None else _attempts(self.run, self.job):
+        for attempt in [self.attempt] if self.attempt is not None else attempts_with_logs(self.run, self.job):
             logs = self._logs(attempt)
             most = min(_CHUNK, max(_LEAST_CHUNK, _MOST // max(1, len(logs))))
             for source, segments in logs:
@@ -215,7 +217,7 @@ class LogFollower:
         found = log_segments(self.run.logs(self.job, attempt))
         logs = []
         for name, segments in found.items():
-            match = _HEAD.fullmatch(name)
+            match = HEAD.fullmatch(name)
             if match and (self.node is None or int(match[1]) == self.node):
                 key = f"{attempt}/{int(match[1])}"
                 if key not in self._sources:
@@ -225,7 +227,7 @@ class LogFollower:
         return sorted(logs, key=lambda log: log[0].node)
 
 
-def _attempts(run: Run, job: str) -> list[int]:
+def attempts_with_logs(run: Run, job: str) -> list[int]:
     """The attempts that have a log. Other files, which a job may have put there, are ignored. Raises OSError."""
     directory = run.path / "logs" / job
     try:

@@ -79,7 +79,7 @@ class PlanRequest(BaseModel):
     queue: str = "default"
 
 
-def _job(session: Session, reference: str, operation: Operation) -> Job:
+def permitted_job(session: Session, reference: str, operation: Operation) -> Job:
     """The job, where the caller may do this to it. Raises ClientError."""
     job = find_job(session, reference, permissions.visible_queues())
     if job is None:
@@ -239,7 +239,7 @@ def job_detail(request: Request, reference: str) -> Any:
     """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results."""
     controller = controller_of(request)
     with controller.database.session() as session:
-        job = _job(session, reference, Operation.READ_JOB)
+        job = permitted_job(session, reference, Operation.READ_JOB)
         run = controller.store.run(job.run)
         owner = owner_of(session, run)
         is_visible = owner is not None and permissions.is_visible(owner)  # a job may continue a run of another queue
@@ -289,21 +289,21 @@ def job_logs(
     """
     controller = controller_of(request)
     with controller.database.session() as session:
-        job = _job(session, reference, Operation.READ_JOB_LOGS)
+        job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
         with reading(job):
             count = len(job.gang.nodes)
         if node is not None and not 0 <= node < count:
             raise ClientError(
                 f"job {job.name} ({job.id[:8]}) has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, _positions(positions))
+        follower = LogFollower(controller.store.run(job.run), job.id, node, rank, attempt, positions_of(positions))
         job_id = job.id
     lines: AsyncIterator[str] | Iterator[str]
     lines = _follow(controller, job_id, follower, request.app.state.closing) if follow else _stored(follower)
     return StreamingResponse(lines, media_type="application/x-ndjson")
 
 
-def _positions(text: str) -> dict[str, int]:
+def positions_of(text: str) -> dict[str, int]:
     """Raises ClientError."""
     try:
         given = json.loads(text)
@@ -333,7 +333,7 @@ def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
 def _running(controller: Controller, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
     """Id, attempt and nodes of a running job. Raises ClientError."""
     with controller.database.session() as session:
-        job = _job(session, reference, operation)
+        job = permitted_job(session, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
             raise ClientError(f"job {job.name} ({job.id[:8]}) is {job.status}, not RUNNING", CONFLICT)

@@ -1,5 +1,5 @@
 // Puts texts of the server where the templates' bound(...) said. Nothing here ever becomes markup.
-const ATTRIBUTES = new Set(["href", "title", "value", "max", "points", "datetime", "aria-label", "min", "label"]);
+const ATTRIBUTES = new Set(["href", "title", "value", "max", "points", "datetime", "aria-label", "min", "label", "x", "width"]);
 
 /** Renew every bound part of `root` whose field is in `record`. */
 export function fill(root, record) {

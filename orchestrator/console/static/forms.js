@@ -61,7 +61,7 @@ export function startForms() {
     const button = event.submitter;
     const fields = new FormData(form, button);
     if (button) button.disabled = true; // a second click sends nothing twice
-    const told = await send(form.getAttribute("action"), fields);
+    const told = await send(button?.getAttribute("formaction") ?? form.getAttribute("action"), fields);
     if (button) button.disabled = false;
     if (told) follow(told, form);
   });

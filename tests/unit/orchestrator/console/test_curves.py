@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def test_a_long_history_is_thinned_to_points_from_its_first_iteration_to_its_las
     found = curves_of(long_run, ["reward"], points=300)
     iterations = found["iterations"]
     assert len(iterations) <= 300 and iterations[0] <= 50 and iterations[-1] == found["last"] == 10_000
-    assert max(b - a for a, b in zip(iterations, iterations[1:], strict=False)) <= 100
+    assert max(b - a for a, b in pairwise(iterations)) <= 100
     assert found["series"]["reward"] == iterations
 
 
@@ -41,7 +42,7 @@ def test_a_long_history_is_thinned_to_points_from_its_first_iteration_to_its_las
 def test_a_window_has_its_own_points(long_run: Run, begin: int, end: int, step: int) -> None:
     iterations = curves_of(long_run, ["reward"], begin, end, 300)["iterations"]
     assert begin <= iterations[0] <= begin + step and end - step <= iterations[-1] <= end
-    assert max(b - a for a, b in zip(iterations, iterations[1:], strict=False)) <= step
+    assert max(b - a for a, b in pairwise(iterations)) <= step
 
 
 def test_a_window_beyond_the_end_is_empty(long_run: Run) -> None:

@@ -1,0 +1,185 @@
+"""The page of a job: why it waits, how it learns, its attempts, its log, its checkpoints, its configuration and its files; live."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.responses import RedirectResponse
+
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.routes import job_detail
+from orchestrator.api.permissions import Operation, current_identity
+from orchestrator.console.curves import columns
+from orchestrator.console.job_config import before_it, differences, text_of
+from orchestrator.console.job_facts import attempts_of, checkpoints_of, facts_of
+from orchestrator.console.job_log import ChosenLog, LiveLog
+from orchestrator.console.live import Event, Recent, Rows, last_id, stream
+from orchestrator.console.pages import render
+from orchestrator.console.routing import page_router
+from orchestrator.console.run_files import File, files_of
+from orchestrator.control.reconciler import Controller
+from orchestrator.persistence.queries import short_id
+from shared_store.files import DamagedFile
+from shared_store.layout import Run
+from shared_store.metrics import history_of
+
+router = page_router()
+
+_recent = Recent(1.0)
+_RECORDS = 200
+"""Iterations that one event brings; a page that has missed more reads its curves again."""
+_CHILDREN = 100
+"""Jobs of an array that its page names."""
+
+
+@router.get("/jobs/{reference}")
+def job(request: Request, reference: str) -> Response:
+    """The page; by a name or the start of an id, the way to it."""
+    controller = controller_of(request)
+    detail = job_detail(request, reference)
+    if detail["id"] != reference:
+        return RedirectResponse(f"/jobs/{detail['id']}", 303)
+    described = batch.call(controller, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    array = described.get("arrayProperties", {})
+    before = before_it(controller, detail)
+    spec = detail["spec"] or {}
+    is_visible = detail["results"] is not None
+    files = _files(controller, detail["run"]) if is_visible else []
+    rows = _rows(controller, detail)
+    return render(
+        request,
+        "job.html",
+        job=detail,
+        short=short_id(detail["id"]),
+        facts=facts_of(detail),
+        attempts=rows["attempts"],
+        blank_attempt=dict.fromkeys(_ATTEMPT, ""),
+        checkpoints=rows["checkpoints"],
+        blank_checkpoint=dict.fromkeys(_CHECKPOINT, ""),
+        definition=described["jobDefinition"].rpartition("/")[2],
+        children=range(min(array["size"], _CHILDREN)) if "statusSummary" in array else (),
+        array=array,
+        has_run=is_visible,
+        trains=bool(spec.get("train")),
+        container=_container(spec),
+        nodes=range(detail["nodes"]),
+        configuration=text_of(spec),
+        before=before,
+        changed=differences(before[2], spec) if before and spec else [],
+        parent=(detail["results"] or {}).get("parent") or {},
+        files=files,
+        pictures=[each for each in files if each.is_picture][:6],
+    )
+
+
+@router.get("/jobs/{reference}/stream")
+def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
+    """What changes of the page, and what its log has anew. The id of an event is what the page has then, of both."""
+    controller = controller_of(request)
+    key = (id(controller), current_identity.get(), chosen.job)
+    look = partial(_recent.get, key, partial(_look, request, chosen.job))
+    iteration, places = _had(last_id(request))
+    log = LiveLog(chosen, chosen.end() if places is None else places)
+    return stream(request, _Feed(look, log, chosen.run, iteration).changes)
+
+
+def _look(request: Request, job_id: str) -> dict[str, Any]:
+    """The parts of the page that change; shared by all who look at it."""
+    detail = job_detail(request, job_id)
+    is_visible = detail["results"] is not None
+    return {"facts": facts_of(detail), **_rows(controller_of(request), detail), "hasRun": is_visible}
+
+
+def _rows(controller: Controller, detail: Mapping[str, Any]) -> dict[str, Any]:
+    found = checkpoints_of(controller, detail["run"]) if detail["results"] is not None else {}
+    return {"attempts": attempts_of(detail), "checkpoints": found}
+
+
+@dataclass
+class _Feed:
+    """What one page has been sent."""
+
+    look: Any
+    log: LiveLog
+    run: Run
+    iteration: int | None
+    """The last iteration of its curves; None: it has none yet, and the next is the newest."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    attempts: Rows = field(default_factory=Rows)
+    checkpoints: Rows = field(default_factory=Rows)
+    is_over: bool = False
+
+    def changes(self) -> Sequence[Event] | None:
+        """The events since the last look; None once the job is over and everything of it has been sent."""
+        if self.is_over:
+            return None
+        seen = self.look()  # before the log: nothing is written after the end
+        events: list[Event] = []
+        if changed := {name: value for name, value in seen["facts"].items() if self.facts.get(name) != value}:
+            events.append(Event("facts", changed))
+        self.facts = seen["facts"]
+        for name, rows in (("attempts", self.attempts), ("checkpoints", self.checkpoints)):
+            events += [Event(name, each.data) for each in rows.changes(seen[name], {})]
+        if seen["hasRun"]:
+            events += self._curves()
+        lines, is_behind = self.log.changes()
+        events += [lines] if lines else []
+        self.is_over = not self.facts["open"] and not is_behind
+        given = json.dumps({"i": self.iteration, "l": self.log.places}, separators=(",", ":"))
+        return [Event(each.name, each.data, given) for each in events]
+
+    def _curves(self) -> list[Event]:
+        """New iterations; ``again`` where an attempt went back behind what the page has, or it has missed too much."""
+        history = history_of(self.run)
+        newest = int((history.last() or {}).get("iteration") or 0)
+        had, self.iteration = self.iteration, newest
+        if had is None or newest == had:
+            return []
+        records = history.after(had, _RECORDS + 1) if newest > had else []
+        if newest < had or len(records) > _RECORDS:
+            return [Event("metrics", {"again": True})]
+        names = sorted({name for each in records for name in each})
+        return [Event("metrics", columns(records, names))]
+
+
+def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
+    """What the page has, as the id of its last event says; nothing where it says nothing that can be read."""
+    try:
+        told = json.loads(given)
+        iteration, places = told["i"], told["l"]
+        fits = all(isinstance(each, int) and 0 <= each < 2**63 for each in places.values())
+        if fits and (iteration is None or isinstance(iteration, int)):
+            return iteration, dict(places)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        pass
+    return None, None
+
+
+def _files(controller: Controller, name: str) -> list[File]:
+    try:
+        return files_of(permitted_run(controller, name, Operation.READ_RUN))
+    except (ClientError, DamagedFile, OSError):
+        return []
+
+
+def _container(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What code the job runs."""
+    training = spec.get("train") or {}
+    command = spec.get("command")
+    return [
+        ("Task", str(training.get("task") or "")),
+        ("Algorithm", str(training.get("algorithm") or "")),
+        ("Command", " ".join(map(str, command)) if isinstance(command, list) else ""),
+        ("Image", str(spec.get("image") or "")),
+    ]
+
+
+_ATTEMPT = ("number", "epoch", "ending", "kind", "why", "started", "took", "since", "cost", "from", "span", "nodes")
+_CHECKPOINT = (*("iteration", "epoch", "label", "reward", "score", "evaluated", "size", "created", "marks", "problem"),)

@@ -1,0 +1,191 @@
+"""What a person does with a job and with a checkpoint of its run: what the commands do, through the same functions of the API."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from fastapi import Depends, Request, Response
+
+from orchestrator.api import permissions
+from orchestrator.api.batch import operations as batch
+from orchestrator.api.checkpoints import choose
+from orchestrator.api.context import Context, controller_of, permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native import clones, continuing, routes, runs
+from orchestrator.api.native.continuing import Changes
+from orchestrator.api.native.model_routes import RegisterRequest, register_model
+from orchestrator.api.native.routes import permitted_job
+from orchestrator.api.permissions import Operation
+from orchestrator.console.forms import Form, Question, done, sent_form
+from orchestrator.console.routing import page_router
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.errors import SpecError
+from orchestrator.engines.registry import FRESH
+from orchestrator.persistence.queries import short_id
+from orchestrator.spec.evaluations import evaluation_document
+from orchestrator.spec.model import validate
+from shared_store.checkpoints import list_checkpoints
+from shared_store.layout import Run
+
+router = page_router()
+_Wanted = int | Literal["best", "latest"] | None
+
+
+@router.post("/jobs/{reference}/stop")
+def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Stop the job."""
+    job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
+    text = "A training saves a checkpoint before it leaves, and can be resumed. What waits is cancelled."
+    form.confirm(Question(f"Stop {name}?", text, "Stop"))
+    reason = f"stopped in the console by {permissions.current_identity.get().name}"
+    batch.call(controller_of(request), "TerminateJob", {"jobId": job, "reason": reason})
+    return done(request, f"/jobs/{job}", f"{name} is asked to stop")
+
+
+@router.post("/jobs/{reference}/save")
+def save(request: Request, reference: str) -> Response:
+    """Have a training save a checkpoint now."""
+    job, _, _, _ = _job(request, reference, Operation.CHECKPOINT_JOB)
+    return done(request, f"/jobs/{job}", routes.save_now(request, job)["answer"])
+
+
+@router.post("/jobs/{reference}/resume")
+def resume(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Submit a job that continues the run."""
+    run, directory = _run(request, reference, Operation.RESUME_RUN)
+    wanted = _checkpoint(form)
+    chosen = choose(run, wanted)
+    newest = list_checkpoints(run)[-1:]
+    if chosen and newest and chosen.name != newest[0].name:
+        text = (
+            f"The newest checkpoint is of iteration {newest[0].iteration}. What the run has learnt after iteration "
+            f"{chosen.iteration} counts no longer, also in its curves."
+        )
+        form.confirm(Question(f"Go on from iteration {chosen.iteration}?", text, "Resume"))
+    iteration = chosen.iteration if chosen and wanted is not None else None
+    told = runs.resume(controller_of(request), run, Changes(iteration, _changes(form), directory))
+    return done(request, f"/jobs/{told['jobId']}", f"resumed {run.name} from iteration {told['iteration']}")
+
+
+@router.post("/jobs/{reference}/clone")
+def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Submit a job that begins a new run with the weights of a checkpoint."""
+    run, directory = _run(request, reference, Operation.CLONE_RUN)
+    name = _named(form, "the new run")
+    told = clones.clone(controller_of(request), run, name, Changes(_checkpoint(form), _changes(form), directory))
+    parent = told["parent"]
+    return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
+
+
+@router.post("/jobs/{reference}/evaluate")
+def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Submit a job that evaluates a checkpoint."""
+    run, directory = _run(request, reference, Operation.READ_RUN)
+    document = evaluation_document(run.name, _trained(request, run), {"checkpoint": _iteration(run, form)})
+    return _submitted(request, document, directory, f"evaluation of {run.name}")
+
+
+@router.post("/jobs/{reference}/export")
+def export(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Submit a job that exports a checkpoint's policy."""
+    return _beside(request, reference, form, "export")
+
+
+@router.post("/jobs/{reference}/record")
+def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Submit a job that records what a checkpoint's policy does."""
+    return _beside(request, reference, form, "record")
+
+
+@router.post("/jobs/{reference}/register")
+def register(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+    """Keep an exported checkpoint as the next version of a model."""
+    run, _ = _run(request, reference, Operation.REGISTER_MODEL)
+    body = RegisterRequest(name=_named(form, "the model"), checkpoint=_checkpoint(form))
+    model = register_model(request, run.name, body)
+    told = f"registered {run.name}@{model['iteration']} as {model['name']}@{model['version']}"
+    return done(request, f"/jobs/{reference}", told)
+
+
+def _beside(request: Request, reference: str, form: Form, kind: str) -> Response:
+    """A job of one CPU that reads a checkpoint, in the queue of its training."""
+    run, directory = _run(request, reference, Operation.READ_RUN)
+    trained = _trained(request, run)
+    kept = {key: trained[key] for key in ("queue", "share", "image", "environment", "secrets") if trained.get(key)}
+    document = {
+        **kept,
+        "name": f"{kind}-{run.name}".replace(".", "-")[:100],
+        "resources": {"cpus": 1, "memory": "2GiB"},
+        kind: {"run": run.name, "checkpoint": _iteration(run, form)},
+    }
+    return _submitted(request, document, directory, f"{kind} of {run.name}")
+
+
+def _submitted(request: Request, document: Mapping[str, Any], directory: str, what: str) -> Response:
+    """Submit a job and go to its page. Raises ClientError."""
+    controller = controller_of(request)
+    try:
+        spec = validate(dict(document), what)
+    except SpecError as error:
+        raise ClientError(str(error)) from None
+    controller.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    controller.check_writable(adds=True)
+    with controller.writing, controller.database.session() as session:
+        answer, _ = continuing.submit(Context(session, controller), spec, directory, what, {})
+    controller.wake()
+    return done(request, f"/jobs/{answer['jobId']}", f"submitted {answer['jobName']}")
+
+
+def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:
+    """Id, title, run and working directory of a job with which the caller may do this. Raises ClientError."""
+    with controller_of(request).database.session() as session:
+        job = permitted_job(session, reference, operation)
+        return job.id, f"{job.name} ({short_id(job.id)})", job.run, job.gang.options.directory
+
+
+def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, str]:
+    """The run of a job, with which the caller may do this, and the job's working directory. Raises ClientError."""
+    _, _, run, directory = _job(request, reference, Operation.READ_JOB)
+    return permitted_run(controller_of(request), run, operation), directory
+
+
+def _trained(request: Request, run: Run) -> Mapping[str, Any]:
+    controller: Controller = controller_of(request)
+    with controller.database.session() as session:
+        spec = runs.spec_of(session, run) or {}
+    if not spec.get("train"):
+        raise ClientError(f"run {run.name} is no training, so it has no policy")
+    return spec
+
+
+def _checkpoint(form: Form) -> _Wanted:
+    """The checkpoint that was marked; None: the newest. Raises ClientError."""
+    given = form.one("checkpoint")
+    if given in ("", "latest"):
+        return None
+    if given == "best":
+        return "best"
+    if given.isascii() and given.isdecimal() and len(given) < 10:
+        return int(given)
+    raise ClientError(f"checkpoint {given[:50]!r}: expected an iteration, best or latest")
+
+
+def _iteration(run: Run, form: Form) -> int:
+    """Raises ClientError where there is no such checkpoint."""
+    chosen = choose(run, _checkpoint(form))
+    if chosen is None:
+        raise ClientError(f"run {run.name} has no checkpoint yet; train it first")
+    return chosen.iteration
+
+
+def _changes(form: Form) -> tuple[str, ...]:
+    """``key.path=value``, one a line."""
+    return tuple(line.strip() for line in form.one("changes").splitlines() if line.strip())
+
+
+def _named(form: Form, what: str) -> str:
+    name = form.one("name").strip()
+    if not 0 < len(name) <= 128:
+        raise ClientError(f"give {what} a name, of at most 128 characters")
+    return name

@@ -1,0 +1,82 @@
+"""The configuration of a job as YAML, and what is different from the one before it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import yaml
+from sqlalchemy import select
+
+from orchestrator.api import permissions
+from orchestrator.api.context import permitted_run
+from orchestrator.api.damaged import reading
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native import runs
+from orchestrator.api.permissions import Operation
+from orchestrator.control.reconciler import Controller
+from orchestrator.persistence.models import Job
+from shared_store.files import DamagedFile
+
+_ABSENT = object()
+_LONGEST = 300
+"""Characters of a value in the table of differences."""
+
+
+def text_of(spec: Mapping[str, Any] | None) -> str:
+    """The spec as YAML; empty for a job that came through the Batch API without one."""
+    return str(yaml.safe_dump(dict(spec), sort_keys=False, allow_unicode=True, width=100)) if spec else ""
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Each key whose values differ, with the old and the new one as text; an absent value is empty."""
+    before, after = dict(_flattened(old)), dict(_flattened(new))
+    keys = [*after, *(key for key in before if key not in after)]
+    pairs = ((key, before.get(key, _ABSENT), after.get(key, _ABSENT)) for key in keys)
+    return [(key, _shown(was), _shown(now)) for key, was, now in pairs if was != now]
+
+
+def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, each in value.items():
+        if isinstance(each, Mapping) and each:
+            yield from _flattened(each, f"{prefix}{key}.")
+        elif each not in (None, {}, []):
+            yield f"{prefix}{key}", each
+
+
+def _shown(value: Any) -> str:
+    if value is _ABSENT:
+        return ""
+    text = value if isinstance(value, str) else yaml.safe_dump(value, default_flow_style=True, width=10_000)
+    text = text.removesuffix("\n").removesuffix("\n...")
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
+
+
+def before_it(controller: Controller, detail: Mapping[str, Any]) -> tuple[str, str, Mapping[str, Any]] | None:
+    """What the job's configuration is compared with: a title, an address and a spec; None where there is nothing.
+
+    That is the job before it in its run, else the run whose weights a clone began with.
+    """
+    queues = permissions.visible_queues()
+    with controller.database.session() as session:
+        query = select(Job).where(
+            Job.run == detail["run"], Job.created_at < detail["createdAt"], Job.id != detail["id"]
+        )
+        if queues is not None:
+            query = query.where(Job.queue.in_(queues))
+        earlier = session.scalars(query.order_by(Job.created_at.desc()).limit(1)).first()
+        if earlier is not None and not detail["runIsReplaced"]:
+            with reading(earlier):
+                spec = earlier.gang.spec
+            if spec:
+                return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", permissions.shown(spec)
+        parent = (detail["results"] or {}).get("parent") or {}
+        name = parent.get("run")
+        if not isinstance(name, str):
+            return None
+        try:
+            run = permitted_run(controller, name, Operation.READ_RUN)
+            spec = runs.spec_of(session, run)
+        except (ClientError, DamagedFile, OSError):
+            return None  # deleted, or another's
+    return (f"its parent {name}", f"/runs/{name}", permissions.shown(spec)) if spec else None

@@ -1,0 +1,202 @@
+"""What the page of a job shows of it, as texts: its state and why, how far it is, its attempts on a line of time, its checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+from orchestrator.api.context import permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native import runs
+from orchestrator.api.permissions import Operation
+from orchestrator.console import words
+from orchestrator.control.reconciler import Controller
+from orchestrator.domain.job import Status
+from orchestrator.persistence.ownership import born_at
+from shared_store.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
+from shared_store.evaluations import by_checkpoint
+from shared_store.layout import Run
+from shared_store.wording import counted
+
+CHECKPOINTS = 30
+"""Checkpoints of a run that are listed, the newest; and the best one."""
+_NODES = 16
+"""Nodes of an attempt that are named."""
+
+
+def facts_of(detail: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of the page that change, from what ``GET /api/jobs/{reference}`` answers."""
+    status = detail["status"]
+    is_over = Status(status).is_terminal
+    training = (detail["spec"] or {}).get("train") or {}
+    last = detail["progress"] or {}
+    iteration, iterations = last.get("iteration") or 0, training.get("iterations") or 0
+    attempts = detail["attempts"]
+    started = next((each["startedAt"] for each in attempts if each["startedAt"]), detail["startedAt"])
+    results = detail["results"] or {}
+    return {
+        "status": status,
+        "reason": (detail["statusReason"] or "") if status != Status.SUCCEEDED else "",
+        "open": "" if is_over else "yes",
+        "saves": "yes" if status == Status.RUNNING and training else "",
+        "done": iteration,
+        "iterations": iterations or 1,
+        "progress": f"{iteration} of {iterations}" if iterations and iteration else "",
+        "left": words.duration((iterations - iteration) * last["iteration_seconds"])
+        if not is_over and iteration and isinstance(last.get("iteration_seconds"), int | float)
+        else "",
+        "rate": words.count(last.get("steps_per_second")) if not is_over else "",
+        "reward": words.count(last.get("reward")),
+        "score": _with_error(last.get("score"), last.get("score_error")),
+        "straggler": _straggler(last),
+        "reported": words.moment(last["time"] * 1000)
+        if not is_over and isinstance(last.get("time"), int | float)
+        else "",
+        "attempt": _attempt_of(detail),
+        "where": _where(attempts[-1]["nodes"]) if attempts and not is_over else "",
+        "since": words.moment(started) if started and not is_over else "",
+        "took": words.duration((detail["stoppedAt"] - started) / 1000) if is_over and started else "",
+        "saved": counted(results["checkpoints"], "checkpoint") if results.get("checkpoints") else "",
+        "evaluated": _evaluated(results.get("evaluation")),
+        "evaluating": _automatic(results.get("automatic")),
+    }
+
+
+def attempts_of(detail: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The rows of the attempts, by number; ``from`` and ``span`` are percents of the job's life so far."""
+    begin = detail["createdAt"]
+    end = max(detail["stoppedAt"] or int(time.time() * 1000), begin + 1)
+    saves = detail["kind"] == "train"
+    return {str(each["number"]): _attempt(each, begin, end, saves) for each in detail["attempts"]}
+
+
+def _attempt(attempt: Mapping[str, Any], begin: int, end: int, saves: bool) -> dict[str, Any]:
+    started, stopped = attempt["startedAt"], attempt["stoppedAt"]
+    first = started or stopped or end
+    ended = attempt["ending"] or ("running" if started else "starting")
+    kind = "gpu" if attempt["gpuSeconds"] else "cpu"
+    used, lost = attempt[f"{kind}Seconds"], attempt[f"wasted{kind.title()}Seconds"]
+    cost = f"{words.duration(used)} of {kind.upper()}s" if used else ""
+    lost_words = f", {words.duration(lost)} lost" if used and saves and lost >= 1 else ""
+    return {
+        "number": str(attempt["number"]),
+        "epoch": str(attempt["epoch"]),
+        "ending": f"{ended}{'' if attempt['spent'] else ', not counted'}",
+        "kind": ended,
+        "why": attempt["statusReason"] or "" if ended != "succeeded" else "",
+        "started": words.moment(started),
+        "took": words.duration((stopped - started) / 1000) if started and stopped else "",
+        "since": words.moment(started) if started and not stopped else "",
+        "cost": cost + lost_words,
+        "from": f"{max(0.0, 100 * (first - begin) / (end - begin)):.2f}",
+        "span": f"{max(0.4, 100 * ((stopped or end) - first) / (end - begin)):.2f}",
+        "nodes": _where(attempt["nodes"]),
+    }
+
+
+def _where(nodes: Sequence[Mapping[str, Any]]) -> str:
+    """Where each node is, and what became of it."""
+    told = []
+    for node in nodes[:_NODES]:
+        gpus = f", {counted(len(node['gpus']), 'GPU')}" if node["gpus"] else ""
+        ended = ""
+        if not node["running"]:
+            code, reason = node.get("exitCode"), node.get("reason") or ""
+            ended = f" (exit {'?' if code is None else code}{f': {reason}' if reason else ''})"
+        told.append(f"node {node['index']} on {node['host']}{gpus}{ended}")
+    if len(nodes) > _NODES:
+        told.append(f"and {counted(len(nodes) - _NODES, 'more node')}")
+    return "; ".join(told)
+
+
+def _attempt_of(detail: Mapping[str, Any]) -> str:
+    attempts = detail["attempts"]
+    if not attempts:
+        return f"none yet, {detail['attemptsAllowed']} allowed"
+    number, spent = attempts[-1]["number"], sum(bool(each["spent"]) for each in attempts)
+    allowed = detail["attemptsAllowed"]
+    return f"{number} of {allowed}" if spent == number else f"{number} ({spent} of {allowed} spent)"
+
+
+def _straggler(last: Mapping[str, Any]) -> str:
+    rank, excess = last.get("slowest_rank"), last.get("slowest_excess")
+    if not isinstance(rank, int) or not isinstance(excess, int | float):
+        return ""
+    return f"rank {rank}, {100 * excess:.0f} % over the median"
+
+
+def _with_error(value: Any, error: Any) -> str:
+    if not isinstance(value, int | float):
+        return ""
+    return words.count(value) + (f" ± {words.count(error)}" if isinstance(error, int | float) else "")
+
+
+def _evaluated(evaluation: Mapping[str, Any] | None) -> str:
+    if not evaluation or not isinstance(evaluation.get("mean_return"), int | float):
+        return ""
+    told = f"return {words.count(evaluation['mean_return'])} at iteration {evaluation.get('iteration')}"
+    return f"{told}, {counted(evaluation['episodes'], 'episode')}" if evaluation.get("episodes") else told
+
+
+def _automatic(told: Mapping[str, Any] | None) -> str:
+    if not told:
+        return ""
+    parts = [f"iteration {told['iteration']}, {told['status'] or 'out of sight'}"] if told["job"] else []
+    return "; ".join([*parts, *([told["problem"]] if told["problem"] else [])])
+
+
+def checkpoints_of(controller: Controller, run: str) -> dict[str, dict[str, Any]]:
+    """The rows of a run's newest checkpoints and its best one, by name, the newest first; none where they can't be seen."""
+    try:
+        found = permitted_run(controller, run, Operation.READ_CHECKPOINTS)
+        return _checkpoints(found)
+    except (ClientError, OSError):
+        return {}
+
+
+def _checkpoints(run: Run) -> dict[str, dict[str, Any]]:
+    there = list_checkpoints(run)
+    if not there:
+        return {}
+    evaluated, best = by_checkpoint(run), best_checkpoint(run)
+    shown = there[-CHECKPOINTS:]
+    if best is not None and best.name not in {each.name for each in shown}:
+        shown = [best, *shown]
+    exported = {each.name for each in shown if (run.exports / each.name).is_dir()}
+    rows, born = {}, born_at(run)
+    for each in reversed(shown):
+        marks = {
+            "newest": each is there[-1],
+            "best": best and each.name == best.name,
+            "exported": each.name in exported,
+        }
+        rows[each.name] = _checkpoint(
+            each, born, evaluated.get(each.name), [name for name, is_so in marks.items() if is_so]
+        )
+    return rows
+
+
+def _checkpoint(
+    checkpoint: Checkpoint, born: int, evaluated: Mapping[str, Any] | None, marks: Sequence[str]
+) -> dict[str, Any]:
+    facts = _described(checkpoint, born)
+    return {
+        "iteration": str(checkpoint.iteration),
+        "epoch": str(checkpoint.epoch),
+        "label": f"Checkpoint of iteration {checkpoint.iteration}, epoch {checkpoint.epoch}",
+        "reward": words.count(facts.get("reward")),
+        "score": _with_error(facts.get("score"), facts.get("scoreError")),
+        "evaluated": words.count(evaluated["mean_return"]) if evaluated else "",
+        "size": f"{facts['size'] / 2**20:.1f} MiB" if facts.get("size") else "",
+        "created": words.moment(facts["created"] * 1000) if facts.get("created") else "",
+        "marks": ", ".join(marks),
+        "problem": facts.get("problem") or "",
+    }
+
+
+@lru_cache(maxsize=4096)
+def _described(checkpoint: Checkpoint, born: int) -> dict[str, Any]:
+    """What a checkpoint says of itself, which never changes in a run that was created at ``born`` [Unix ms]."""
+    return runs.describe_checkpoint(checkpoint, verify=False)

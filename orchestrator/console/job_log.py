@@ -1,0 +1,129 @@
+"""The log of a job in a page: windows of it, what is searched, and what is new, never the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+
+from orchestrator.api.context import controller_of
+from orchestrator.api.errors import ClientError
+from orchestrator.api.native.routes import permitted_job, positions_of
+from orchestrator.api.permissions import Operation
+from orchestrator.console.live import Event
+from orchestrator.console.routing import page_router
+from shared_store.log_windows import LINES_A_WINDOW, Chosen, Window, first_error, lines_after, lines_before, search
+from shared_store.logs import LogFollower, LogLine
+
+router = page_router()
+
+_MOST_LAG = 1 << 20
+"""Bytes that a page gets of what it has missed; of more, the last lines."""
+_LONGEST = 4000
+"""Characters of a line that a page shows."""
+_AROUND = 30
+"""Lines after one that was found."""
+
+
+def chosen_log(
+    request: Request,
+    reference: str,
+    node: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
+    rank: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
+    attempt: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
+) -> Chosen:
+    """The lines of the job that are asked for; empty numbers mean all. Raises ClientError."""
+    controller = controller_of(request)
+    with controller.database.session() as session:
+        job = permitted_job(session, reference, Operation.READ_JOB_LOGS)
+        run, job_id = controller.store.run(job.run), job.id
+    numbers = (int(each) if each else None for each in (node, rank, attempt))
+    return Chosen(run, job_id, *numbers)
+
+
+ChosenLog = Annotated[Chosen, Depends(chosen_log)]
+
+
+@router.get("/jobs/{reference}/log")
+def window(
+    chosen: ChosenLog,
+    before: str = Query(default="", max_length=50_000),
+    after: str = Query(default="", max_length=50_000),
+    around: str = Query(default="", max_length=50_000),
+) -> dict[str, Any]:
+    """A window of the log: the last lines; those before or after a place; those around the line that ends at a place."""
+    try:
+        if after:
+            return _told(lines_after(chosen, positions_of(after)))
+        if around:
+            end = lines_after(chosen, positions_of(around), _AROUND).last
+            return _told(lines_before(chosen, end, LINES_A_WINDOW))
+        return _told(lines_before(chosen, positions_of(before) if before else chosen.end()))
+    except OSError as error:
+        raise _unreadable(error) from None
+
+
+@router.get("/jobs/{reference}/log/search")
+def find(
+    chosen: ChosenLog,
+    text: str = Query(default="", max_length=200),
+    place: str = Query(default="{}", max_length=50_000),
+) -> dict[str, Any]:
+    """Lines with a text, or the first errors where there is none; ``over`` is false where the search goes on at ``place``."""
+    try:
+        start = positions_of(place)
+        found = search(chosen, text, start) if text else first_error(chosen, start)
+    except OSError as error:
+        raise _unreadable(error) from None
+    ends = {"positions": [each.position for each in found.lines]}
+    return {"lines": written(found.lines), **ends, "place": found.place, "over": found.is_over}
+
+
+def _unreadable(error: OSError) -> ClientError:
+    return ClientError(f"the log can't be read now: {error.strerror or error}", 503)
+
+
+def _told(found: Window) -> dict[str, Any]:
+    return {"lines": written(found.lines), "first": found.first, "last": found.last, "more": found.more}
+
+
+def written(lines: Sequence[LogLine]) -> list[list[Any]]:
+    """Time, attempt, node, rank (None: the supervisor), stream and text of each line."""
+    return [[*line[:5], line.text if len(line.text) <= _LONGEST else f"{line.text[:_LONGEST]} …"] for line in lines]
+
+
+@dataclass
+class LiveLog:
+    """What is new of a log for one page."""
+
+    chosen: Chosen
+    places: dict[str, int]
+    """What the page has."""
+
+    def __post_init__(self) -> None:
+        self._follower = self._follow(self.places)
+
+    def changes(self) -> tuple[Event | None, bool]:
+        """The event ``lines`` or ``window``, and whether there is more already.
+
+        ``window``: the page has missed so much that it gets the last lines alone; ``skipped`` are the bytes before them. Raises OSError.
+        """
+        end = self.chosen.end()
+        lag = sum(max(0, position - self.places.get(key, 0)) for key, position in end.items())
+        if lag > _MOST_LAG:
+            last = lines_before(self.chosen, end)
+            begun = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
+            self._follower = self._follow(end)
+            self.places = dict(end)
+            return Event("window", {**_told(last), "skipped": begun}), False
+        lines = self._follower.poll()
+        self.places = dict(self._follower.offsets)
+        if not lines:
+            return None, self._follower.behind
+        return Event("lines", {"lines": written(lines), "last": self.places}), self._follower.behind
+
+    def _follow(self, places: Mapping[str, int]) -> LogFollower:
+        chosen = self.chosen
+        return LogFollower(chosen.run, chosen.job, chosen.node, chosen.rank, chosen.attempt, dict(places))

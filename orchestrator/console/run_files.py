@@ -1,0 +1,113 @@
+"""The files that a run has made: pictures, recordings, evaluations, exported policies. Listed, shown and downloaded."""
+
+from __future__ import annotations
+
+import mimetypes
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
+
+from orchestrator.api.context import controller_of, permitted_run
+from orchestrator.api.errors import ClientError
+from orchestrator.api.permissions import Operation
+from orchestrator.console.routing import page_router
+from shared_store.files import DamagedFile, open_regular, refuse_links
+from shared_store.layout import NAME, Run
+
+router = page_router()
+
+PLACES = ("metrics", "recordings", "evaluations", "exports")
+"""Directories of a run whose files are shown."""
+_MOST = 200
+_DEEPEST = 4
+_PICTURES = (".png", ".gif")
+_BLOCK = 256 << 10
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of a run, by its path in it."""
+
+    path: str
+    size: int
+    """Bytes."""
+    changed: int
+    """Unix time [ms]."""
+    address: str
+
+    @property
+    def is_picture(self) -> bool:
+        return self.path.endswith(_PICTURES)
+
+
+def files_of(run: Run) -> list[File]:
+    """The first 200 files of each place, the newest first. Raises DamagedFile, OSError."""
+    run.check_links()
+    return [each for place in PLACES for each in _in(run, place)]
+
+
+def _in(run: Run, place: str) -> list[File]:
+    found = [
+        (path, facts) for path in _walk(run.path / place, 1) if (facts := path.stat(follow_symlinks=False)).st_size
+    ]
+    found.sort(key=lambda each: each[1].st_mtime, reverse=True)
+    files = []
+    for path, facts in found[:_MOST]:
+        name = path.relative_to(run.path).as_posix()
+        files.append(File(name, facts.st_size, int(facts.st_mtime * 1000), f"/runs/{run.name}/files/{quote(name)}"))
+    return files
+
+
+def _walk(directory: Path, depth: int) -> Iterator[Path]:
+    try:
+        entries = sorted(os.scandir(directory), key=lambda each: each.name)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for entry in entries:
+        if not NAME.fullmatch(entry.name):
+            continue  # hidden, or of no use as an address
+        if entry.is_file(follow_symlinks=False):
+            yield Path(entry.path)
+        elif entry.is_dir(follow_symlinks=False) and depth < _DEEPEST:
+            yield from _walk(Path(entry.path), depth + 1)
+
+
+@router.get("/runs/{name}/files/{path:path}")
+def file(request: Request, name: str, path: str) -> Response:
+    """A file of a run: a picture as one, all others as a download."""
+    run = permitted_run(controller_of(request), name, Operation.READ_RUN)
+    parts = path.split("/")
+    if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
+        raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)
+    place = run.path / path
+    try:
+        refuse_links(place, len(parts) + 1)
+        opened = open_regular(place)
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        raise ClientError(f"run {run.name} has no file {path[:100]!r}", 404) from None
+    except (DamagedFile, OSError) as error:
+        raise ClientError(f"{path[:100]} of run {run.name} can't be read: {error}", 409) from None
+    size = os.fstat(opened.fileno()).st_size
+
+    def blocks() -> Iterator[bytes]:
+        left = size  # a file that grows meanwhile has no more than was announced
+        with opened:
+            while left and (block := opened.read(min(left, _BLOCK))):
+                left -= len(block)
+                yield block
+
+    is_picture = path.endswith(_PICTURES)
+    headers = {
+        "Content-Length": str(size),
+        "Content-Disposition": "inline" if is_picture else f'attachment; filename="{parts[-1]}"',
+        "Content-Security-Policy": "default-src 'none'; sandbox",
+        "Cache-Control": "no-store",
+        "Cross-Origin-Resource-Policy": "same-origin",
+    }
+    kind = mimetypes.guess_type(path)[0] if is_picture else None
+    return StreamingResponse(blocks(), media_type=kind or "application/octet-stream", headers=headers)
