@@ -128,7 +128,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, di
         given = {
             "jobs": described["jobs"][::-1],
             "checkpoints": run_routes.run_checkpoints(request, name)[::-1],
-            "evaluations": run_routes.run_evaluations(request, name)[::-1],
+            "evaluations": [{**each, "run": name} for each in run_routes.run_evaluations(request, name)[::-1]],
         }
         return described, {key: {row["key"]: row for row in map(of, given[key])} for key, of in _TABLES.items()}
 
@@ -210,6 +210,7 @@ def _evaluation(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "key": evaluation.get("name", ""),
         "checkpoint": evaluation.get("checkpoint", ""),
+        "table": f"/runs/{evaluation['run']}/files/evaluations/{evaluation['name']}.parquet" if evaluation else "/runs",
         "worlds": ", ".join(f"{place}: {value}" for place, value in flattened(changes))
         if isinstance(changes, Mapping)
         else "",

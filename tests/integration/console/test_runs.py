@@ -87,6 +87,8 @@ def test_the_list_has_every_run_with_its_task_and_best_evaluation(console: Conso
 def test_the_page_of_a_run_has_checkpoints_evaluations_and_lineage(console: Console, store: Store) -> None:
     page = console.visitor().page("/runs/sure")
     assert "00000009-e1" in page.text and "26.50 ± 1.00" in page.text and "75.0 %" in page.text
+    table = console.visitor().http.get("/runs/sure/files/evaluations/00000009-e1-job.parquet")
+    assert page.all("a", href=table.url.path) and table.content[:4] == b"PAR1"
     assert page.all("a", href="/runs/fast") and "No run was cloned from it" in page.text
     (curves,) = [each for each in page.all("div") if each.get("data-curves")]
     assert (curves["data-curves"], curves["data-metrics"]) == ("/runs/sure/curves", "reward kl")
