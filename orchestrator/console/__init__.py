@@ -40,7 +40,7 @@ from fastapi import FastAPI
 
 from orchestrator.console import assets, routing
 
-PAGES = ("login", "jobs", "job", "job_log", "job_actions", "run_files", "curves", "queues", "runs", "compare")
+PAGES = ("login", "jobs", "job", "job_log", "job_actions", "run_files", "curves", "queues", "runs", "compare", "keys")
 """Modules of this package, each with a ``router``."""
 
 

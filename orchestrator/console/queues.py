@@ -24,8 +24,6 @@ from shared_store.wording import counted
 
 router = page_router()
 
-Table = Mapping[str, dict[str, Any]]
-"""Rows by key."""
 _OLD = 10.0
 """Seconds after which the page says how old an engine's list of hosts is."""
 _recent = Recent()
@@ -58,13 +56,13 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
     return stream(request, changes)
 
 
-def _tables(controller: Controller, queue: str) -> dict[str, Table]:
-    """Every table's rows, shared by all who look at the same."""
+def _tables(controller: Controller, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """The rows of every table, by key; shared by all who look at the same."""
     key = (id(controller), current_identity.get(), queue)
     return _recent.get(key, partial(_read_tables, controller, queue))
 
 
-def _read_tables(controller: Controller, queue: str) -> dict[str, Table]:
+def _read_tables(controller: Controller, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
     found = overview(controller, queue)
     waiting = [
         {**job, "queue": each["name"], "place": place}
@@ -73,8 +71,7 @@ def _read_tables(controller: Controller, queue: str) -> dict[str, Table]:
     ]
     shares = [{**share, "queue": each["name"]} for each in found["queues"] for share in each["shares"]]
     given = {**found, "waiting": waiting, "shares": shares}
-    tables = {name: {row["key"]: row for row in map(of, given[name])} for name, of in _ROWS.items()}
-    return tables
+    return {name: {row["key"]: row for row in map(of, given[name])} for name, of in _ROWS.items()}
 
 
 def _queue(queue: Mapping[str, Any]) -> dict[str, Any]:

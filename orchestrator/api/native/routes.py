@@ -27,6 +27,7 @@ from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
 from orchestrator.api.native import (
     job_list,
+    key_routes,
     league_routes,
     model_routes,
     queue_overview,
@@ -63,6 +64,7 @@ router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
 router.include_router(webhook_routes.router)
+router.include_router(key_routes.router)
 
 _LARGEST_PLAN = 4 << 20
 """Characters of all nodes' variables together."""

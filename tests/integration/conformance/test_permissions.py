@@ -101,6 +101,9 @@ TABLE = {
     Operation.RERUN_ENTRY: OWN_WRITE,
     Operation.ENTER_LEAGUE: OWN_WRITE,
     Operation.DISQUALIFY: OWN_WRITE,
+    Operation.READ_KEYS: ALL_READ,
+    Operation.CREATE_KEY: SHARED_WRITE,
+    Operation.DELETE_KEY: SHARED_WRITE,
     Operation.READ_WEBHOOKS: ALL_READ,
     Operation.TEST_WEBHOOK: SHARED_WRITE,
 }
@@ -209,6 +212,9 @@ def requests_of(world: World) -> dict[Operation, Callable[[str], httpx.Response]
         of_ours(of.RERUN_ENTRY, {}),
         of_ours(of.ENTER_LEAGUE, {"model": world.run, "job": world.job}),
         of_ours(of.DISQUALIFY, {"reason": "x"}),
+        of_ours(of.READ_KEYS),
+        lambda key: world.native_call(key, of.CREATE_KEY, {"name": world.fresh()}),
+        lambda key: world.delete_key(key),
         of_ours(of.READ_WEBHOOKS),
         of_ours(of.TEST_WEBHOOK, {}),
     ]
