@@ -136,7 +136,7 @@ def _host(host: Mapping[str, Any]) -> dict[str, Any]:
         "gpus": f"{used['gpus']} of {gpus}" if gpus else "",
         "usedGpus": used["gpus"],
         "allGpus": gpus or 1,
-        "memory": f"{_gib(used['memory'])} of {_gib(memory)} GiB",
+        "memory": f"{_bytes(used['memory'])} of {_bytes(memory)}",
         "usedMemory": used["memory"],
         "allMemory": memory or 1,
         "state": "takes nothing now" if host.get("away") else "",
@@ -182,8 +182,8 @@ def _amounts(amounts: Mapping[str, float] | None) -> str:
     return ", ".join(f"{amount:g} {unit}{'s' if amount != 1 else ''}" for amount, unit in named if amount)
 
 
-def _gib(mebibytes: int) -> str:
-    return f"{mebibytes / 1024:.3g}"
+def _bytes(mebibytes: int) -> str:
+    return f"{mebibytes / 1024:.3g} GiB" if mebibytes >= 1024 else f"{mebibytes} MiB"
 
 
 _ROWS = {

@@ -139,7 +139,7 @@ def _row(run: Mapping[str, Any]) -> dict[str, Any]:
     """The texts of a run's row; all empty for the row that scripts copy."""
     name, train, jobs = run.get("run", ""), _train(run), run.get("jobs") or []
     job = jobs[-1] if jobs else {}
-    iterations, created = train.get("iterations"), run.get("created")
+    iterations = train.get("iterations")
     return {
         "name": name,
         "link": f"/runs/{quote(name, safe='')}" if name else "/runs",
@@ -155,7 +155,7 @@ def _row(run: Mapping[str, Any]) -> dict[str, Any]:
         "job": job.get("name", ""),
         "jobLink": f"/jobs/{job['id']}" if job else "/",
         "status": job.get("status", ""),
-        "created": words.moment(created * 1000 if created else None),
+        "created": words.moment(run.get("created")),
     }
 
 

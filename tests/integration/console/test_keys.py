@@ -44,15 +44,19 @@ def test_a_key_is_made_its_secret_is_shown_once_and_it_works(console: Console) -
 def test_a_key_is_deleted_once_the_person_has_said_yes(console: Console) -> None:
     key = console.keys.create("bob")
     bob, visitor = Visitor(console.url, secret_of(key)), console.visitor()
-    asked = visitor.submit("/keys/bob/delete")
+    stream = visitor.events("/keys/stream")
+    assert "bob" in next(stream)[1]["order"]
+    asked = visitor.submit("/keys/delete", name="bob")
     assert asked.status_code == 409 and asked.json()["question"]["title"] == "Delete key bob?"
     assert bob.http.get("/", follow_redirects=False).status_code == 200
-    told = visitor.submit("/keys/bob/delete", confirmed="yes").json()
+    told = visitor.submit("/keys/delete", name="bob", confirmed="yes").json()
     assert told == {"location": "/keys", "message": "deleted key bob"}
+    assert "bob" not in next(stream)[1]["order"]
+    stream.close()
     assert bob.http.get("/", follow_redirects=False).status_code == 303
     bob.close()
-    assert "there is no key 'bob'" in visitor.submit("/keys/bob/delete", confirmed="yes").json()["message"]
-    own = visitor.submit("/keys/admin/delete").json()["question"]["text"]
+    assert "there is no key 'bob'" in visitor.submit("/keys/delete", name="bob", confirmed="yes").json()["message"]
+    own = visitor.submit("/keys/delete", name="admin").json()["question"]["text"]
     assert "It is your own: you are logged out." in own and "last one" not in own
 
 
@@ -61,7 +65,7 @@ def test_only_keys_with_all_queues_see_keys_and_a_read_only_one_changes_none(con
     assert "may use job queue lab only" in lab.page("/keys", 403).text
     for visitor, said in ((lab, "may use job queue lab only"), (reader, "is read-only")):
         made = visitor.submit("/keys/create", name="mine")
-        gone = visitor.submit("/keys/admin/delete", confirmed="yes")
+        gone = visitor.submit("/keys/delete", name="admin", confirmed="yes")
         for answer in (made, gone):
             assert answer.status_code == 403 and said in answer.json()["message"]
     page = reader.page("/keys")
@@ -102,7 +106,7 @@ def test_a_server_that_other_machines_can_reach_shows_keys_and_makes_none(tmp_pa
     try:
         page = visitor.page("/keys")
         assert "muster keys create NAME" in page.text and not page.all("form", action="/keys/create")
-        for path, fields in (("/keys/create", {"name": "x"}), ("/keys/admin/delete", {"confirmed": "yes"})):
+        for path, fields in (("/keys/create", {"name": "x"}), ("/keys/delete", {"name": "admin", "confirmed": "yes"})):
             answer = visitor.submit(path, **fields)
             assert answer.status_code == 403 and "other machines can reach this server" in answer.json()["message"]
         bearer = {"Authorization": f"Bearer {secret}"}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from orchestrator.client import Client
+from tests.conftest import wait_for
 from tests.support.console.fixtures import Console
 from tests.support.console.visitor import Page
 
@@ -51,10 +53,8 @@ def test_why_a_job_waits_is_what_the_api_says(console: Console, waiting: dict[st
 def test_a_key_sees_its_queues_alone(console: Console, waiting: dict[str, str]) -> None:
     page = console.visitor("lab").page("/queues")
     assert rows_of(page, waiting["lab"]) and not rows_of(page, waiting["default"]) and "in-shared" not in page.text
-    assert [
-        each["name"]
-        for each in console.client.__class__(console.url, console.secrets["lab"]).get("/api/queues")["queues"]
-    ] == ["lab"]
+    with Client(console.url, console.secrets["lab"]) as client:
+        assert [each["name"] for each in client.get("/api/queues")["queues"]] == ["lab"]
     refused = console.visitor("lab").page("/queues?queue=shared", 404)
     assert "there is no queue 'shared'; there is lab" in refused.text
 
@@ -71,6 +71,24 @@ def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str])
         if name == "waiting" and data.get("order") == []:
             break
     stream.close()
+
+
+def test_a_share_that_uses_something_is_told_with_its_weight_and_the_host_as_full(
+    console: Console, waiting: dict[str, str]
+) -> None:
+    definition = console.register("runs", cpus="1", command=["sleep", "600"])
+    job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
+    running = console.client.batch("SubmitJob", **job)["jobId"]
+    wait_for(lambda: console.client.get(f"/api/jobs/{running}")["status"] == "RUNNING", 30, "the job to run")
+    told = console.client.get("/api/queues", queue="shared")
+    (share,) = told["queues"][0]["shares"]
+    assert (share["share"], share["weight"], share["inUse"]) == ("red", 0.5, {"cpus": 1.0, "gpus": 0})
+    assert share["score"] == pytest.approx(share["used"] * 0.5)
+    assert told["hosts"][0]["inUse"]["cpus"] == 1.0 and told["queues"][0]["inUse"] == {"cpus": 1.0, "gpus": 0}
+    page = console.visitor().page("/queues")
+    assert rows_of(page, "shared/red") and "1 of 1" in page.text
+    console.client.batch("TerminateJob", jobId=running, reason="enough")
+    wait_for(lambda: console.client.get(f"/api/jobs/{running}")["status"] == "FAILED", 30, "the end of the job")
 
 
 def test_hostile_names_are_text(console: Console) -> None:

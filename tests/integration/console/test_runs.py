@@ -26,7 +26,9 @@ def trained(store: Store, name: str, returns: list[float], **changes: Any) -> Ru
     run = store.run(name)
     described = run.description()
     assert described is not None
-    write_json(run.path / "run.json", {**described, "queue": "default", "owner": "key admin", **changes})
+    write_json(
+        run.path / "run.json", {**described, "created": 1.7e12, "queue": "default", "owner": "key admin", **changes}
+    )
     for iteration in (6, 9):
         add_checkpoint(store, name, iteration)
     with MetricsWriter(run, 1, 0) as metrics:
@@ -77,6 +79,7 @@ def names(page: Page) -> list[str]:
 def test_the_list_has_every_run_with_its_task_and_best_evaluation(console: Console, store: Store) -> None:
     page = console.visitor().page("/runs")
     assert names(page) == ["fast", "fast-b", "labs", "sure"]
+    assert page.all("time", datetime="2023-11-14T22:13:20+00:00")
     assert "Cartpole" in page.text and "25.2 at 9" in page.text and "key admin" in page.text
     assert names(console.visitor().page("/runs?search=FAST")) == ["fast", "fast-b"]
     assert names(console.visitor().page("/runs?after=fast-b")) == ["labs", "sure"]
@@ -149,7 +152,14 @@ def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
 
 def test_what_is_in_a_run_is_text_and_nothing_else(console: Console, store: Store) -> None:
     parent = {"run": HOSTILE, "checkpoint": HOSTILE}
-    run = trained(store, "hostile", [1.0], train={"task": HOSTILE, "seed": HOSTILE}, owner=HOSTILE, parent=parent)
+    run = trained(
+        store,
+        "hostile",
+        [1.0],
+        train={"task": HOSTILE, "seed": HOSTILE},
+        owner=HOSTILE,
+        parent=parent,
+    )
     written = run.evaluations / "00000009-e1-job.json"
     summary = {**SPEC, "mean_return": 1.0, "mean_length": 1.0, "max_length": 1, "episodes": 1, "time": 1.0}
     write_json(
@@ -176,6 +186,7 @@ def test_what_is_in_a_run_is_text_and_nothing_else(console: Console, store: Stor
 def test_a_damaged_run_says_so_and_takes_no_other_away(console: Console, store: Store) -> None:
     run = trained(store, "damaged", [1.0])
     (run.path / "run.json").write_text("{")
+    trained(store, "odd-age", [1.0], created=1e300)
     page = console.visitor().page("/runs?search=a")
-    assert "damaged" in names(page) and "fast" in names(page) and "run.json" in page.text
+    assert "damaged" in names(page) and "fast" in names(page) and "created is no time" in page.text
     assert "damaged file" in console.visitor().page("/runs/damaged", 409).text
