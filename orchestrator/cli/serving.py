@@ -164,7 +164,8 @@ def serve(
     echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
     try:
-        ended.wait()
+        while not ended.wait(1.0):  # Python sees a signal that another thread took when this one wakes
+            pass
     finally:
         server.close()
     echo("stopped; running jobs continue and the next `muster serve` finds them")

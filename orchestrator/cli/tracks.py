@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +16,7 @@ from orchestrator.cli.recordings import OverwriteOption, check_output
 from orchestrator.cli.serving import StoreOption, controller
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.domain.errors import ServerError, UsageError
+from orchestrator.spec.tracks import ask
 
 TrackArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="A preset (oval), a seed (random:7), or a track of the store.")
@@ -137,25 +134,14 @@ def import_file(
 
 
 def _ask(order: Mapping[str, Any], store: str | None, output: Path | None = None, overwrite: bool = False) -> Any:
-    """Run a subprocess, since tracks belong to the worker, which this package never imports. Raises UsageError, ServerError."""
+    """Have another process do it, in the controller's store. Raises UsageError, ServerError."""
     if output is not None:
         check_output(output, overwrite, ".png", ".npy")
-    if find_spec("numpy") is None:
-        raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
     with controller(store, None) as connect:
         place = connect().get("/api/capacity")["store"]
     if not Path(place).is_dir():
         raise ServerError(f"the controller's store, {place}, is not on this machine; run the command where it is")
-    whole = {**order, "store": place, "output": str(output.absolute()) if output else None}
-    asked = subprocess.run(
-        [sys.executable, "-P", "-m", "worker.racer", json.dumps(whole)], capture_output=True, text=True, check=False
-    )
-    said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
-    if asked.returncode == 2:
-        raise UsageError(said[-1])
-    if asked.returncode:
-        raise ServerError(f"worker.racer: {said[-1]}")
-    return json.loads(asked.stdout)
+    return ask({**order, "store": place, "output": str(output.absolute()) if output else None})
 
 
 def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:

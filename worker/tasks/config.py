@@ -201,6 +201,8 @@ class TaskConfig(_Common):
     if a declaration makes it an image. Submission checks jobs against these names."""
     races: ClassVar[bool] = False
     """Whether an episode is a lap of a race, as a job with ``race`` runs it."""
+    hyperparameters: ClassVar[tuple[str, ...]] = ()
+    """Further names for settings that ``train.hyperparameters`` accepts (:meth:`plain_settings`)."""
     other_rewards: ClassVar[Mapping[str, float]] = MappingProxyType({})
     """Reward terms and weights that replace the default ones if :attr:`has_other_rewards`."""
 

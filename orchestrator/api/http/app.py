@@ -34,7 +34,7 @@ BROWSER_HEADERS = [
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
     ("Content-Security-Policy", "frame-ancestors 'none'"),
-    ("Referrer-Policy", "no-referrer"),
+    ("Referrer-Policy", "same-origin"),  # without a referrer a browser sends the origin of a page's own form as null
 ]
 """Headers of every answer, errors and refusals too, which the server adds: no page may frame an answer or guess its type."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import time
@@ -39,6 +40,8 @@ from shared_store.wording import shown
 
 router = APIRouter()
 
+LEAGUE_TAG, MODEL_TAG = "muster:league", "muster:model"
+"""Tags of a race's job: the league, and the model as ``NAME@VERSION``."""
 _RACER = re.compile(r"\w[\w .'-]{0,63}")
 _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 _Moment = Annotated[float, Field(ge=0, lt=1e11, allow_inf_nan=False)]
@@ -263,6 +266,16 @@ def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest
     return {"entry": number, "ruling": stored.ruling(number)}
 
 
+def entered_jobs(request: Request, name: str) -> set[str]:
+    """The jobs whose races are entries of a league; of an altered entry nothing is known."""
+    stored, _ = _find(reconciler_of(request), name)
+    found = set()
+    for number in stored.numbers():
+        with contextlib.suppress(LeagueError):
+            found.add(str(stored.entry(number)["evaluation"]["job"]))
+    return found
+
+
 def _find(reconciler: Reconciler, name: str) -> tuple[StoredLeague, League]:
     """Raises ClientError: there is no such league, or its rules were altered."""
     try:
@@ -328,7 +341,8 @@ def _submit(
                 spec = race_job(league, model.reference, facts, queue, _suffix())
             except SpecError as error:
                 raise ClientError(str(error)) from None
-            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {})
+            tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
+            answer, _ = submit(context, spec, directory, f"league {league.name}, race of {model.reference}", {}, tags)
     reconciler.wake()
     return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
 

@@ -25,7 +25,15 @@ from orchestrator.api.context import permitted_run, queue_names, reconciler_of
 from orchestrator.api.damaged import reading
 from orchestrator.api.errors import ClientError
 from orchestrator.api.evaluated import check_evaluation
-from orchestrator.api.native import job_list, league_routes, model_routes, run_routes, runs, webhook_routes
+from orchestrator.api.native import (
+    job_list,
+    league_routes,
+    model_routes,
+    run_routes,
+    runs,
+    track_routes,
+    webhook_routes,
+)
 from orchestrator.api.permissions import JobsOf, Operation
 from orchestrator.api.racing_tracks import check_tracks
 from orchestrator.api.sources import sources_of
@@ -54,6 +62,7 @@ router.include_router(job_list.router)
 router.include_router(run_routes.router)
 router.include_router(model_routes.router)
 router.include_router(league_routes.router)
+router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 
 _LARGEST_PLAN = 4 << 20

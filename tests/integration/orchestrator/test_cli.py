@@ -197,7 +197,7 @@ def test_no_answer_may_be_framed_or_taken_for_another_type(shared_server: Servin
     answer = httpx.get(f"{shared_server.url}{path}", headers=headers, trust_env=False)
     assert answer.status_code == status
     assert answer.headers["x-frame-options"] == "DENY" and answer.headers["x-content-type-options"] == "nosniff"
-    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert answer.headers["referrer-policy"] == "same-origin"
     assert all("frame-ancestors 'none'" in policy for policy in answer.headers.get_list("content-security-policy"))
 
 

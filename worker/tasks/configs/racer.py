@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from shared_store.file_fields import kept_file
 from worker.learning.ppo.settings import PPOConfig
 from worker.racer.actions import LIDARS, ActionSpace, action_space, read_metadata
-from worker.racer.hyperparameters import plain_settings
+from worker.racer.hyperparameters import KNOWN, plain_settings
 from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import MOST_OBJECTS
 from worker.tasks.config import (
@@ -108,6 +108,7 @@ class RacerConfig(TaskConfig):
     """
 
     races: ClassVar[bool] = True
+    hyperparameters: ClassVar[tuple[str, ...]] = tuple(KNOWN)
     other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
     control_hz: Positive = 15.0
     """Control steps per simulated second [Hz]."""
