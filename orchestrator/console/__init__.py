@@ -52,10 +52,7 @@ PAGES = (
     "tracks",
     "models",
     "leagues",
-    "queues",
-    "runs",
-    "compare",
-    "keys",
+PAGES = ("queues", "runs", "compare", "keys")
 )
 """Modules of this package, each with a ``router``."""
 
